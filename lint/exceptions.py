@@ -63,5 +63,5 @@ def shrink_baseline(offences: Iterable[Offence], root: Path, path: Path = BASELI
 
 
 def shown(path: Path, root: Path) -> str:
-    """A path as people write it: below the checkout, with slashes."""
+    """Return a path as people write it: below the checkout, with slashes."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()

@@ -38,7 +38,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _is_entry(node: Definition) -> bool:
-    """Whether a framework calls a definition, so that no code names it."""
+    """Return whether a framework calls a definition, so that no code names it."""
     if (node.name.startswith("__") and node.name.endswith("__")) or node.name in _CALLED_BY_NAME:
         return True
     return any(

@@ -39,7 +39,7 @@ class Credential:
 def resolve(
     url: str | None = None, token_file: Path | None = None, environment: Mapping[str, str] | None = None
 ) -> Credential:
-    """The server and token that flags, environment and stored logins name."""
+    """Return the server and token that flags, environment and stored logins name."""
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
@@ -66,7 +66,7 @@ def require_address(url: str) -> None:
 
 
 def as_token(text: str) -> str:
-    """`text` without the ends of lines that files and variables bring along. Raises `BadToken`, without telling it."""
+    """Return `text` without leading and trailing white space. Raises `BadToken`, which does not contain the text."""
     token = text.strip()
     if not token or not token.isascii() or not token.isprintable() or " " in token:
         raise BadToken("the text given is not a token: a token is one word of letters, digits and _")
@@ -74,7 +74,7 @@ def as_token(text: str) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """The token in a file. Raises `BadCredentialFile` where it holds none, or other users may read it."""
+    """Return the token in a file. Raises `BadCredentialFile` where it holds none, or other users may read it."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()
@@ -101,13 +101,13 @@ class Logins:
 
 
 def logins_path(environment: Mapping[str, str]) -> Path:
-    """The file of stored logins: below `XDG_CONFIG_HOME`, or `~/.config`."""
+    """Return the file of stored logins: below `XDG_CONFIG_HOME`, or `~/.config`."""
     base = environment.get("XDG_CONFIG_HOME") or str(Path(environment.get("HOME") or Path.home()) / ".config")
     return Path(base) / "marey" / "credentials.json"
 
 
 def read_logins(path: Path) -> Logins:
-    """The stored logins; none where nobody logged in. Raises `BadCredentialFile` where the file is damaged."""
+    """Return the stored logins; none where nobody logged in. Raises `BadCredentialFile` where the file is damaged."""
     if not path.exists():
         return Logins()
     try:
@@ -146,7 +146,7 @@ def _write_logins(path: Path, logins: Logins) -> None:
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
-    """The administrator's token of a server on this machine, where its data folder is known and readable."""
+    """Return the administrator's token of a server on this machine, where its data folder is known and readable."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
     path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN

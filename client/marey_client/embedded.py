@@ -89,7 +89,7 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def room(module: str, extra: str) -> ModuleType:
-    """A module of another part of Marey. Raises `NotInstalled`, naming the extra that brings it."""
+    """Return a module of another part of Marey. Raises `NotInstalled`, naming the extra that brings it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

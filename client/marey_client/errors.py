@@ -228,7 +228,7 @@ _BY_CODE: dict[str, type[RequestFailed]] = {"lease-lost": LeaseLost}
 
 
 def error_of(problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> RequestFailed:
-    """The exception for a problem document; its class is found by code, then by status.
+    """Return the exception for a problem document; its class is found by code, then by status.
 
     `anonymous` says that the request carried no token.
     """

@@ -221,14 +221,14 @@ def _may_travel(name: str) -> bool:
 
 
 def _refused_name(name: str) -> ImportEntry:
-    """The entry of a file that is not sent because of its name."""
+    """Return the entry of a file that is not sent because of its name."""
     shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
     detail = "its name is too long, no UTF-8, or holds line breaks or other control characters; rename it"
     return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
-    """A job's entry with the items that were made of its file when the job was published."""
+    """Return a job's entry with the items that were made of its file when the job was published."""
     skeleton = outputs.get(skeleton_output(entry.name))
     made = outputs.get(entry.name) or skeleton
     if made is None:

@@ -89,7 +89,7 @@ class Marey:
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Bytes by digest."""
+        """Return a blob's bytes by its digest."""
         return Blobs(self.transport)
 
     @cached_property

@@ -89,13 +89,13 @@ class Transport:
         )
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
-        """The same connections with another token; closing either closes both."""
+        """Return the same connections with another token; closing either closes both."""
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other
 
     def with_retries(self, retries: Retries) -> Transport:
-        """The same connections and token with other patience."""
+        """Return the same connections and token with other patience."""
         other = copy(self)
         other.retries = retries
         return other
@@ -222,7 +222,7 @@ def _quoted(path: str) -> str:
 
 
 def as_json(model: BaseModel | None) -> bytes | None:
-    """The fields of `model` that were given, as JSON; secrets included, which pydantic's own JSON hides."""
+    """Return the fields of `model` that were given, as JSON; secrets included, which pydantic's own JSON hides."""
     if model is None:
         return None
     return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)
@@ -237,7 +237,7 @@ def _revealed(value: Any) -> Any:
 
 
 def read_model(answer: type[Model], response: httpx.Response) -> Model:
-    """The body of `response` as a model; `UnexpectedAnswer` if it is none."""
+    """Return the body of `response` as a model; `UnexpectedAnswer` if it is none."""
     try:
         return answer.model_validate_json(response.content)
     except ValidationError as error:
@@ -248,7 +248,7 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
 
 
 def read_tree(response: httpx.Response) -> Any:
-    """The body of `response` as a tree with numpy arrays."""
+    """Return the body of `response` as a tree with numpy arrays."""
     media_type = response.headers.get("Content-Type", "").partition(";")[0].strip()
     try:
         return decode_tree(response.content, media_type, max_bytes=MAX_ANSWER_BYTES)

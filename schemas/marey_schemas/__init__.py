@@ -1,1 +1,1 @@
-"""Documents that travel between the parts of Marey, and their codecs."""
+"""Documents that the parts of Marey exchange, and their codecs."""

@@ -52,7 +52,7 @@ class UserCreate(Request):
 
 
 class UserChange(Request):
-    """Changes of a user; absent fields stay. Who changes their own password gives the current one."""
+    """Changes of a user; absent fields stay unchanged. Users who change their own password give the current one."""
 
     display_name: DisplayName | None = None
     password: Password | None = None
@@ -129,7 +129,7 @@ class ProjectCreate(Request):
 
 
 class ProjectChange(Request):
-    """Changes of a project; absent fields stay."""
+    """Changes of a project; absent fields stay unchanged."""
 
     title: DisplayName | None = None
     description: str | None = Field(None, max_length=10_000)
@@ -137,7 +137,7 @@ class ProjectChange(Request):
 
 
 class Project(Answer):
-    """A team's space."""
+    """A project: the items, jobs and members of a team."""
 
     id: str
     name: str

@@ -1,4 +1,4 @@
-"""Waiting times between tries: longer after each failure, and random, so that many callers do not come back at once."""
+"""Delays between retries: they grow with each failure, and are random so that many callers do not retry at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 MOST_STEPS = 64
-"""Of growth; after that, no wait is below the longest one that anybody allows."""
+"""Greatest number of doublings, which bounds the exponent; any longest delay is reached before."""
 
 
 @dataclass(frozen=True)
@@ -36,5 +36,5 @@ class Backoff:
 
 
 def spread(seconds: float, share: float, random_unit: Callable[[], float] = random.random) -> float:
-    """Take up to `share` of some seconds off at random."""
+    """Subtract a random part, up to `share`, from a duration in seconds."""
     return seconds * (1.0 - share * random_unit())

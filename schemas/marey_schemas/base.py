@@ -1,4 +1,4 @@
-"""The bases of every document that travels, and of the options of computations."""
+"""Base classes of requests, answers and options."""
 
 from typing import Any, Self
 
@@ -30,9 +30,9 @@ class Options(Request):
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Take these options alone out of a model that extends them."""
+        """Return only these options of a model that extends them."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:
-        """Copy with other values, which are checked."""
+        """Return a copy with other values, which are validated."""
         return type(self)(**{**dict(self), **changes})

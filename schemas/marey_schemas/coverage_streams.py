@@ -23,11 +23,11 @@ LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000
 MOST_SECONDS = 1e9
 MOST_FRAMES = 4096
-"""In one request; the chunks of a live performance have a tenth of a second to a second."""
+"""Greatest number of frames in a request; a live performance sends 0.1 s to 1 s at a time."""
 
 
 class CoverageStreamCreate(Request):
-    """A new stream: what frames will come, and which speeds and turn rates are wanted."""
+    """Request for a new stream: the form of its frames, and the speeds and turn rates to cover."""
 
     frame_rate_hz: float = Field(
         ge=LEAST_FRAME_RATE_HZ,
@@ -122,7 +122,7 @@ class CoverageFrames(Request):
 
 
 class CoverageCell(Answer):
-    """A speed and turn rate, and how much there is of it."""
+    """A cell of the grid, one speed and one turn rate, with the seconds of data in it."""
 
     speed_m_s: float
     turn_rate_deg_s: float = Field(description="Turn rate in degrees per second, positive to the left.")
@@ -191,7 +191,7 @@ class CoverageStream(Answer):
 
 
 class CoverageStreamState(CoverageStream, CoverageNow):
-    """A stream with its map."""
+    """A stream with the coverage of each cell."""
 
     seconds: tuple[tuple[float, ...], ...] = Field(description="[speeds, turn rates]: seconds of data in each cell.")
     deficit_s: tuple[tuple[float, ...], ...] = Field(
@@ -211,7 +211,7 @@ class MeasuredOptions(Answer):
 
 
 class MeasuredCells(Answer):
-    """The map of an evaluation."""
+    """The coverage of each cell in an evaluation."""
 
     seconds: Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=2)]
 
@@ -223,7 +223,7 @@ class MeasuredCells(Answer):
 
 
 class MeasuredCoverage(Answer):
-    """The part of `EvaluationDocument` that tells what is covered."""
+    """The part of `EvaluationDocument` that contains the coverage."""
 
     options: MeasuredOptions
     coverage: MeasuredCells

@@ -42,7 +42,7 @@ class FileFormat:
     begins : pattern that only the beginning of such a file matches; None where the name alone identifies it
     other_endings : endings that identify a named file, but that folders are not searched for
     euler : its rotations are Euler angles, whose orders an export keeps from the import
-    archive : its files are ZIP archives, told from other archives by their ending
+    archive : its files are ZIP archives with an ending of their own
     companion : format of a second file that its reader takes
     needs_companion : why that file is needed; empty where it is optional
     unread : why there is no reader, for files that people expect to be read
@@ -63,7 +63,7 @@ class FileFormat:
     unread: str = ""
 
     def names(self, file: str) -> bool:
-        """Whether a file name has one of the endings."""
+        """Return whether a file name has one of the endings."""
         return file.lower().endswith(self.endings + self.other_endings)
 
 
@@ -138,7 +138,7 @@ _BY_NAME = {one.name: one for one in FORMATS}
 
 
 def format_named(name: str) -> FileFormat:
-    """The format of that name. Raises `KeyError`."""
+    """Return the format of that name. Raises `KeyError`."""
     return _BY_NAME[name]
 
 

@@ -112,7 +112,7 @@ class KindDeclaration:
         return f"{self.name}@{self.version}"
 
     def document(self) -> JobKind:
-        """The declaration as it travels."""
+        """Return the declaration as a document."""
         return JobKind(
             name=self.name,
             description=self.description,
@@ -147,7 +147,7 @@ _RIGS = InputSpec(
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
-    """Whether a file of an import may be a graph, whose models are found by their names."""
+    """Return whether a file of an import may be a graph, whose models are found by their names."""
     rows = [row for row in IMPORTED if "graph" in row.reads]
     return any(row.names(file["name"]) for file in params["files"] for row in rows)
 
@@ -410,7 +410,7 @@ class UnknownKindError(LookupError):
 
 @cache
 def job_kinds() -> Mapping[str, KindDeclaration]:
-    """Every kind by name: the built-in ones and those of installed distributions.
+    """Return every kind by name: the built-in ones and those of installed distributions.
 
     Raises `TypeError` for an entry point that is no declaration, `ValueError` for a name that is taken.
     """
@@ -426,7 +426,7 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
 
 
 def find_kind(name: str) -> KindDeclaration:
-    """The kind called `name`; `UnknownKindError` if there is none."""
+    """Return the kind called `name`; `UnknownKindError` if there is none."""
     try:
         return job_kinds()[name]
     except KeyError:

@@ -111,7 +111,7 @@ class CutParams(TaggedResults):
         return self
 
     def piece_name(self, clip: str, label: str, number: int) -> str:
-        """Name of a piece."""
+        """Return the name of a piece."""
         given = {"clip": clip, "label": label.replace("/", "-")}
 
         def text(found: re.Match[str]) -> str:
@@ -169,7 +169,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Number of tasks for the trials: a few trials each, so that a lost task loses little."""
+    """Return the number of tasks for the trials: a few trials each, so that a lost task loses little."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 
@@ -200,7 +200,7 @@ class SweepParams(SweepOptions):
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
-    """A task for each setting of the weights."""
+    """Return a task for each setting of the weights."""
     return 1 + WEIGHT_GROUPS * len(params.factors)
 
 

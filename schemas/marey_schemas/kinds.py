@@ -26,7 +26,7 @@ class Kind(StrEnum):
 
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":
-        """The kind a URL segment names; `KeyError` if none."""
+        """Return the kind a URL segment names; `KeyError` if none."""
         return _BY_PLURAL[plural]
 
 

@@ -63,7 +63,7 @@ class ModelPlan(Request):
 
 
 def model_pipeline(plan: ModelPlan, **shared: Any) -> PipelineCreate:
-    """The pipeline that carries out a plan. `shared` are further fields of it, such as `seed` and `priority`."""
+    """Return the pipeline that carries out a plan. `shared` are further fields of it, such as `seed` and `priority`."""
     steps: dict[str, PipelineStep] = {}
     clips: Any = plan.clips
     annotations: Any = plan.annotations

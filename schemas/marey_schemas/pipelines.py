@@ -1,4 +1,4 @@
-"""Pipelines: jobs handed in together, in which some work on what others make."""
+"""Pipelines: jobs that are submitted together and use each other's results as inputs."""
 
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
@@ -76,12 +76,12 @@ class PipelineError(ValueError):
 
     @classmethod
     def unknown_step(cls, pointer: str, name: str, pipeline: PipelineCreate) -> Self:
-        """A step that is named and not there."""
+        """Return a step that is named and not there."""
         return cls(pointer, "unknown-step", f"There is no step {name!r}; there are {', '.join(pipeline.steps)}.")
 
 
 def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
-    """The names of the steps, each after those it needs, else as they were given.
+    """Return the names of the steps, each after those it needs, else as they were given.
 
     Raises `PipelineError` for a step that is not there, and for steps that wait for each other.
     """
@@ -108,7 +108,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """The job that a step stands for; `ids` are those of the jobs of the steps it needs."""
+    """Return the job that a step stands for; `ids` are those of the jobs of the steps it needs."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:

@@ -26,7 +26,7 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
-"""No motion was ever captured so exactly, and squares of errors in smaller ones cannot be computed with."""
+"""The least value is below the accuracy of any motion capture, and squared errors over it stay finite."""
 Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
@@ -76,7 +76,7 @@ class _PlaceConstraint(_SearchConstraint):
 
 
 class JointPositionConstraint(_PlaceConstraint):
-    """A joint is at a place."""
+    """A joint is at a position."""
 
     type: Literal["joint_position"]
     joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
@@ -86,7 +86,7 @@ class JointPositionConstraint(_PlaceConstraint):
 
 
 class JointOrientationConstraint(_SearchConstraint):
-    """A joint is turned so."""
+    """A joint has a rotation in the world."""
 
     type: Literal["joint_orientation"]
     joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
@@ -114,7 +114,7 @@ class LookDirectionConstraint(_SearchConstraint):
 
 
 class RootPositionConstraint(_PlaceConstraint):
-    """The body stands over a place on the ground."""
+    """The body is at a position on the ground."""
 
     type: Literal["root_position"]
     target_m: tuple[Coordinate | None, Coordinate | None] = Field(
@@ -131,7 +131,7 @@ class RootHeadingConstraint(_SearchConstraint):
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
-    """A moment comes so long after the motion's beginning."""
+    """A keyframe is reached at a time after the motion's beginning."""
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
@@ -171,7 +171,7 @@ class SearchStep(Request):
 
 
 class SearchRequest(RefineOptions):
-    """Ask for a motion, or for several that follow one another, that meet constraints."""
+    """Request for one motion, or several consecutive motions, that meet constraints."""
 
     constraints: SearchConstraints = Field(
         (), description="Constraints on a single motion; for several motions, use `steps`."
@@ -220,7 +220,7 @@ class SearchRequest(RefineOptions):
 
     @property
     def asked_steps(self) -> tuple[SearchStep, ...]:
-        """The steps; one where there are constraints alone."""
+        """The steps; a single one if only `constraints` are given."""
         return self.steps or (SearchStep(constraints=self.constraints),)
 
 

@@ -17,7 +17,7 @@ PROTOCOL_VERSION = 1
 
 
 class ClaimRequest(Request):
-    """A worker asks for work."""
+    """Request of a worker for jobs."""
 
     worker: str = Field(min_length=1, max_length=255, description="Name of the worker, shown to people.")
     kinds: tuple[str, ...] = Field(min_length=1, max_length=256)
@@ -52,11 +52,11 @@ class PinnedInput(Answer):
 
     @property
     def ref(self) -> RevisionRef:
-        """As documents refer to it."""
+        """The input as a reference in documents."""
         return RevisionRef(item=self.item, revision=self.revision)
 
     def as_input(self) -> ItemInput:
-        """As results name what they were made of."""
+        """Return the input as it is listed in the origin of results."""
         return ItemInput(item=self.item, revision=self.revision)
 
 
@@ -90,7 +90,7 @@ class LeaseList(Answer):
 
 
 class Heartbeat(Request):
-    """The worker is alive."""
+    """Report that the worker is alive, with the job's progress."""
 
     progress: Progress | None = None
 
@@ -138,7 +138,7 @@ class CompleteRequest(Request):
 
 
 class FailRequest(Request):
-    """The attempt did not succeed."""
+    """Report of a failed attempt."""
 
     write_id: str = Field(min_length=8, max_length=64)
     code: str = Field(min_length=1, max_length=128)
@@ -166,7 +166,7 @@ class BatchCompleteRequest(Request):
 
 
 class CompleteAnswer(Answer):
-    """The job has succeeded, and this is what it published."""
+    """Results that a successful job published."""
 
     job: str
     state: JobState

@@ -56,11 +56,11 @@ FIRST_COMMAND = "marey project create lab"
 
 
 class CannotListen(Exception):
-    """The address or the port that the settings name is not to be had; the text says which, and why."""
+    """The server cannot listen on the address or port in the settings; the text gives both and the reason."""
 
 
 class Application(TornadoApplication):
-    """Every route, and what their handlers share."""
+    """The Tornado application: all routes, and the services that their handlers share."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.routes = RouteTable(self, RESOURCES)
@@ -97,12 +97,12 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
 
 
 def create_app(settings: Settings, database: Database) -> Application:
-    """An application over a database whose schema is current."""
+    """Return an application over a database whose schema is current."""
     return Application(settings, database)
 
 
 def describe(routes: RouteTable) -> Description:
-    """The API described for programs and for people."""
+    """Return the description of the API for programs and for people."""
     document = build_document(routes, version("marey"))
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
     return Description(text, render_page(document), hashlib.sha256(text).hexdigest()[:16])
@@ -160,7 +160,7 @@ async def _drain(services: Services, server: HTTPServer) -> None:
 
 
 def open_database(settings: Settings) -> Database:
-    """The database of a server: its folder made, its schema current, its first administrator there.
+    """Open the database of a server; create its folder, tables and first administrator if they are missing.
 
     Raises `DatabaseUnusable` where it cannot be opened.
     """
@@ -173,7 +173,7 @@ def open_database(settings: Settings) -> Database:
 
 
 def connect_database(settings: Settings) -> Database:
-    """The database as it stands."""
+    """Connect to the database without upgrading its tables."""
     blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
     return Database(settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs)
 
@@ -198,7 +198,7 @@ async def serve(settings: Settings) -> None:
 
 @asynccontextmanager
 async def compiling_kernels() -> AsyncIterator[None]:
-    """See in a process of its own, while the server answers already, that imports find their kernels compiled."""
+    """Compile the kernels of imports in a separate process while the server already answers."""
     process = await asyncio.create_subprocess_exec(sys.executable, "-m", "marey_motion.warm_up")
     try:
         yield
@@ -227,7 +227,7 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
 
 
 def make_worker_token(database: Database, settings: Settings) -> str:
-    """A token for the workers that this process starts.
+    """Create a token for the workers that this process starts.
 
     Those of earlier starts at this address stop working; servers that share the database keep theirs.
     """
@@ -243,7 +243,7 @@ def _replace_worker_token(tx: Transaction, name: str) -> str:
 
 
 def greeting(settings: Settings, address: str, database: Database) -> Iterator[str]:
-    """Its lines, without any secret."""
+    """Return the lines that a new server prints, without any secret."""
     yield f"listening on {address}"
     data = settings.data.absolute()
     yield f"data: {data}; database: {database.shown}"

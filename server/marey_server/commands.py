@@ -54,7 +54,7 @@ def read_settings(**given: Any) -> Settings:
 
 
 def upgrade(**settings: Any) -> None:
-    """Bring the tables to this version's."""
+    """Upgrade the tables to the schema of this version."""
     from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
@@ -77,7 +77,7 @@ def backup(*, target: Path, **settings: Any) -> None:
 
 
 def restore(*, source: Path, **settings: Any) -> None:
-    """Put a backup in the place of a database that is not there."""
+    """Restore a database from a backup; no database may exist at that place."""
     chosen = read_settings(**settings)
     target = _sqlite_file(chosen, must_exist=False)
     # A log that stays behind would be played into the backup.

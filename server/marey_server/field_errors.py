@@ -13,14 +13,14 @@ MAX_ERRORS = 50
 
 
 def json_pointer(steps: Sequence[str]) -> str:
-    """The JSON Pointer (RFC 6901) of a path of steps."""
+    """Return the JSON Pointer (RFC 6901) of a path of steps."""
     return "".join("/" + step.replace("~", "~0").replace("/", "~1") for step in steps)
 
 
 def field_errors(
     error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
 ) -> list[FieldError]:
-    """The first `MAX_ERRORS` faults of `tree`, which was validated; `pointer` writes down where each is."""
+    """Return the first `MAX_ERRORS` faults of `tree`, which was validated; `pointer` writes down where each is."""
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     return [
         FieldError(
@@ -33,7 +33,7 @@ def field_errors(
 
 
 def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
-    """The steps of a location that the tree has, and of a missing field its name: pydantic puts the names of the
+    """Return the steps of a location that the tree has, and of a missing field its name: pydantic puts the names of the
     alternatives it tried in between.
     """
     steps = []

@@ -154,7 +154,7 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 def database_address(url: URL) -> str:
-    """The whole address, password included."""
+    """Return the whole address, password included."""
     return url.render_as_string(hide_password=False)
 
 

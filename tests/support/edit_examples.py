@@ -38,5 +38,5 @@ EXAMPLES: dict[str, list[dict[str, Any]]] = {
 
 
 def commands_of_all() -> list[dict[str, Any]]:
-    """Every example as a command."""
+    """Return every example as a command."""
     return [{"command": name, **given} for name, many in EXAMPLES.items() for given in many]

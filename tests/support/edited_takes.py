@@ -15,12 +15,12 @@ from marey_motion.skeleton import Skeleton
 def make_walk(
     turn_rate_rad_s: float = 0.0, seconds: float = 3.0, rate_hz: float = 60.0, speed_m_s: float = 1.3
 ) -> Clip:
-    """A generated walk; feet that stand do not slide, and the floor is at height zero."""
+    """Return a generated walk; feet in contact do not slide, and the floor is at height zero."""
     return generate_gait(speed_m_s, turn_rate_rad_s, seconds, rate_hz)
 
 
 def make_breathing_walk(**given: float) -> Clip:
-    """A walk whose spine and left arm also move against their parents."""
+    """Return a walk whose spine and left arm also move against their parents."""
     walk = make_walk(**given)
     joints = tuple(sorted(walk.skeleton.index_of(name) for name in ("Spine1", "LeftArm")))
     phase = np.linspace(0.0, 6.0, walk.frame_count)[:, None, None]
@@ -43,7 +43,7 @@ def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
 
 
 def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:
-    """Whether two clips show the same motion, joint by joint, whatever the signs of their quaternions."""
+    """Return whether two clips show the same motion, joint by joint, whatever the signs of their quaternions."""
     if a.frame_count != b.frame_count or a.translated_joints != b.translated_joints:
         return False
     turned = quaternions.angle_between(a.rotations.astype(np.float64), b.rotations.astype(np.float64))
@@ -54,7 +54,7 @@ def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:
 
 
 def are_exactly(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
-    """Whether rotations are the same to the last bit, but for the sign of whole quaternions."""
+    """Return whether rotations are the same to the last bit, but for the sign of whole quaternions."""
     return bool(np.all(np.all(a == b, axis=-1) | np.all(a == -b, axis=-1)))
 
 

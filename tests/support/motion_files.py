@@ -37,7 +37,7 @@ def bvh(
     frames: int | str | None = None,
     frame_time: str = "0.01",
 ) -> bytes:
-    """A BVH file of these lines of numbers; the header tells their count unless `frames` says otherwise."""
+    """Return a BVH file of these lines of numbers; the header tells their count unless `frames` says otherwise."""
     declared = len(rows) if frames is None else frames
     return (
         hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)
@@ -45,7 +45,7 @@ def bvh(
 
 
 def nested(names: Sequence[str], channels: Sequence[str], *, tip: bool = True) -> str:
-    """A HIERARCHY of joints one below the other, each 10 units above its parent."""
+    """Return a HIERARCHY of joints one below the other, each 10 units above its parent."""
     lines = ["HIERARCHY"]
     for depth, (name, own) in enumerate(zip(names, channels, strict=True)):
         words = own.split()

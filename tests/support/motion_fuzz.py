@@ -60,7 +60,7 @@ def seeds() -> list[Seed]:
 
 
 def broken(data: bytes, source: random.Random) -> bytes:
-    """The file with one to eight pieces cut, doubled, swapped, overwritten or put in."""
+    """Return the file with one to eight pieces cut, doubled, swapped, overwritten or put in."""
     text = bytearray(data)
     for _ in range(source.randint(1, 8)):
         start = source.randint(0, len(text))

@@ -43,7 +43,7 @@ def joints_in_the_world(clip: Clip) -> np.ndarray:
 
 
 def plain_rows(clip: Clip, body: MatchingBody) -> PlainRows:
-    """Rows of a clip at 60 Hz that does not loop."""
+    """Return the rows of a clip at 60 Hz that does not loop."""
     places = joints_in_the_world(clip)
     frames = len(places)
     ground = places[:, body.torso][:, [0, 2]]

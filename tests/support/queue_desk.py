@@ -117,11 +117,11 @@ class Desk:
         return [job.id for job in made]
 
     def job(self, job_id: str) -> Job:
-        """A job as it stands."""
+        """Return the present state of a job."""
         return self.database.read(self.user, reading.read_job, job_id)
 
     def state(self, job_id: str) -> str:
-        """The state of a job."""
+        """Return the state of a job."""
         return self.job(job_id).state.value
 
     def cancel(self, job_id: str) -> Job:
@@ -160,7 +160,7 @@ class Desk:
         return lease
 
     def attempt(self, lease: Lease) -> Principal:
-        """The principal of an attempt, as its token resolves now."""
+        """Return the principal of an attempt, as its token resolves now."""
         return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
 
     def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
@@ -191,7 +191,7 @@ class Desk:
         return self.database.write(SYSTEM, reap_page, self.policy).taken
 
     def write_id(self) -> str:
-        """A new one."""
+        """Return a new one."""
         return f"write-{next(self._write_ids):06}"
 
     def _attempt_of(self, lease: Lease) -> Principal:
@@ -212,14 +212,14 @@ def _as_attempt(lease: Lease) -> Principal:
 
 
 def document(**facts: Any) -> dict[str, Any]:
-    """A small open document."""
+    """Return a small open document."""
     return {"schema": "marey/document@1", **facts}
 
 
 def output(
     name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
 ) -> StagedOutput:
-    """A staged result that is a small document."""
+    """Return a staged result that is a small document."""
     parts = {"study": document(name=name, **facts)}
     return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
 

@@ -13,7 +13,7 @@ TERMINAL = ("succeeded", "failed", "cancelled")
 
 @dataclass
 class ModelJob:
-    """One job."""
+    """State of one job."""
 
     id: str
     priority: int
@@ -68,7 +68,7 @@ class ModelQueue:
         return taken
 
     def holds(self, job_id: str, fence: int) -> bool:
-        """Whether an attempt holds its job."""
+        """Return whether an attempt holds its job."""
         job = self.jobs[job_id]
         return job.state == "running" and job.fence == fence
 

@@ -37,14 +37,14 @@ class Server:
         return f"{self.address}/api/v1"
 
     def client(self, token: str | None = None) -> httpx.Client:
-        """A client that shows `token`."""
+        """Return a client that shows `token`."""
         if token not in self._clients:
             headers = {"Authorization": f"Bearer {token}"} if token else {}
             self._clients[token] = httpx.Client(base_url=self.api, headers=headers, timeout=60)
         return self._clients[token]
 
     def make_user(self, name: str, *, administrator: bool = False, scopes: tuple[str, ...] = USER_SCOPES) -> str:
-        """A user and a token of his."""
+        """Create a user with a token; return both."""
         made = self.database.write(SYSTEM, users.create_user, UserCreate(name=name, administrator=administrator))
         return self.make_token(made.id, name, administrator=administrator, scopes=scopes)
 
@@ -53,7 +53,7 @@ class Server:
         return self.database.write(principal, tokens.create_token, TokenCreate(name="test", scopes=scopes)).secret
 
     def make_project(self, name: str = "lab", *, owner: str = "olga", **others: Role) -> str:
-        """A project, its owner's token; `others` are made members."""
+        """Return a project, its owner's token; `others` are made members."""
         token = self.make_user(owner)
         person = self.database.read(SYSTEM, tokens.resolve_token, token)
         self.database.write(person, projects.create_project, ProjectCreate(name=name))

@@ -118,7 +118,7 @@ class ServerProcess(MareyProcess):
         return (self.data / "admin.token").read_text().strip()
 
     def client(self, *, patient: bool = True, port: int | None = None) -> Marey:
-        """An administrator's client; a patient one outlasts a restart."""
+        """Return an administrator's client; a patient one outlasts a restart."""
         url = f"http://127.0.0.1:{port}" if port else self.url
         return Marey(url, self.token, retries=PATIENT if patient else ONCE)
 
@@ -152,7 +152,7 @@ def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerPro
 
 
 def free_port() -> int:
-    """A loopback port nobody listens on just now."""
+    """Return a loopback port nobody listens on just now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

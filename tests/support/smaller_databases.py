@@ -43,7 +43,7 @@ def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase
 
 
 def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: Flags) -> MatchingDatabase:
-    """The rows of `clips`, which are all that are `kept`, in one database."""
+    """Return the rows of `clips`, which are all that are `kept`, in one database."""
     if not clips:
         raise MotionError("no clip is left", code="no-clips")
     before = np.concatenate(([0], np.cumsum(kept)))
@@ -55,6 +55,6 @@ def _gathered(database: MatchingDatabase, clips: Sequence[DatabaseClip], kept: F
 
 
 def _by_row(database: MatchingDatabase) -> dict[str, Any]:
-    """The arrays that have one entry per row."""
+    """Return the arrays that have one entry per row."""
     values = {field.name: getattr(database, field.name) for field in fields(database)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

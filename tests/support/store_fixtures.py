@@ -19,13 +19,13 @@ ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 
 
 def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
-    """A chain of joints `j0`, `j1`, ..."""
+    """Return a chain of joints `j0`, `j1`, ..."""
     chain = [{"name": f"j{i}", "parent": i - 1, "offset": [0, bone_m if i else 0, 0]} for i in range(joints)]
     return {"schema": "marey/skeleton@1", "joints": chain}
 
 
 def motion_tree(skeleton: Any, *, frames: int = 5, joints: int = 3, seed: int = 0) -> dict[str, Any]:
-    """A random motion of the chain; `skeleton` is an item, or a reference."""
+    """Return a random motion of the chain; `skeleton` is an item, or a reference."""
     ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
     poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
     return {
@@ -82,7 +82,7 @@ class Lab:
             members.put_member(tx, self.name, str(who.user_name), MemberChange(role=role))
 
     def sign_up(self, name: str, *, administrator: bool = False) -> Principal:
-        """A new user, as a principal with every scope."""
+        """Create a user; return its principal, with every scope."""
         return self.database.write(SYSTEM, _new_user, name, administrator=administrator)
 
     def read(
@@ -113,7 +113,7 @@ class Lab:
         self.write(projects.change_project, self.name, change, expected_rev=None)
 
     def add_skeleton(self, name: str = "rig", **kwargs: Any) -> Item:
-        """A new skeleton."""
+        """Return a new skeleton."""
         request = ItemCreate(name=name, parts={"hierarchy": skeleton_tree(**kwargs)})
         return self.write(items.create_item, self.name, Kind.SKELETON, request)
 
@@ -128,7 +128,7 @@ class Lab:
         info: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> Item:
-        """A new clip of random poses."""
+        """Return a new clip of random poses."""
         parts = {"motion": motion_tree(skeleton, **kwargs)} | ({"info": info} if info else {})
         request = ItemCreate(name=name, collection=collection, tags=tags, parts=parts)
         return self.write(items.create_item, self.name, Kind.CLIP, request, who=who)

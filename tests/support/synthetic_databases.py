@@ -51,14 +51,14 @@ def gait_pose(frames: int, speed_m_s: float, phase: float = 0.0) -> NDArray[np.f
 
 
 def arc_track(speed_m_s: float, turn_rate_deg_s: float, seconds: float, phase: float = 0.0, **options: Any) -> Track:
-    """A root on a straight line or circle from its first frame on."""
+    """Return a root on a straight line or circle from its first frame on."""
     trial = Trial("circle", speed_m_s, float(np.radians(turn_rate_deg_s)), approach_s=0.0, duration_s=seconds)
     path = reference(trial, look_ahead_s=0.0)
     return Track(path.positions, path.headings, gait_pose(path.tick_count, speed_m_s, phase), **options)
 
 
 def path_track(trial: Trial, **options: Any) -> Track:
-    """A root on a trial's own trajectory, with the second that it looks ahead."""
+    """Return a root on a trial's own trajectory, with the second that it looks ahead."""
     path = reference(trial)
     return Track(path.positions, path.headings, gait_pose(len(path.headings), trial.speed_m_s), **options)
 
@@ -94,7 +94,7 @@ def synthetic_database(
     *,
     normaliser: Normaliser | None = None,
 ) -> MatchingDatabase:
-    """The tracks as clips in the order given; futures clamp to the last frame, or wrap for loops."""
+    """Return the tracks as clips in the order given; futures clamp to the last frame, or wrap for loops."""
     options = options or DatabaseOptions()
     features, selectable, clips = [], [], []
     for number, track in enumerate(tracks):
@@ -128,7 +128,7 @@ def synthetic_database(
 
 
 def index_of(database: MatchingDatabase) -> SearchIndex:
-    """The database's rows, ready for search."""
+    """Return the database's rows, ready for search."""
     normalised = (database.features - database.normaliser.offset) / database.normaliser.scale
     return build_index(normalised, database.starts, database.selectable)
 

@@ -37,7 +37,7 @@ def _folder(item: pytest.Item) -> str:
 
 
 def backend_of(item: pytest.Item) -> str | None:
-    """The database that a test runs on, or None."""
+    """Return the database that a test runs on, or None."""
     callspec = getattr(item, "callspec", None)
     values = callspec.params.values() if callspec else ()
     return next((value for value in values if isinstance(value, str) and value in BACKENDS), None)
@@ -142,7 +142,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _group(item: pytest.Item) -> str:
-    """The tests that run in one process: those of a file, which share fixtures; all ways over one database.
+    """Return the tests that run in one process: those of a file, which share fixtures; all ways over one database.
 
     Fault cases share nothing, take long and wait much, so each goes where there is room.
     """

@@ -59,8 +59,8 @@ TRANSFERS_AT_ONCE = 4
 class LogUploader:
     """The file a job prints to, and how much of it the server has.
 
-    The log of the attempt is this file from its start, so that the server's word how long it is tells where to go on,
-    whatever became of earlier answers.
+    The log of the attempt is a prefix of this file, so that its length, which the server returns, is where to continue,
+    even if earlier answers were lost.
     """
 
     def __init__(self, api: AttemptApi, path: Path) -> None:
@@ -77,7 +77,7 @@ class LogUploader:
         return self.path.stat().st_size
 
     def send(self) -> None:
-        """Send what is new, unless the server keeps no more. Raises what the server answers, and `OSError`."""
+        """Send new output unless the log on the server is full. Raises the client's errors and `OSError`."""
         with self._sending, self.path.open("rb") as file:
             while not self._full:
                 file.seek(self._sent)
@@ -101,7 +101,7 @@ def environment() -> dict[str, str]:
 
 
 class Stop(Enum):
-    """Why an attempt is given up."""
+    """Reason to stop an attempt."""
 
     LEASE_LOST = "lease-lost"
     CANCELLED = "cancelled"
@@ -123,7 +123,7 @@ class Watch:
     weighed: float = 0.0
 
     def verdict(self, child: ChildProcess) -> Stop | None:
-        """Why the attempt must stop now, if it must."""
+        """Return the reason to stop the attempt now, or None."""
         if self.keeper.lost.is_set():
             return Stop.LEASE_LOST
         if self.keeper.cancelled.is_set():
@@ -141,7 +141,7 @@ class Watch:
         return None
 
     def explain(self, stop: Stop) -> str:
-        """The reason in a sentence, with its figures."""
+        """Return the reason as a sentence with its numbers."""
         resources = self.lease.resources
         return {
             Stop.LEASE_LOST: "the lease was lost",
@@ -178,7 +178,7 @@ class RunningAttempt:
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Have `child` do the job; `finish` must follow. Afterwards the child is idle, or dead."""
+        """Run the job in `child`; call `finish` next. Afterwards the child is idle or dead."""
         try:
             child.send(self._order())
             end = self._attend(child)
@@ -283,7 +283,7 @@ class RunningAttempt:
     # -- at the end --
 
     def _report(self, end: Done | Failed | Stop) -> None:
-        """Tell the server how it went; heartbeats go on meanwhile, for it may take a while to get through."""
+        """Report the result to the server. Heartbeats continue, because the server may be unreachable for a while."""
         if end is Stop.LEASE_LOST:
             log.warning("%s: %s", self._lease.job, self._watch.explain(end))
             return
@@ -317,7 +317,7 @@ class RunningAttempt:
         )  # fmt: skip
 
     def _try_to_send_log(self) -> None:
-        """Send what is new. A log that cannot be sent is no reason to lose a result."""
+        """Send new output; a failure is logged only, so that no result is lost because of it."""
         try:
             self._job_log.send()
         except LeaseLost:

@@ -30,7 +30,7 @@ from marey_schemas.worker_protocol import (
 )
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
-"""For the final answer of an attempt: computed results are worth waiting for."""
+"""Retries of the final request of an attempt: computed results are worth waiting for."""
 
 PLAIN_TEXT = "text/plain; charset=utf-8"
 
@@ -94,7 +94,7 @@ class AttemptApi:
         return _split_documents(answer.content)
 
     def read_item(self, kind: Kind, item: str) -> Item:
-        """An item as it is now."""
+        """Return an item as it is now."""
         with _dead_token_is_lost_lease():
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
@@ -112,12 +112,12 @@ class AttemptApi:
             return [one.result or {} for one in pages(self._transport, TaskResult, f"/jobs/{self._job}/results")]
 
     def read_blob(self, digest: str) -> bytes:
-        """Bytes by digest."""
+        """Return a blob's bytes by its digest."""
         with _dead_token_is_lost_lease():
             return Blobs(self._transport).fetch(digest)
 
     def put_file(self, path: Path) -> str:
-        """Send a file; its digest."""
+        """Send a file and return its digest."""
         with _dead_token_is_lost_lease():
             return Blobs(self._patient).put_file(path)
 
@@ -139,7 +139,7 @@ def _dead_token_is_lost_lease() -> Iterator[None]:
 
 
 def _split_documents(data: bytes) -> list[bytes | None]:
-    """The bytes of each document in the MessagePack of `{"documents": [...]}`."""
+    """Return the bytes of each document in the MessagePack of `{"documents": [...]}`."""
     unpacker = msgpack.Unpacker(max_buffer_size=len(data))
     unpacker.feed(data)
     if unpacker.read_map_header() != 1 or unpacker.unpack() != "documents":

@@ -64,7 +64,7 @@ def load(kinds: list[str]) -> None:
 
 
 def run_job(run: Run, pipe: Connection) -> End:
-    """Do one job; every way it can end, as a message."""
+    """Run one job and return its end, of any kind, as a message."""
     context = Context(run, pipe)
     allow_memory(run.memory_limit_bytes)
     try:
@@ -99,7 +99,7 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """A task, a gathering, or a job that is neither; one that has no tasks is done and gathered at once."""
+    """Run a task, a gathering, or a whole job; a fan-out without tasks runs and is gathered at once."""
     params = kind.params.model_validate(run.params)
     is_task, gathers = run.position is not None, run.position is None and run.size is not None
     results = context.task_results() if gathers else [_function(kind.implementation)(context, params)]

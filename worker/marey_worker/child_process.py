@@ -1,4 +1,4 @@
-"""A child as its supervisor sees it: started, spoken to, killed."""
+"""The supervisor's side of a child process: start, messages, kill."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class ChildProcess:
                 return
 
     def receive(self, timeout_s: float) -> Any | None:
-        """The next message, or None if none came in time. Raises `EOFError` once the child has died."""
+        """Return the next message, or None if none came in time. Raises `EOFError` once the child has died."""
         try:
             return self._pipe.recv() if self._pipe.poll(timeout_s) else None
         except ConnectionResetError as error:

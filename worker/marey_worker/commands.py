@@ -22,7 +22,7 @@ from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
 MIB = 1 << 20
 BRIEF = Retries(tries=6)
-"""Of what an attempt asks for: a worker that shall stop does not wait long for a server that is away."""
+"""Retries of an attempt's requests: a worker that shall stop does not wait long for an unreachable server."""
 
 
 def work(

@@ -32,7 +32,7 @@ from marey_worker.messages import (
 T = TypeVar("T")
 
 _numbers = itertools.count(1)
-"""Of requests, throughout the process: an answer that comes after its job has ended is nobody's."""
+"""Request numbers, unique in the process, so that an answer after the end of its job is ignored."""
 
 DOCUMENTS_PER_REQUEST = 16
 REQUESTS_AHEAD = 2
@@ -68,7 +68,7 @@ class Task(NamedTuple):
 
 
 class Context:
-    """One job: its inputs, and the ways to read documents, tell progress and stage results.
+    """A running job: its inputs, and methods that read documents, report progress and stage results.
 
     Everything goes through the supervisor; reading ahead and staging overlap with computing.
     """
@@ -87,7 +87,7 @@ class Context:
     # -- reading --
 
     def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
-        """A part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
+        """Return a part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None:
             raise NoSuchThing(f"There is no part {part!r} of {kind} {item!r} at revision {revision}.", f"no-{kind}")
@@ -117,7 +117,7 @@ class Context:
             yield documents[0][0], tuple(document for _, document in documents)
 
     def item(self, kind: Kind, item: str) -> Item:
-        """An item as it is now. Raises `NoSuchThing` where there is none."""
+        """Return an item as it is now. Raises `NoSuchThing` where there is none."""
         asked = self._send(lambda request: ReadItem(request, kind, item))
         found: Item = self._value(asked, f"no-{kind}")
         return found
@@ -133,7 +133,7 @@ class Context:
         return results
 
     def blob(self, digest: str) -> bytes:
-        """Bytes by digest."""
+        """Return a blob's bytes by its digest."""
         data: bytes = self._value(self._send(lambda request: ReadBlob(request, digest)), "no-blob")
         return data
 
@@ -148,7 +148,7 @@ class Context:
         self._staging.append(self._send(lambda request: Stage(request, body)))
 
     def put_file(self, path: Path) -> str:
-        """Send a file; its digest, to be named in the result."""
+        """Send a file and return its digest, for a reference in the result."""
         digest: str = self._ask(lambda request: PutFile(request, path))
         return digest
 
@@ -158,7 +158,7 @@ class Context:
             self._value(self._staging.popleft())
 
     def progress(self, done: float, total: float | None = None, note: str = "") -> None:
-        """Tell how far the job is; as often as is convenient."""
+        """Report the progress of the job; may be called often."""
         self._pipe.send(Made(Progress(done=done, total=total, note=note)))
 
     def log(self, text: str) -> None:

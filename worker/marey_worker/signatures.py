@@ -21,7 +21,7 @@ def of_exit(status: int) -> str:
 
 
 def told_exit(status: int) -> str:
-    """The same in words."""
+    """Return the same in words."""
     if status == -signal.SIGKILL:
         return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"
     if status < 0:

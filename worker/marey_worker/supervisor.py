@@ -182,7 +182,7 @@ class _Bench:
             self._child.kill(grace_s=0.0)
 
     def child(self) -> ChildProcess:
-        """A child that is ready for a job."""
+        """Return a child that is ready for a job."""
         if self._child is not None and (not self._child.alive or self._jobs >= JOBS_PER_CHILD):
             self._child.kill(grace_s=0.0)
             self._child = None

@@ -265,7 +265,7 @@ def _ask_name() -> str:
 
 
 def _ask_secret(what: str, *, twice: bool = False) -> str:
-    """A password from the terminal, unseen; where there is none, the next line of standard input."""
+    """Return a password from the terminal, unseen; where there is none, the next line of standard input."""
     if sys.stdin.isatty():
         return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
     if secret := sys.stdin.readline().rstrip("\r\n"):

@@ -53,7 +53,7 @@ class Address:
 
 
 def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHandle | None:
-    """The item an address names, of the first of `kinds` that has one; None if there is none."""
+    """Return the item an address names, of the first of `kinds` that has one; None if there is none."""
     project = marey.project(address.project)
     if not address.path:
         return None
@@ -70,7 +70,7 @@ def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHand
 
 
 def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
-    """The item an address names. Raises `WrongUsage` where there is none."""
+    """Return the item an address names. Raises `WrongUsage` where there is none."""
     found = find_item(marey, address, kinds)
     if found is None:
         wanted = " or ".join(kind.value for kind in kinds) if len(kinds) <= 2 else "item"

@@ -281,7 +281,7 @@ def export_annotation(
 
 
 def annotation_at(marey: Marey, place: str) -> AnnotationHandle:
-    """The annotation at a place. Raises `WrongUsage` where there is none."""
+    """Return the annotation at a place. Raises `WrongUsage` where there is none."""
     from marey_schemas.kinds import Kind
 
     found: AnnotationHandle = require_item(marey, Address.parse(place), [Kind.ANNOTATION])

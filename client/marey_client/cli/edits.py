@@ -179,7 +179,7 @@ def list_commands(
 def _commands(
     marey: Marey, project: str, do: list[str] | None, file: str | None, saved: str | None
 ) -> EditHandle | EditDocument:
-    """The saved edit, or the commands that were typed or are in a file."""
+    """Return the saved edit, or the commands that were typed or are in a file."""
     if saved is None:
         return _given(marey, project, do, file)
     if do or file:
@@ -203,7 +203,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """The command with the id of its source, where that is named by its address."""
+    """Return the command with the id of its source, where that is named by its address."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -233,7 +233,7 @@ def _range(text: str) -> slice:
 
 
 def parse_command(text: str) -> dict[str, Any]:
-    """A command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
+    """Return a command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
     from marey_schemas.editing.edits import COMMAND_MODELS
 
     try:

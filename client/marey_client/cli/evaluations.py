@@ -139,7 +139,7 @@ def report(
 
 
 def _clips_in(marey: Marey, address: Address) -> list[Any]:
-    """The clip at an address, or all in a folder and below it."""
+    """Return the clip at an address, or all in a folder and below it."""
     from marey_schemas.kinds import Kind
 
     clip = find_item(marey, address, [Kind.CLIP])
@@ -161,7 +161,7 @@ def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
 
 
 def evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
-    """The evaluation at a place. Raises `WrongUsage` where there is none."""
+    """Return the evaluation at a place. Raises `WrongUsage` where there is none."""
     from marey_schemas.kinds import Kind
 
     found: EvaluationHandle = require_item(marey, Address.parse(place), [Kind.EVALUATION])

@@ -54,7 +54,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """An error in one line, with what is needed to ask for help."""
+    """Return an error in one line, with what is needed to ask for help."""
     from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(_told(error).split()) or type(error).__name__

@@ -109,7 +109,7 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
 
 
 def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
-    """An item, or where the input takes many, a folder; or what a job makes."""
+    """Return an item, or where the input takes many, a folder; or what a job makes."""
     from marey_schemas.jobs import ItemInput, JobOutputsInput
 
     if address.has_id and address.name.startswith("job_"):

@@ -98,7 +98,7 @@ def sample(
 
 
 def model_at(marey: Marey, place: str) -> ModelHandle:
-    """The model at a place. Raises `WrongUsage` where there is none."""
+    """Return the model at a place. Raises `WrongUsage` where there is none."""
     from marey_schemas.kinds import Kind
 
     found: ModelHandle = require_item(marey, Address.parse(place), [Kind.MODEL])

@@ -102,7 +102,7 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             try:
                 restored = thing.restore()
             except Conflict as error:
-                error.add_note("move what stands there away first, with marey mv")
+                error.add_note("first move the item at that place away, with marey mv")
                 raise
             tell(f"{thing.place} is back")
             return restored
@@ -152,7 +152,7 @@ def _parted(path: str) -> tuple[str, str]:
 
 
 def _typed(thing: Thing) -> str:
-    """A thing as it is typed; a folder with a final stroke."""
+    """Return a thing as it is typed; a folder with a final stroke."""
     place = f"{thing.place}/" if thing.kind == FOLDER else thing.place
     return place if place.isascii() and " " not in place else f"'{place}'"
 

@@ -42,7 +42,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
 
 def _shown(cell: object) -> str:
-    """A cell as text; moments to the second, as the server's clock of UTC has them."""
+    """Return a cell as text; moments to the second, as the server's clock of UTC has them."""
     from datetime import datetime
 
     if isinstance(cell, datetime):

@@ -141,7 +141,7 @@ def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) 
 
 
 def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The project, and the takes as `build_model` wants them. Files are sent."""
+    """Return the project, and the takes as `build_model` wants them. Files are sent."""
     if project is None:
         addresses = [Address.parse(take) for take in takes]
         if len({address.project for address in addresses}) > 1:

@@ -168,7 +168,7 @@ def _constraint(
 
 
 def _moment(text: str) -> str | float:
-    """A canonical frame where it is a number, else a label."""
+    """Return a canonical frame where it is a number, else a label."""
     try:
         return float(text)
     except ValueError:

@@ -164,7 +164,7 @@ def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def record_arrays(document: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
-    """The ticks of each trial by its name, T of them at `rate_hz` of the document.
+    """Return the ticks of each trial by its name, T of them at `rate_hz` of the document.
 
     rows (T,): row of the database that is shown; positions (T, 2): root on the ground, metres; headings (T,): radians;
     status (T,): 0 kept, 1 replacing, 2 replaced, 3 forced; match_cost, continuing_cost, pose_cost (T,): NaN where one

@@ -28,7 +28,7 @@ class GraphPlace(Request):
 
 
 class GraphPrimitive(Request):
-    """One node: a model, what part it plays, and what may follow it."""
+    """A node of the graph: a model, its type, and the primitives that may follow it."""
 
     model: RevisionRef | OutputRef
     type: Literal["start", "standard", "end", "idle", "single", "cycle_end"] = "standard"
@@ -93,7 +93,7 @@ def _require_known(nodes: Mapping[GraphPlace, Any], where: str, places: Iterable
 
 
 def _reached(starts: Iterable[GraphPlace], follows: Mapping[GraphPlace, set[GraphPlace]]) -> set[GraphPlace]:
-    """Everything that can be come to from the starts, which count themselves."""
+    """Return all nodes that can be reached from the starts, including the starts."""
     reached = set(starts)
     waiting = list(reached)
     while waiting:

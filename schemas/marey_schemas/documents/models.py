@@ -182,12 +182,12 @@ class MotionPrimitiveDocument(Request):
 
 
 def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
-    """A stored part `model` without its notes, which older documents may hold in ways of their own."""
+    """Return a validated part `model` without its notes, whose form differs in older documents."""
     return MotionPrimitiveDocument.model_validate({**part, "provenance": {}, "training": None})
 
 
 def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
-    """Origin of an imported part `model`; None where an older document records it in another form."""
+    """Return the origin of an imported part `model`; empty if an older document records it in another form."""
     try:
         return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
     except ValidationError:
@@ -195,7 +195,7 @@ def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
 
 
 def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:
-    """Of the examples of a stored part `model`; none where an older document says them in a way of its own."""
+    """Return the examples' log-likelihoods in a part `model`; none if an older document has another form."""
     try:
         examples = TrainingNotes.model_validate(model.get("training") or {}).examples
     except ValidationError:

@@ -1,4 +1,4 @@
-"""Files that models, trees and graphs were imported from: given back as they came while nothing has changed."""
+"""Imported files of models, trees and graphs, which are exported unchanged as long as the part is unchanged."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ CONTENT = {
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""Members of a part that come from its file."""
+"""Members of a part that are read from its file."""
 
 
 class StoredOriginal(Request):
-    """The file that something was imported from, and the digest of what it became then."""
+    """An imported file, with the digest of the content that was made from it."""
 
     name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest
@@ -30,7 +30,7 @@ class StoredOriginal(Request):
 
 
 def content_digest(part: str, document: Mapping[str, Any]) -> str:
-    """Digest of what a part says that comes from its file; arrays may be references to what is stored."""
+    """Return the digest of the members of a part that come from its file; arrays may be references."""
     return document_digest({name: document.get(name) for name in CONTENT[part]})
 
 

@@ -15,7 +15,7 @@ Frame = Annotated[int, Field(ge=0, le=MAX_FRAME)]
 
 
 class CreateSegment(Request):
-    """Put the frames [start, end) under a label."""
+    """Label the frames [start, end) as a segment."""
 
     command: Literal["create_segment"]
     label: Label
@@ -27,7 +27,7 @@ class CreateSegment(Request):
 
 
 class RemoveSegment(Request):
-    """Leave the frames of a segment without a label."""
+    """Remove a segment."""
 
     command: Literal["remove_segment"]
     at: Frame = Field(description="Any frame of the segment.")
@@ -42,7 +42,7 @@ class SplitSegment(Request):
 
 
 class MergeSegment(Request):
-    """Make one of a segment and its neighbour, with the gap between them."""
+    """Merge a segment with its neighbour, including the gap between them."""
 
     command: Literal["merge_segment"]
     at: Frame = Field(description="Any frame of the segment whose label is kept.")
@@ -50,7 +50,7 @@ class MergeSegment(Request):
 
 
 class MoveBoundary(Request):
-    """Let a segment start or end at another frame; a neighbour at that edge follows or gives way."""
+    """Move the start or end of a segment; an adjacent neighbour is extended or shortened."""
 
     command: Literal["move_boundary"]
     at: Frame = Field(description="Any frame of the segment.")
@@ -67,7 +67,7 @@ class RelabelSegment(Request):
 
 
 class AddKeyframe(Request):
-    """Mark a frame."""
+    """Add a keyframe."""
 
     command: Literal["add_keyframe"]
     label: Label
@@ -75,7 +75,7 @@ class AddKeyframe(Request):
 
 
 class MoveKeyframe(Request):
-    """Mark another frame instead."""
+    """Move a keyframe to another frame."""
 
     command: Literal["move_keyframe"]
     label: Label
@@ -84,7 +84,7 @@ class MoveKeyframe(Request):
 
 
 class RemoveKeyframe(Request):
-    """Take a mark away."""
+    """Remove a keyframe."""
 
     command: Literal["remove_keyframe"]
     label: Label
@@ -92,7 +92,7 @@ class RemoveKeyframe(Request):
 
 
 class Clear(Request):
-    """Take every segment and keyframe away."""
+    """Remove all segments and keyframes."""
 
     command: Literal["clear"]
 

@@ -73,7 +73,7 @@ class EncodedArray:
 
 
 def is_leaf(value: Mapping[str, Any]) -> bool:
-    """Whether an object of a parsed document stands for an array."""
+    """Return whether an object of a parsed document stands for an array."""
     return value.keys() >= LEAF_KEYS
 
 
@@ -158,7 +158,7 @@ class ArrayOf:
     columns: int | None = None
 
     def validate(self, value: object) -> NDArray[Any]:
-        """The array, or `ArrayError` saying which of dtype, dimensions, columns or values is wrong."""
+        """Return the array, or `ArrayError` saying which of dtype, dimensions, columns or values is wrong."""
         if isinstance(value, EncodedArray):
             array = require_finite(value.decode())
         elif isinstance(value, np.ndarray):

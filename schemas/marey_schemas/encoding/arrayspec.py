@@ -77,7 +77,7 @@ class ArraySpec:
 
 
 def little_endian(array: NDArray[Any]) -> NDArray[Any]:
-    """The same numbers as a C-contiguous little-endian array, copied only where needed. Raises `ArrayError`."""
+    """Return the same numbers as a C-contiguous little-endian array, copied only where needed. Raises `ArrayError`."""
     spec = ArraySpec.of(array)
     return np.ascontiguousarray(array, dtype=spec.dtype).reshape(spec.shape)
 

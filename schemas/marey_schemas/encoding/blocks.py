@@ -54,7 +54,7 @@ class _Layout:
         return -(-self.columns // self.group_columns)
 
     def of_frames(self, frames: int) -> "_Layout":
-        """The same tiles for another number of frames."""
+        """Return the same tiles for another number of frames."""
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
@@ -108,7 +108,7 @@ def cut_frames(data: bytes, start: int, stop: int) -> bytes:
 
 
 def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[bytes]:
-    """The tiles of an array, each compressed by itself."""
+    """Return the tiles of an array, each compressed by itself."""
     table = array.reshape(layout.frames, layout.columns)
     parts = (
         (table[layout.block(block), layout.group(group)], layout.lead(group))
@@ -240,7 +240,7 @@ def _columns_by_group(
 
 
 def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """The indices counted from zero. Raises `IndexError`."""
+    """Return the indices counted from zero. Raises `IndexError`."""
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
         raise IndexError("columns must be one list of integers")

@@ -28,7 +28,7 @@ _LEAVES = (str, float, int, bool, type(None))
 
 
 def canonical_json(tree: Any) -> bytes:
-    """The one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
+    """Return the one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
 
     JSON has one type of number, and databases and languages keep no other: a whole number below 2**63 is written
     without a point whether it came as 1 or 1.0 (and -0.0 as 0), any other as the shortest text of its double. Raises
@@ -45,7 +45,7 @@ def document_digest(tree: Any) -> str:
 
 
 def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], None]) -> Any:
-    """The tree with each array replaced by `{"dtype", "shape", "content": array_digest}`.
+    """Return the tree with each array replaced by `{"dtype", "shape", "content": array_digest}`.
 
     `keep(digest, array)` is called once per array, in document order.
     """
@@ -64,7 +64,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
 
 
 def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray]) -> Any:
-    """The inverse of `detach_arrays`: each reference is replaced by `load(digest)`."""
+    """Return the inverse of `detach_arrays`: each reference is replaced by `load(digest)`."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"dtype", "shape", "content"}:
             return load(tree["content"])

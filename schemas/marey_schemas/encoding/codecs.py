@@ -173,7 +173,7 @@ class _Walk:
         return "".join("/" + str(step).replace("~", "~0").replace("/", "~1") for step in self._path)
 
     def visit(self, value: Any) -> Any:
-        """The checked and converted value. Raises `CodecError`."""
+        """Return the checked and converted value. Raises `CodecError`."""
         if isinstance(value, _FOREIGN):
             raise self._error("bad-type", f"a value of type {type(value).__name__} cannot be encoded")
         if isinstance(value, str):

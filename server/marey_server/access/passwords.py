@@ -9,7 +9,7 @@ import secrets
 from typing import NamedTuple
 
 LOG2_N = 15
-"""2**15 blocks of 1 KiB: 32 MiB and about 0.1 s per guess."""
+"""Cost parameter of scrypt: 2**15 blocks of 1 KiB need 32 MiB and about 0.1 s per guess."""
 
 _BLOCK = 8
 _PARALLEL = 1
@@ -33,7 +33,7 @@ def hash_password(password: str) -> str:
 
 
 def password_matches(password: str, stored: str | None) -> bool:
-    """Whether `password` is the one `stored` was made of. As slow without a stored hash as with one."""
+    """Return whether `password` is the one `stored` was made of. As slow without a stored hash as with one."""
     parsed = _parse(stored or _nobody())
     key = _derive(password, parsed.salt, parsed.log2_n, parsed.block, parsed.parallel, len(parsed.key))
     return hmac.compare_digest(key, parsed.key) and stored is not None
@@ -57,7 +57,7 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """A hash that no password has, for users that do not exist: the answer must take as long."""
+    """Return a hash that no password has, for users that do not exist: the answer must take as long."""
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

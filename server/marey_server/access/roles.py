@@ -28,4 +28,4 @@ class RequiredRole:
 
 
 STRICTEST = RequiredRole(Role.OWNER, "write", guests=False)
-"""Required where nothing is declared."""
+"""Role required by operations that declare none."""

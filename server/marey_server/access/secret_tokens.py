@@ -24,13 +24,13 @@ class IssuedToken(NamedTuple):
 
 
 def issue_user_token() -> IssuedToken:
-    """A new token of a user."""
+    """Create a token of a user."""
     prefix, secret = secrets.token_hex(6), secrets.token_hex(32)
     return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
 
 
 def issue_attempt_token() -> IssuedToken:
-    """A new token of an attempt; its row is found by the hash."""
+    """Create a token of an attempt; its row is found by the hash."""
     secret = secrets.token_hex(32)
     return IssuedToken(f"{_ATTEMPT}{secret}", "", hash_secret(secret))
 
@@ -41,7 +41,7 @@ def hash_secret(secret: str) -> str:
 
 
 def secret_matches(secret: str, secret_hash: str) -> bool:
-    """Whether `secret` is the one that was hashed, in constant time."""
+    """Return whether `secret` is the one that was hashed, in constant time."""
     return hmac.compare_digest(hash_secret(secret), secret_hash)
 
 
@@ -54,5 +54,5 @@ def split_user_token(text: str) -> tuple[str, str] | None:
 
 
 def attempt_secret(text: str) -> str | None:
-    """The secret of an attempt's token, None if `text` is none."""
+    """Return the secret of an attempt's token, None if `text` is none."""
     return text[len(_ATTEMPT) :] or None if text.startswith(_ATTEMPT) else None

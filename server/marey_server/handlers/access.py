@@ -17,7 +17,7 @@ from marey_server.store.transaction import Transaction
 
 
 def read_me(tx: Transaction) -> Me:
-    """The caller, and how far the credential reaches."""
+    """Return the caller, and how far the credential reaches."""
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
@@ -25,7 +25,7 @@ def read_me(tx: Transaction) -> Me:
 
 
 def sign_in(tx: Transaction, principal: Principal, request: Login) -> NewToken:
-    """A token for somebody whose password was checked."""
+    """Return a token for somebody whose password was checked."""
     tx.principal = principal
     wanted = TokenCreate(name="sign-in", scopes=principal.scopes, expires_in_s=request.expires_in_s)
     return tokens.create_token(tx, wanted)
@@ -173,7 +173,7 @@ class UserResource(Resource):
         )
 
     async def _verify(self, user: str, body: UserChange) -> str | None:
-        """The stored hash that the current password fits.
+        """Return the stored hash that the current password fits.
 
         Raises `ForbiddenProblem` where one was given that does not.
         """

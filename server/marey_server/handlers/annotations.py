@@ -14,7 +14,7 @@ from marey_server.motions.annotating import apply_commands, prepare_annotation
 from marey_server.store import items
 
 MOST_TRIES = 5
-"""Commands that go for any state are applied anew to what others made of an annotation meanwhile, so often."""
+"""Attempts to apply commands sent with `If-Match: *` when other requests change the annotation at the same time."""
 
 
 class AnnotationCommands(Resource):

@@ -15,12 +15,12 @@ from marey_server.http.streaming import BlobSender
 from marey_server.store import blobs
 
 MAX_BLOB_BYTES = 1024 * MIB
-"""More must come as a resumable upload."""
+"""Greatest size of a blob in one request; larger blobs need a resumable upload."""
 _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 def require_digest(text: str) -> str:
-    """The text, if it can name a blob. Raises `NotFoundProblem`."""
+    """Return the text, if it can name a blob. Raises `NotFoundProblem`."""
     if not _DIGEST.fullmatch(text):
         raise NotFoundProblem("A blob is identified by sha256: and 64 hexadecimal digits.", code="no-blob")
     return text

@@ -65,7 +65,7 @@ class ItemsQuery(CountedPageQuery):
 
 
 def kind_of(plural: str) -> Kind:
-    """The kind that a segment of the address names. Raises `NotFoundProblem`."""
+    """Return the kind that a segment of the address names. Raises `NotFoundProblem`."""
     try:
         return Kind.from_plural(plural)
     except KeyError:

@@ -142,7 +142,7 @@ class ProjectJobBatch(Resource):
 
 
 class JobResource(Resource):
-    """One job."""
+    """State of one job."""
 
     path = "/jobs/{job}"
     tag = "Jobs"
@@ -163,7 +163,7 @@ def wait_preferred(resource: Resource) -> float:
 
 
 async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
-    """The job when it has ended, when the time is over, or when the caller or the server is going away."""
+    """Return the job when it has ended, when the time is over, or when the caller or the server is going away."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     with wakeups.listen([f"job:{job_id}"]) as listener:

@@ -110,14 +110,14 @@ class Figure(StoredFileSender):
 
 
 def _scripts(report: ReportDocument) -> str:
-    """The part of the policy that lets the page run its own scripts, named by content, and no others."""
+    """Return the part of the policy that lets the page run its own scripts, named by content, and no others."""
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
-    """The report of an item, of whichever kind it is. Raises `NotFoundProblem`."""
+    """Return the report of an item, of whichever kind it is. Raises `NotFoundProblem`."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
     return _REPORT_OF[part["schema"]].model_validate(part)
 
@@ -126,7 +126,7 @@ _REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}
 
 
 def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredFigure:
-    """A figure of a report. Raises `NotFoundProblem`, and says what there is."""
+    """Return a figure of a report. Raises `NotFoundProblem`, and says what there is."""
     named = [figure for figure in report.figures if figure.name == name]
     for figure in named:
         if figure.trial == trial:
@@ -140,7 +140,7 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """The form of a figure that is asked for. Raises `NotFoundProblem`."""
+    """Return the form of a figure that is asked for. Raises `NotFoundProblem`."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     table = query.table or next(iter(figure.csv), None)

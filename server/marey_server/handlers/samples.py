@@ -45,7 +45,7 @@ class ModelUser(Resource):
     async def usable_model(
         self, project: str, kind: str, item: str, revision: int | None
     ) -> tuple[FoundModel, UsableModel]:
-        """The model that is asked for, parsed; those used last are kept."""
+        """Return the model that is asked for, parsed; those used last are kept."""
         found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
         known = self.services.models.get(found.part.digest)
         if known is None:

@@ -29,7 +29,7 @@ class Searcher(Resource):
     async def searchables(
         self, project: str, kind: str, item: str, request: SearchRequest
     ) -> tuple[list[FoundSearchable], list[Searchable]]:
-        """The model of each step with its tree, parsed; those used last are kept."""
+        """Return the model of each step with its tree, parsed; those used last are kept."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
         parsed: dict[SearchableKey, Searchable] = {}
         for one in found:

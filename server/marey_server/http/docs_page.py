@@ -27,7 +27,7 @@ nav a { margin-right: .8rem }
 
 
 def render_page(document: Schema) -> bytes:
-    """The page of an OpenAPI document."""
+    """Return the page of an OpenAPI document."""
     return "".join(_page(document)).encode()
 
 

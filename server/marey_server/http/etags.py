@@ -36,12 +36,12 @@ ABSENT = Precondition(absent=True)
 
 
 def entity_tag(state: int | str, form: str) -> str:
-    """The ETag header of a state in a form."""
+    """Return the ETag header of a state in a form."""
     return f'"{state}.{form}"'
 
 
 def parse_tags(header: str) -> list[str]:
-    """The opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequestProblem`."""
+    """Return the opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequestProblem`."""
     if header.strip() == "*":
         return ["*"]
     tags: list[str] = []
@@ -63,7 +63,7 @@ def parse_tags(header: str) -> list[str]:
 
 
 def matches(if_none_match: str | None, tag: str) -> bool:
-    """Whether the caller holds `tag` already, so that 304 is the answer."""
+    """Return whether the caller holds `tag` already, so that 304 is the answer."""
     if not if_none_match:
         return False
     held = parse_tags(if_none_match)
@@ -71,7 +71,7 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 
 
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
-    """The precondition of a change.
+    """Return the precondition of a change.
 
     Raises `PreconditionRequiredProblem` where the caller sent none, `PreconditionFailedProblem` where none of the tags
     can ever match, `BadRequestProblem` where they are malformed.

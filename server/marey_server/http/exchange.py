@@ -48,7 +48,7 @@ class Exchange(RequestHandler):
 
     @classmethod
     def template(cls) -> str:
-        """The template of the address, as in `/api/v1/projects/{project}`."""
+        """Return the template of the address, as in `/api/v1/projects/{project}`."""
         return cls.root + cls.path.replace(":int}", "}")
 
     @property
@@ -60,12 +60,12 @@ class Exchange(RequestHandler):
     # -- the body that comes ------------------------------------------------------------------------------------------
 
     def declared_length(self) -> int:
-        """The length of the body as its sender says; 0 where it does not, or says what Tornado refuses next."""
+        """Return the length of the body as its sender says; 0 where it does not, or says what Tornado refuses next."""
         text = self.request.headers.get("Content-Length", "0").partition(",")[0].strip()  # the same may stand twice
         return int(text) if _LENGTH.fullmatch(text) else 0
 
     def expects_body(self) -> bool:
-        """Whether a body follows the headers."""
+        """Return whether a body follows the headers."""
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
@@ -102,12 +102,12 @@ class Exchange(RequestHandler):
             await self.flush()
 
     def method_not_allowed(self) -> MethodNotAllowedProblem:
-        """The refusal of a method that was not declared."""
+        """Return the refusal of a method that was not declared."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
         return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
 
     def is_awaited(self) -> bool:
-        """Whether an answer still has somebody to go to, and the server time to make one."""
+        """Return whether an answer still has somebody to go to, and the server time to make one."""
         return not self._gone and not self.services.draining.is_set()
 
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class Exchange(RequestHandler):
 
 
 def render_problem(error: BaseException, request_id: str) -> Rendered:
-    """The problem document of an error. Of faults that are not refusals it says nothing but the request id."""
+    """Return the problem document of an error. Of faults that are not refusals it says nothing but the request id."""
     if isinstance(error, ApiProblem):
         problem = _of_refusal(error, request_id)
         headers = dict(error.headers)

@@ -62,7 +62,7 @@ class _Range:
 
 
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
-    """The offer the caller likes best; the first offer wins ties.
+    """Return the offer the caller likes best; the first offer wins ties.
 
     Raises `NotAcceptableProblem`, listing what is offered.
     """
@@ -111,7 +111,7 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
 
 
 def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
-    """The media type of a body; JSON if it names none.
+    """Return the media type of a body; JSON if it names none.
 
     Raises `UnsupportedMediaTypeProblem`, listing what is understood.
     """

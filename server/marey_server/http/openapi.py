@@ -66,7 +66,7 @@ _TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
 
 
 def build_document(routes: Iterable[Route], version: str) -> Schema:
-    """The OpenAPI document of a table of routes."""
+    """Return the OpenAPI document of a table of routes."""
     routes = list(routes)
     models = _Models(routes)
     paths: dict[str, Schema] = {}
@@ -126,7 +126,7 @@ class _Models:
         return {"$ref": _REF.format(model=name)}
 
     def document(self) -> Schema:
-        """A document of any known schema; the open one admits those of the others, too."""
+        """Return a document of any known schema; the open one admits those of the others, too."""
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 
 
@@ -178,7 +178,7 @@ def _query_parameters(operation: Operation) -> list[Schema]:
 
 
 def _without_null(schema: Schema) -> Schema:
-    """A parameter that is not there is simply absent: null cannot be sent."""
+    """A parameter without a value is absent from the query, because null cannot be sent."""
     shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
     shown.pop("title", None)
     choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]

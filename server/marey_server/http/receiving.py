@@ -27,7 +27,7 @@ class Receiver:
             await self._flush()
 
     async def finish(self) -> Spool:
-        """Everything that came, hashed. The caller closes it."""
+        """Return the received body with its digest. The caller closes it."""
         if len(self._pending) <= INLINE_BYTES:
             self._write(bytes(self._pending))
             self._pending.clear()

@@ -70,7 +70,7 @@ class AnswerForm:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """The bytes of a reply; 304 without any where the caller holds this state in this form."""
+    """Return the bytes of a reply; 304 without any where the caller holds this state in this form."""
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location
@@ -94,7 +94,7 @@ def _load(content: Lasting, media: MediaType) -> bytes:
 
 
 def encode(content: Content, media: MediaType) -> bytes:
-    """A model or tree in a media type; bytes as they are."""
+    """Return a model or tree in a media type; bytes as they are."""
     if isinstance(content, bytes):
         return content
     if isinstance(content, BaseModel):

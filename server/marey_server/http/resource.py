@@ -57,7 +57,7 @@ class Resource(Exchange):
 
     tag: ClassVar[str]
     uneventful = False
-    """Whether this success says nothing that a log should tell: nothing was leased, the server is still alive."""
+    """Whether a success is too frequent to be logged, such as an empty claim or a readiness check."""
 
     operation: Operation
     caller: Caller
@@ -176,7 +176,7 @@ class Resource(Exchange):
     # -- one request, from its headers to its answer ------------------------------------------------------------------
 
     async def prepare(self) -> None:
-        """Check everything that the headers and the address tell, before any of the body is taken in."""
+        """Check the path, the query and the headers before the body is received."""
         self.services.in_flight.add(self)
         try:
             self._check_head()

@@ -83,7 +83,7 @@ class RouteTable(Router):
         node.resource = resource
 
     def find_handler(self, request: HTTPServerRequest, **_kwargs: Any) -> HTTPMessageDelegate:
-        """The resource of a request's path, with the values of the path's variables."""
+        """Return the resource of a request's path, with the values of the path's variables."""
         resource, values = self._find(request.path or "")
         names = _VARIABLE.findall(resource.path)
         return self._application.get_handler_delegate(

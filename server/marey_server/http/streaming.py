@@ -49,7 +49,7 @@ class ByteRange:
 
 
 def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRange | None:
-    """The range that is asked for; None for the whole: no range, several, malformed, or of another state."""
+    """Return the range that is asked for; None for the whole: no range, several, malformed, or of another state."""
     if header is None or (if_range is not None and if_range.strip() != etag):
         return None
     match = _RANGE.fullmatch(header.strip())
@@ -81,7 +81,7 @@ def _open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: 
 
 
 def attachment(file_name: str) -> str:
-    """The Content-Disposition of a file (RFC 6266), with a name of any characters."""
+    """Return the Content-Disposition of a file (RFC 6266), with a name of any characters."""
     plain = "".join(sign if " " <= sign <= "~" and sign not in '"\\%' else "_" for sign in file_name)
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(file_name, safe='')}"
 

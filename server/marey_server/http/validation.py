@@ -56,7 +56,7 @@ def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
 
 
 def decode_body(data: bytes, media_type: str) -> Any:
-    """The tree a body holds.
+    """Return the tree a body holds.
 
     Raises `BadRequestProblem` where it is none, `InvalidProblem` where it holds what may not travel.
     """
@@ -83,7 +83,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
-    """Whether a tree holds arrays.
+    """Return whether a tree holds arrays.
 
     Raises `InvalidProblem` at a text with a NUL character, which databases do not store.
     """

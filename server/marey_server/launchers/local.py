@@ -1,7 +1,7 @@
 """Worker processes beside the server, on the same machine.
 
 A worker gets its token through a pipe to its standard input, which stays open: when the server goes, however it goes,
-the pipe closes and the worker stops. Nothing secret stands in an argument list or an environment.
+the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables.
 """
 
 from __future__ import annotations

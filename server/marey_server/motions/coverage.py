@@ -76,7 +76,7 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 
 
 def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
-    """A new stream, and the members of `CoverageStreamState` that are computed."""
+    """Start a stream; return it with the computed members of `CoverageStreamState`."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import Grid
 
@@ -106,7 +106,7 @@ def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]
 
 
 def look(stream: Stream) -> CoverageStreamState:
-    """A stream with its map."""
+    """Return a stream with the coverage of each cell."""
     from marey_motion.evaluation.online import OnlineCoverage
 
     online = OnlineCoverage.from_tree(decode_tree(stream.state, MSGPACK))
@@ -178,7 +178,7 @@ def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
 
 @lru_cache(maxsize=CACHED_BODIES)
 def body_of(rig: bytes) -> MatchingBody:
-    """The body of a stream's skeleton. Raises `MotionError` where joints that tell a direction are not mapped."""
+    """Return the body of a stream's skeleton. Raises `MotionError` if joints that define a direction are not mapped."""
     from marey_motion.documents import mapping_from_document, skeleton_from_document
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
@@ -230,7 +230,7 @@ def _packed(online: OnlineCoverage) -> bytes:
 
 
 def _said(frames: CoverageFrames) -> str:
-    """The digest of a request: the same frames at the same offset, in whatever media type they came."""
+    """Return the digest of a request: the same frames at the same offset, in whatever media type they came."""
     hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
     hashed.update("/".join(frames.translated_joints).encode())
     for name in ("poses", "translations", "roots"):
@@ -254,7 +254,7 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 
 
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
-    """The members of `CoverageNow`."""
+    """Return the members of `CoverageNow`."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
     return {
         "index": online.index,

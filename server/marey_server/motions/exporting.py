@@ -30,7 +30,7 @@ class ServedFile:
 
 
 def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
-    """Everything that a file of an item can need. Raises `NotFoundProblem`."""
+    """Return everything that a file of an item can need. Raises `NotFoundProblem`."""
     found = items.read_item(tx, project, kind, item_id)
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
@@ -45,7 +45,7 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
 def find_unchanged_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile | None:
-    """The file that a model, a tree or a graph was imported from, if that still says the same.
+    """Return the file that a model, a tree or a graph was imported from, if that still says the same.
 
     Raises `NotFoundProblem`.
     """
@@ -65,7 +65,7 @@ def find_unchanged_original(
 def find_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile:
-    """The file that an item, or a model's tree, was imported from.
+    """Return the file that an item, or a model's tree, was imported from.
 
     Raises `NotFoundProblem` where it was made otherwise.
     """
@@ -86,7 +86,7 @@ def find_original(
 def write_file(
     source: ItemToExport, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
 ) -> ServedFile:
-    """The file of an item. Raises `InvalidProblem` where the format cannot hold it."""
+    """Write the file of an item. Raises `InvalidProblem` where the format cannot hold it."""
     if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem("Only aligned clips can be exported in their source's time.", code="no-such-export")
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"

@@ -41,7 +41,7 @@ class SourceFile:
     content: bytes | Spool | None
 
     def read(self) -> bytes:
-        """All its bytes."""
+        """Return the bytes of the file."""
         assert self.content is not None
         return b"".join(self.content.chunks()) if isinstance(self.content, Spool) else self.content
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 MIB = 1 << 20
 LARGEST_ANSWER_BYTES = 32 * MIB
-"""Of the poses of all samples of one request."""
+"""Greatest size of the poses of all samples in an answer."""
 
 SAMPLES_SCHEMA = "marey/motion-samples@1"
 EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -57,7 +57,7 @@ class UsableModel:
 
 
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
-    """A model by its item. Raises `NotFoundProblem`."""
+    """Return a model by its item. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(f"An item of the kind {kind} generates no motion; only models do.", code="not-a-model")
     part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
@@ -65,7 +65,7 @@ def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision
 
 
 def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
-    """Its documents. Raises `NotFoundProblem` where its skeleton is gone."""
+    """Read the model's documents. Raises `NotFoundProblem` if its skeleton was deleted."""
     model = items.load_part(tx, found.part, arrays="decoded")
     ref = model["skeleton"]
     skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
@@ -73,7 +73,7 @@ def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
 
 
 def parse_model(loaded: LoadedModel) -> UsableModel:
-    """The model itself. Raises `InvalidProblem` where its numbers describe none."""
+    """Build the model from its documents. Raises `InvalidProblem` if its numbers are not valid."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.errors import MotionError
     from marey_motion.modelling.primitive_documents import primitive_from_tree
@@ -88,7 +88,7 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
 
 
 def size_bytes(model: UsableModel) -> int:
-    """Bytes of a model's arrays, and of those that are computed from its mixture."""
+    """Return the size in bytes of a model's arrays, and of those that are computed from its mixture."""
     primitive = model.primitive
     parts = (primitive.spatial, primitive.temporal)
     arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]

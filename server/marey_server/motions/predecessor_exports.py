@@ -29,7 +29,7 @@ class PredecessorOptions:
     """Options that the predecessor's formats leave open.
 
     `end_index` and `form` are of annotations, `layout` of models; no layout is that of the file that a model was
-    imported from, where it has not changed since, and else 3. `part` tells a model from its tree, and what is kept
+    imported from, where it has not changed since, and else 3. `part` selects a model or its tree, or what is kept
     beside an aligned clip from the clip.
     """
 
@@ -73,7 +73,7 @@ def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOr
 def write_predecessor(
     kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
-    """Name and bytes of a file.
+    """Return the name and the bytes of a file.
 
     Raises `InvalidProblem` where the item has none, `NotFoundProblem` for a model without a tree.
     """
@@ -115,7 +115,7 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
 
 
 def _alignment(part: Mapping[str, Any]) -> bytes:
-    """The time function, and the sections that keyframes cut the canonical frames into."""
+    """Return the time function, and the sections that keyframes cut the canonical frames into."""
     from marey_motion.formats.predecessor.alignment import write_predecessor_alignment
 
     info = AlignmentInfo.model_validate(part)

@@ -27,11 +27,11 @@ if TYPE_CHECKING:  # numeric modules take a second to load: only who looks at pr
 Tree = dict[str, Any]
 
 MOST_WORK = 5e9
-"""About nanoseconds of one thread. A job has no such limit."""
+"""Greatest cost of a preview, in nanoseconds of one thread (estimated). Jobs have no such limit."""
 MOST_NUMBERS = 50_000_000
-"""Of any motion on the way."""
+"""Greatest number of values in any intermediate motion."""
 MOST_SHOWN = 5_000_000
-"""Numbers of the answer."""
+"""Greatest number of values in the answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
 
 
 def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
-    """The document of the preview.
+    """Return the document of the preview.
 
     Raises `InvalidProblem` where the commands cannot be applied or there is no such frame.
     """
@@ -133,7 +133,7 @@ def _size(motion: Tree) -> int:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """A clip, and its body; the mapping is looked at when a command asks for it. Raises `MotionError`."""
+    """Return a clip, and its body; the mapping is looked at when a command asks for it. Raises `MotionError`."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

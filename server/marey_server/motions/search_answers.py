@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 
 FAR_CM = 5.0
-"""A model that misses a place by more does not reach there: inverse kinematics would hide that."""
+"""Error above which a position is out of the model's reach; inverse kinematics would hide it."""
 
 MOST_WORK = 3e9
-"""About nanoseconds of one thread: what a search may take."""
+"""Greatest cost of a search, in nanoseconds of one thread (estimated)."""
 
 UNITS = {
     "joint_position": "cm", "root_position": "cm", "joint_orientation": "deg", "look_direction": "deg",
@@ -128,7 +128,7 @@ def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tupl
 
 
 def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
-    """A refusal with a JSON Pointer to what the error names."""
+    """Return a refusal with a JSON Pointer to what the error names."""
     where = str(error.where or "")
     if not request.steps:
         where = where.removeprefix("steps[0]").removeprefix(".")
@@ -143,7 +143,7 @@ def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
 def answer_of(
     result: SearchResult, searchables: Sequence[Searchable], found: Sequence[FoundSearchable], request: SearchRequest
 ) -> dict[str, Any]:
-    """The answer as a document."""
+    """Return the answer as a document."""
     from marey_motion.documents import clip_to_document
 
     errors = _errors(result, request)
@@ -160,7 +160,7 @@ def answer_of(
 
 
 def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str) -> SampleFile:
-    """All steps as one file. Raises `InvalidProblem` where the format cannot hold it."""
+    """Write all steps to one file. Raises `InvalidProblem` where the format cannot hold it."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 

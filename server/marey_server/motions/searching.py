@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from marey_motion.rigs import JointMapping
 
 MOST_DRAWING_WORK = 2e9
-"""For trees of a request that are drawn because models have none: about nanoseconds of one thread."""
+"""Greatest cost of the trees that a request draws for models without one, in nanoseconds of one thread."""
 
 SearchableKey = tuple[str, str, str]
 
@@ -45,7 +45,7 @@ class FoundSearchable:
 
 @dataclass(frozen=True, slots=True)
 class LoadedSearchable:
-    """The documents of it."""
+    """The documents of a model that can be searched."""
 
     found: FoundSearchable
     model: LoadedModel
@@ -73,7 +73,7 @@ class Searchable:
 def find_searchables(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: SearchRequest
 ) -> list[FoundSearchable]:
-    """The model of each step. Raises `NotFoundProblem`."""
+    """Return the model of each step. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(f"An item of the kind {kind} cannot be searched; models can.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]
@@ -82,7 +82,7 @@ def find_searchables(
 
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
-    """Its documents. Raises `NotFoundProblem` where its skeleton is gone."""
+    """Read the model's documents. Raises `NotFoundProblem` if its skeleton was deleted."""
     tree, mapping = (
         None if part is None else items.load_part(tx, part, arrays="decoded") for part in (found.tree, found.mapping)
     )
@@ -90,7 +90,7 @@ def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> Lo
 
 
 def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
-    """The model itself, with a tree.
+    """Return the model itself, with a tree.
 
     Raises `InvalidProblem` where its numbers describe none, `TooLargeProblem` where drawing a tree takes too long.
     """
@@ -150,5 +150,5 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
 
 
 def size_bytes(made: Searchable) -> int:
-    """Bytes of a model's arrays and of its tree's."""
+    """Return the size in bytes of a model's arrays and of its tree's."""
     return models.size_bytes(made.usable) + made.tree.samples.nbytes + made.tree.means.nbytes

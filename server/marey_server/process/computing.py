@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 THREAD_NAME = "marey-compute"
 LONGEST_WAIT_S = 20.0
-"""For a place among the long computations; then the caller shall ask again."""
+"""Longest wait for a place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 KEPT_BLOCK_BYTES = 8 * 2**20

@@ -34,12 +34,12 @@ LEAD_TTL_US = 30_000_000
 LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
 FIRST_GARBAGE_S = 60.0
-"""After the start: who runs a server for an hour a day must not keep garbage for ever."""
+"""Delay of the first collection after the start; short, so that servers that run an hour a day collect, too."""
 
 
 @asynccontextmanager
 async def keeping_house(services: Services) -> AsyncIterator[None]:
-    """Keep house inside the block; at its end, let another process lead."""
+    """Run the periodic chores inside the block; at its end, let another process lead."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     chores = (
@@ -90,7 +90,7 @@ async def _reap(services: Services, holder: str) -> None:
 
 
 def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
-    """Whether this process leads, and whether workers have had time to renew their leases."""
+    """Return whether this process leads, and whether workers have had time to renew their leases."""
     return _leads(tx, holder), grace.over(tx.now_us)
 
 
@@ -114,7 +114,7 @@ async def _share_results(services: Services, holder: str) -> None:
 
 
 def _leads(tx: Transaction, holder: str) -> bool:
-    """Whether this process leads."""
+    """Return whether this process leads."""
     return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None
 
 

@@ -22,7 +22,7 @@ access_log = logging.getLogger("marey_server.access_log")
 
 
 def request_id(given: str | None) -> str:
-    """The caller's own request id if it is a sane one, else a new one."""
+    """Return the caller's own request id if it is a sane one, else a new one."""
     return given if given is not None and _SANE_ID.fullmatch(given) else secrets.token_hex(12)
 
 
@@ -34,7 +34,7 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def _tells_of_an_upgrade(record: logging.LogRecord) -> bool:
-    """Not of the look at the tables that each question for readiness begins with."""
+    """Filter out the log records of the schema check in each readiness request."""
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
 
@@ -57,7 +57,7 @@ class Metrics:
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
 
     def exposition(self) -> tuple[bytes, str]:
-        """All figures in the text format of Prometheus, and its media type."""
+        """Return all figures in the text format of Prometheus, and its media type."""
         return generate_latest(self.registry), CONTENT_TYPE_LATEST
 
     def count_request(self, method: str, route: str, status: int, duration_s: float, bytes_in: int) -> None:

@@ -26,7 +26,7 @@ from marey_server.store.jobs.reaper import StartGrace
 
 NAMES_REMEMBERED = 10_000
 SIGN_INS_AT_ONCE = 2
-"""A password takes 32 MiB and 0.1 s to check."""
+"""Greatest number of passwords checked at once; each check needs 32 MiB and 0.1 s."""
 LARGEST_ANSWER_SHARE = 8
 """A body larger than this part of the cache of answers is not kept: it would displace all others."""
 ANSWER_ENTRY_BYTES = 512

@@ -161,7 +161,7 @@ def add_holder(tx: Transaction, digest: str) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Those of `digests` that the caller may refer to, locked so that they stay until this write has done so."""
+    """Return those of `digests` that the caller may refer to, locked so that they stay until this write has done so."""
     allowed = sorted(readable(tx, digests))
     renew = update(blob).values(created_us=tx.now_us).returning(blob.c.digest)
     return {digest for digest in allowed if tx.execute(renew.where(blob.c.digest == digest)).first() is not None}
@@ -189,12 +189,12 @@ def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> 
 
 
 def readable(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Those of `digests` that are stored and that the caller may read or refer to."""
+    """Return those of `digests` that are stored and that the caller may read or refer to."""
     return _held(tx, digests, since_us=0) | _referenced(tx, digests)
 
 
 def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
-    """Those of `digests` that the caller must send before referring to them, in the order asked."""
+    """Return those of `digests` that the caller must send before referring to them, in the order asked."""
     digests = list(dict.fromkeys(digests))
     there = _referenced(tx, digests)
     there |= _held(tx, [digest for digest in digests if digest not in there], since_us=tx.now_us - RENEW_US)
@@ -210,14 +210,14 @@ def require_readable(tx: Transaction, digest: str) -> int:
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:
-    """Bytes `start` to `stop` of a blob, for callers who have checked that they may be read."""
+    """Return bytes `start` to `stop` of a blob, for callers who have checked that they may be read."""
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))
 
 
 def read_range(tx: Transaction, digest: str, start: int, stop: int) -> bytes:
-    """Bytes `start` to `stop` of a blob that the caller may read; ask for at most a few MiB at a time."""
+    """Return bytes `start` to `stop` of a blob that the caller may read; ask for at most a few MiB at a time."""
     size = require_readable(tx, digest)
     return read_blob(tx, digest, start, min(stop, size))
 

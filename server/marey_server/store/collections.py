@@ -69,7 +69,7 @@ def at_or_below(path: str) -> ColumnElement[bool]:
 
 
 def read_collection(tx: Transaction, project: str, collection_id: str) -> Collection:
-    """A collection."""
+    """Return a collection."""
     return _shown(_find(tx, projects.require(tx, project), collection_id, _ALIVE))
 
 
@@ -124,7 +124,7 @@ def _shown(row: Row[Any]) -> Collection:
 
 
 def create_collection(tx: Transaction, project: str, request: CollectionCreate) -> Collection:
-    """A new folder, with those above it. Raises `ConflictProblem` where there is one at this path."""
+    """Create a folder and the folders above it. Raises `ConflictProblem` if it exists."""
     project_row = projects.require(tx, project)
     if _lock(tx, project_row.id, request.path) is not None:
         raise _path_taken(request.path)

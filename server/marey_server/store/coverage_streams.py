@@ -21,7 +21,7 @@ from marey_server.store.tables import coverage_stream
 from marey_server.store.transaction import Transaction
 
 MOST_STREAMS = 64
-"""In one project."""
+"""Greatest number of streams in a project."""
 
 LIFETIME_US = 86400 * 1_000_000
 """A stream that got no frames for so long is dropped."""
@@ -49,7 +49,7 @@ class NewStream:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """A stream as it is kept."""
+    """A stored stream."""
 
     id: str
     settings: Tree
@@ -63,7 +63,7 @@ class Stream:
     rev: int
 
     def shown(self) -> Tree:
-        """The members of `CoverageStream`."""
+        """Return the members of `CoverageStream`."""
         return {
             **self.settings,
             "id": self.id,
@@ -86,7 +86,7 @@ class StreamStep:
 
 
 def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
-    """A new stream. Raises `ConflictProblem` where the project has too many."""
+    """Create a stream. Raises `ConflictProblem` if the project has too many."""
     project_row = projects.require(tx, project)
     tx.lock(f"coverage:{project_row.id}")
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
@@ -104,7 +104,7 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
 def list_streams(
     tx: Transaction, project: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """The streams of a project, the newest first."""
+    """Return the streams of a project, the newest first."""
     project_row = projects.require(tx, project)
     statement = select(*_LISTED).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     order = listing.parse_order("-id", {"id": coverage_stream.c.id})
@@ -113,12 +113,12 @@ def list_streams(
 
 
 def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """A stream, for who may read it. Raises `NotFoundProblem`."""
+    """Return a stream, for who may read it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """A stream, for who may send frames to it. Raises `NotFoundProblem`."""
+    """Return a stream, for who may send frames to it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
@@ -165,7 +165,7 @@ def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
 
 
 def drop_old_streams(tx: Transaction) -> int:
-    """Drop what nobody has sent frames to for a day."""
+    """Delete streams that have received no frames for a day."""
     return tx.execute(delete(coverage_stream).where(_is_old(tx))).rowcount
 
 

@@ -92,7 +92,7 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
 
 
 def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
-    """The document with other text and the same arrays and files."""
+    """Return the document with other text and the same arrays and files."""
     canonical = canonical_json(body)
     return replace(content, digest=blobs.digest_of(canonical), body=body)
 
@@ -283,7 +283,7 @@ def _attach_stored(
 
 
 def _place(tree: Any, pointer: str) -> tuple[Any, str | int]:
-    """The object or list that holds what a JSON Pointer names, and its key there."""
+    """Return the object or list that holds what a JSON Pointer names, and its key there."""
     steps = [step.replace("~1", "/").replace("~0", "~") for step in pointer.split("/")[1:]]
     for step in steps[:-1]:
         tree = tree[int(step) if isinstance(tree, list) else step]

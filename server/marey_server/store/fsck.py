@@ -47,7 +47,7 @@ class StoreDefect:
 
 
 def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[StoreDefect]:
-    """Everything that is wrong, as it is found. `progress(what, count)` is called after each page."""
+    """Yield all defects as they are found. `progress(what, count)` is called after each page."""
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
         ("blobs", blob, _check_blob),

@@ -52,7 +52,7 @@ class Collected:
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
-    """Delete what nothing has referred to for `grace_us`. Safe at any time, beside anything, by several at once."""
+    """Delete data that has had no reference for `grace_us`. Safe at any time and in several processes at once."""
     return Collected(
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
@@ -79,7 +79,7 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Conditions on rows that may go, staged documents aside."""
+    """Return the conditions for rows that may be deleted, apart from staged documents."""
     old = table.c.created_us < tx.now_us - grace_us
     if table is document:
         return old, ~exists().where(revision_part.c.document_digest == document.c.digest)
@@ -88,7 +88,7 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Those of `digests` that may go now, locked so that it stays so."""
+    """Return those of `digests` that may go now, locked so that it stays so."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())

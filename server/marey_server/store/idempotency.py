@@ -30,7 +30,7 @@ class StoredAnswer:
 
 
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
-    """Claim `key` for a request (None), or tell what the same request was answered.
+    """Claim `key` for a request and return None, or return the stored answer of the same request.
 
     `fingerprint` distinguishes requests; one that was sent with a token of another reach is another request, so that no
     narrower token hears what it may not ask for. Raises `InvalidProblem` where the key stands for another request. The
@@ -59,7 +59,7 @@ def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], b
 
 
 def principal_key(principal: Principal) -> str:
-    """Whose keys these are."""
+    """Return the owner of idempotency keys: an attempt, a user, or else the kind of caller."""
     if principal.kind == "attempt":
         return f"{principal.job_id}/{principal.fence}"
     return principal.user_id or principal.kind

@@ -60,7 +60,7 @@ class ProjectRow:
     """The caller is no member and reads because the project is public."""
 
     def shown(self) -> Project:
-        """The project as it travels."""
+        """Return the project as a document."""
         return Project(
             id=self.id, name=self.name, title=self.title, description=self.description, visibility=self.visibility,
             role=None if self.guest else self.role, created_at=datetime_of(self.created_us),
@@ -105,7 +105,7 @@ def require(
 
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
-    """A project, deleted or not, for the server's own work: nobody is asked."""
+    """Return a project, deleted or not, for the server's own work: nobody is asked."""
     row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
     return _row(row, Role.READER, guest=False)
 
@@ -124,7 +124,7 @@ _DELETED_BY_NAME = (
 
 
 def _as_seen(principal: Principal, row: Row[Any]) -> ProjectRow | None:
-    """The project with the caller's role in it; None where he may not know it."""
+    """Return the project with the caller's role in it; None where he may not know it."""
     if principal.kind == "attempt":
         return _row(row, Role.READER, guest=False) if principal.project_id == row.id else None
     if any(scope.partition("!project=")[2] in ("", row.name) for scope in principal.scopes):
@@ -159,14 +159,14 @@ def is_visible(principal: Principal) -> ColumnElement[bool]:
 
 
 def read_project(tx: Transaction, name: str) -> Project:
-    """A project."""
+    """Return a project."""
     return require(tx, name).shown()
 
 
 def list_projects(
     tx: Transaction, *, sort: str = "name", cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """The projects that the caller may read."""
+    """Return the projects that the caller may read."""
     order = listing.parse_order(sort, SORT_KEYS)
     identity = ["projects", tx.principal.user_id]
     statement = _with_role_of(tx.principal.user_id or "").where(is_visible(tx.principal))
@@ -179,7 +179,7 @@ def list_projects(
 
 
 def create_project(tx: Transaction, request: ProjectCreate) -> Project:
-    """A new project, owned by the caller. Raises `ConflictProblem` where the name is taken."""
+    """Create a project owned by the caller. Raises `ConflictProblem` if the name is used."""
     principal = tx.principal
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to create a project.")

@@ -21,7 +21,7 @@ def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
 
 
 def is_expected(rev: int, expected: ExpectedRev) -> bool:
-    """The same of a `rev` that was read."""
+    """Return the same of a `rev` that was read."""
     return expected is None or (rev == expected if isinstance(expected, int) else rev in expected)
 
 

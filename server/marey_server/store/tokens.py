@@ -111,7 +111,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
 
 
 def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """The caller's tokens, newest first, without their secrets."""
+    """Return the caller's tokens, newest first, without their secrets."""
     user_id = _require_user(tx.principal, "read")
     order = listing.parse_order("-id", {"id": token.c.id})
     statement = select(token).where(token.c.user_id == user_id)

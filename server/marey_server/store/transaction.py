@@ -53,11 +53,11 @@ class Transaction:
         return self.connection.execute(statement, parameters)
 
     def run(self, statement: Prepared, parameters: Mapping[str, Any]) -> list[Any]:
-        """The rows of a prepared statement."""
+        """Return the rows of a prepared statement."""
         return statement.run(self.connection, parameters)
 
     def first(self, statement: Prepared, parameters: Mapping[str, Any]) -> Any | None:
-        """The first row of a prepared statement; None where it gives none."""
+        """Return the first row of a prepared statement; None where it gives none."""
         rows = statement.run(self.connection, parameters)
         return rows[0] if rows else None
 
@@ -66,7 +66,7 @@ class Transaction:
         statement.run_each(self.connection, many)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
-        """An INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing.
+        """Return an INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing.
 
         Without `row`, give the rows when executing it.
         """

@@ -30,7 +30,7 @@ _ADMINISTRATORS = "administrators"
 
 
 def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | None = None) -> User:
-    """A new user. `password_hash` comes from `passwords.hash_password`, which takes too long for a transaction.
+    """Create a user. `password_hash` comes from `passwords.hash_password`, which takes too long for a transaction.
 
     Raises `ConflictProblem` where the name is taken.
     """
@@ -52,7 +52,7 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """A user, for administrators and for himself. Raises `NotFoundProblem`."""
+    """Return a user, for administrators and for himself. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -62,7 +62,7 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """All users by name, for administrators."""
+    """Return all users by name, for administrators."""
     require_administrator(tx.principal)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
     rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
@@ -139,7 +139,7 @@ def _require_some_administrator(tx: Transaction) -> None:
 
 
 def stored_hash(tx: Transaction, name: str) -> str | None:
-    """The hash a password is checked against, None where nobody of this name can sign in with one."""
+    """Return the hash a password is checked against, None where nobody of this name can sign in with one."""
     statement = select(user.c.password_hash).where(user.c.name == name, user.c.disabled.is_(False))
     found: str | None = tx.execute(statement).scalar()
     return found
@@ -162,7 +162,7 @@ def _principal(row: Row[Any]) -> Principal:
 
 
 def ensure_first_administrator(tx: Transaction) -> User | None:
-    """The user `admin` of a database that has no users yet; None where it has some."""
+    """Create the user `admin` in a database without users; return None if there are users."""
     tx.lock(_ADMINISTRATORS)
     if tx.execute(select(user.c.id).limit(1)).first() is not None:
         return None
@@ -170,7 +170,7 @@ def ensure_first_administrator(tx: Transaction) -> User | None:
 
 
 def administrator_principal(tx: Transaction, name: str | None = None) -> Principal:
-    """An administrator by name, or the one who was made first, for who has the database in hands anyway.
+    """Return an administrator by name, or the first one; for callers with direct access to the database.
 
     Raises `NotFoundProblem` where no such administrator is active; one always is.
     """
@@ -187,7 +187,7 @@ def administrator_principal(tx: Transaction, name: str | None = None) -> Princip
 
 
 def is_administrator(principal: Principal) -> bool:
-    """Whether the caller administrates the server, with a credential that reaches so far."""
+    """Return whether the caller administrates the server, with a credential that reaches so far."""
     return principal.administrator and scopes.allows(principal.scopes, "admin")
 
 

@@ -1,6 +1,6 @@
-"""Tells request handlers that wait, in this process, that what they wait for may have happened.
+"""Wakes request handlers of this process that wait for an event, such as the end of a job.
 
-A wake-up is a hint: whoever wakes looks at the database again. Other processes are noticed by looking again from time
+A wake-up is a hint: the handler reads the database again. Changes by other processes are found by polling from time
 to time.
 """
 

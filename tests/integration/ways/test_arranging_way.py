@@ -128,7 +128,7 @@ def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_
     assert next(lab.clips.list(path="raw/a")).id == second
     told = run("restore", f"lab/{first}", status=1).stderr
     assert "There is another clip 'a' in its place now." in told
-    assert "move what stands there away first, with marey mv" in told
+    assert "first move the item at that place away, with marey mv" in told
     run("mv", "lab/raw/a", "lab/raw/b")
     run("restore", f"lab/{first}")
     assert next(lab.clips.list(path="raw/a")).id == first

@@ -47,7 +47,7 @@ class _Group(NamedTuple):
 
 
 def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
-    """The job's input `candidates`, without clips that the set has."""
+    """Return the job's input `candidates`, without clips that the set has."""
     database = evaluated.clips.database
     known = {source_of(clip) for clip in database.clips}
     pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]
@@ -74,7 +74,7 @@ def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """The group's database, with the very body of the set where it is of the set's skeleton."""
+    """Return the group's database, with the very body of the set where it is of the set's skeleton."""
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
     rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body

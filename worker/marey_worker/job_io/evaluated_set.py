@@ -31,7 +31,7 @@ class EvaluatedSet:
 
 
 def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, Mapping[str, Any]]:
-    """An evaluation with the records of its trials, and its document."""
+    """Return an evaluation with the records of its trials, and its document."""
     document = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
     records = records_from_tree(context.document(Kind.EVALUATION, pin.item, pin.revision, "records"))
     with refusing_motion_errors():
@@ -39,7 +39,7 @@ def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, M
 
 
 def read_evaluated_set(context: Context) -> EvaluatedSet:
-    """The job's input `evaluation`, and its clips. Raises `JobRefused`."""
+    """Return the job's input `evaluation`, and its clips. Raises `JobRefused`."""
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))

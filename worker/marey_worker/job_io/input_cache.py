@@ -68,7 +68,7 @@ class InputCache:
         return data
 
     def _keep(self, path: Path, data: bytes) -> None:
-        """Keep bytes if that can be done: a folder that is full or gone is no reason to fail a job."""
+        """Store bytes if possible; a folder that is full or missing must not fail a job."""
         size = SEAL_BYTES + len(data)
         if size > self.max_bytes:
             return

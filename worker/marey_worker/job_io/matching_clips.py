@@ -33,7 +33,7 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 LOOP_TAG = "loop"
 NAMES_SHOWN = 5
 MOST_KEPT = 1
-"""Databases; one of an hour of motion takes a few hundred megabytes."""
+"""Greatest number of cached databases; an hour of motion takes a few hundred megabytes."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class MatchingClips:
 
     @cached_property
     def index(self) -> SearchIndex:
-        """Of the database's normalised features; made when it is first needed."""
+        """Search index of the database's normalised features; built at the first use."""
         database = self.database
         return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
@@ -62,7 +62,7 @@ class ClipSet:
     trims: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def as_tree(self) -> dict[str, Any]:
-        """To be kept with an evaluation."""
+        """Return the set as a tree that is stored with an evaluation."""
         return {
             "clips": [pin.model_dump(mode="json") for pin in self.clips],
             "rig": None if self.rig is None else self.rig.model_dump(mode="json"),
@@ -82,13 +82,13 @@ class ClipSet:
 
 
 def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
-    """The clips that the job shall evaluate."""
+    """Return the clips that the job shall evaluate."""
     (rig,) = context.inputs.get("rig", ()) or (None,)
     return ClipSet(context.inputs["clips"], rig, params.loops, params.trims)
 
 
 def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
-    """The job's clips, ready to be matched.
+    """Return the job's clips, ready to be matched.
 
     Raises `JobRefused` for clips of several skeletons, for trims that do not fit, for a skeleton that lacks joints, and
     where too little is left to match.
@@ -132,7 +132,7 @@ def refusing_motion_errors() -> Iterator[None]:
 def build_set(
     context: Context, wanted: ClipSet, options: DatabaseOptions, normaliser: Normaliser | None
 ) -> MatchingDatabase:
-    """The database of clips of one skeleton. Raises `JobRefused`, `MotionError`."""
+    """Return the database of clips of one skeleton. Raises `JobRefused`, `MotionError`."""
     motions = list(read_motions(context, wanted.clips))
     rigged = read_rigged(context, _common_rig(context, wanted, motions))
     body = MatchingBody.from_mapping(rigged.skeleton, rigged.mapping)
@@ -147,7 +147,7 @@ def build_clips(
     options: DatabaseOptions,
     normaliser: Normaliser | None,
 ) -> MatchingDatabase:
-    """The database of clips whose motions, one for each with its digest, are at hand."""
+    """Return the database of clips whose motions, one for each with its digest, are at hand."""
     infos = context.documents(wanted.clips, "info", required=False)
     clips = [
         SourceClip(
@@ -178,7 +178,7 @@ def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tupl
 
 
 def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
-    """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
@@ -209,7 +209,7 @@ def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[in
 
 
 def _pinned_normaliser(context: Context) -> Normaliser | None:
-    """The normaliser of the evaluation that the job names, if it names one."""
+    """Return the normaliser of the evaluation that the job names, if it names one."""
     for pin in context.inputs.get("normaliser", ()):
         evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
         return Normaliser.from_tree(evaluation["normaliser"])

@@ -11,11 +11,11 @@ from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, NoSuchThing
 
 UNUSABLE = (MotionError, ValidationError, NoSuchThing)
-"""What is wrong with one input and keeps no other from being used."""
+"""Errors that concern a single input, so that the other inputs are still processed."""
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
-    """A document of an input. Raises `NoSuchThing` for None: the input was deleted while the job waited."""
+    """Return a document of an input. Raises `NoSuchThing` for None: the input was deleted while the job waited."""
     if document is None:
         raise NoSuchThing(f"revision {pin.revision} of {pin.item} no longer exists", f"no-{pin.kind}")
     return document
@@ -31,7 +31,7 @@ class Refusals:
     def add(
         self, pin: PinnedInput, error: MotionError | ValidationError | NoSuchThing, *, name: str | None = None
     ) -> None:
-        """One more; `name` is what its result would have been called, where that is not the input's path."""
+        """Add a refusal; `name` is the name of the missing result if it differs from the input's path."""
         shown = name or pin.path
         code = "bad-document" if isinstance(error, ValidationError) else error.code
         self._context.log(f"{shown}: {error}")
@@ -39,5 +39,5 @@ class Refusals:
 
     @property
     def first(self) -> str:
-        """The first one, to end a sentence with; nothing where there is none."""
+        """Text of the first refusal, for the end of a sentence; empty if there is none."""
         return f"; {self.entries[0]['name']}: {self.entries[0]['detail']}" if self.entries else ""

@@ -34,7 +34,7 @@ class Rig(NamedTuple):
 
     @classmethod
     def as_stored(cls, ref: RevisionRef) -> Rig:
-        """A skeleton with its own mapping."""
+        """Return a skeleton with its own mapping."""
         return cls(ref, ref)
 
 
@@ -43,7 +43,7 @@ _plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_ent
 
 
 def read_rigged(context: Context, rig: Rig) -> Rigged:
-    """A skeleton with its mapping, or a guessed one where it has none.
+    """Return a skeleton with its mapping, or a guessed one where it has none.
 
     Raises `MotionError` where the mapping contradicts the skeleton.
     """

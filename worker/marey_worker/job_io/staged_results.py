@@ -23,7 +23,7 @@ class StagedResults:
 
     @property
     def count(self) -> int:
-        """Return their number."""
+        """Return the number of results."""
         return len(self.names)
 
     def add(self, output: StagedOutput) -> None:
@@ -40,7 +40,7 @@ class StagedResults:
             self.flush()
 
     def flush(self) -> None:
-        """Hand over what is ready."""
+        """Send the results that are ready."""
         if self._ready:
             self._context.stage(self._ready)
         self._ready, self._ready_bytes = [], 0

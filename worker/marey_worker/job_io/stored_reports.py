@@ -15,7 +15,7 @@ from marey_worker.context import Context
 def store_report(
     context: Context, kind: type[Report], title: str, page: str, figures: Iterable[tuple[str | None, DrawnFigure]]
 ) -> dict[str, Any]:
-    """The document of a report, its page and figures stored; a figure comes with the trial it was asked for."""
+    """Return the document of a report, its page and figures stored; a figure comes with the trial it was asked for."""
     report = kind.model_validate(
         {
             "title": title,

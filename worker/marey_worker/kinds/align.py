@@ -60,7 +60,7 @@ def run(context: Context, params: AlignParams) -> dict[str, Any]:
 
 
 class _Job:
-    """One job."""
+    """State of one job."""
 
     def __init__(self, context: Context, params: AlignParams) -> None:
         self._context = context
@@ -118,7 +118,7 @@ class _Job:
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
 
     def _of_one_skeleton(self, clips: Sequence[_Clip]) -> list[_Clip]:
-        """The clips of the skeleton that most of them move; the others are refused."""
+        """Return the clips of the skeleton that most of them move; the others are refused."""
         counts = Counter(clip.skeleton.item for clip in clips)
         most = min(counts, key=lambda item: (-counts[item], item), default=None)
         others = [clip for clip in clips if clip.skeleton.item != most]
@@ -134,7 +134,7 @@ class _Job:
         return [clip for clip in clips if clip.skeleton.item == most]
 
     def _rig(self, clips: Sequence[_Clip]) -> Rig:
-        """The skeleton at its newest revision in use, with the mapping to go by."""
+        """Return the skeleton at its newest revision in use, with the mapping to go by."""
         if not clips:
             raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._refusals.first}")
         skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
@@ -229,7 +229,7 @@ class _Job:
         return options.replace(reference=_uid(max(named, key=lambda pin: pin.revision)))
 
     def _digest(self, clips: Sequence[_Clip], examples: Sequence[SourceExample], rig: Rig) -> str:
-        """Of all that the alignment is made from."""
+        """Return the digest of all inputs and options of the alignment."""
         contents = {aligned_documents.uid_of(one.pin.item, one.pin.revision): one.content for one in clips}
         return document_digest(
             {

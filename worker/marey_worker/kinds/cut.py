@@ -45,7 +45,7 @@ class _AnnotatedClip(NamedTuple):
 
 
 class _Cutting:
-    """One job."""
+    """State of one job."""
 
     def __init__(self, context: Context, params: CutParams) -> None:
         self._context = context
@@ -57,7 +57,7 @@ class _Cutting:
         self._refusals = Refusals(context)
 
     def run(self) -> dict[str, Any]:
-        """All annotations; how many pieces were made of each label, and what was refused."""
+        """Cut all clips; return the number of pieces by label and the refused clips."""
         labels: Counter[str] = Counter()
         todo = self._read()
         self._require_pieces(todo)
@@ -196,7 +196,7 @@ class _Cutting:
 
 
 def _sliced(motion: MotionDocument, frames: tuple[int, int]) -> dict[str, Any]:
-    """The `motion` part of the frames [start, end), bit for bit."""
+    """Return the `motion` part of the frames [start, end), bit for bit."""
     kept = slice(*frames)
     translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
     poses = np.ascontiguousarray(motion.poses[kept])

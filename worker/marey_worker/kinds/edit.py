@@ -38,7 +38,7 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
 
 
 class _Editing:
-    """One job."""
+    """State of one job."""
 
     def __init__(self, context: Context, params: EditParams) -> None:
         self._context = context
@@ -134,7 +134,7 @@ class _Editing:
         )
 
     def _body(self, motion: MotionDocument) -> EditedBody:
-        """The skeleton of a motion; its mapping is looked for when a command asks. Raises `MotionError`."""
+        """Return the skeleton of a motion; its mapping is looked for when a command asks. Raises `MotionError`."""
         used = _skeleton_of(motion)
         if used not in self._bodies:
             tree = self._context.document(Kind.SKELETON, used.item, used.revision, "hierarchy")
@@ -187,7 +187,7 @@ class _Editing:
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
-    """The commands, and the edit item they are from. Raises `JobRefused`."""
+    """Return the commands, and the edit item they are from. Raises `JobRefused`."""
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):
         raise JobRefused("which-commands", "give either an edit or commands, and not both")
@@ -200,7 +200,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
-    """The clips that commands name, by id. Raises `JobRefused` where one is missing or given twice."""
+    """Return the clips that commands name, by id. Raises `JobRefused` where one is missing or given twice."""
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):

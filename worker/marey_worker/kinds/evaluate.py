@@ -87,7 +87,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Every trial of the suite; those that figures are asked of must be among them."""
+    """Return every trial of the suite; those that figures are asked of must be among them."""
     with refusing_motion_errors():
         trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
@@ -104,9 +104,9 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
 
 
 def headline_of(result: EvaluationResult) -> Headline:
-    """The numbers that lists show; units at the ends of the names, shares from 0 to 1.
+    """Return the numbers that lists show; units at the ends of the names, shares from 0 to 1.
 
-    Clips count once, whether their mirrored twins were added or not.
+    Clips count once, with or without their mirrored copies.
     """
     sources = sum_by_source(result.clips, result.usage)
     rows = recorded_rows(result.clips, result.usage)

@@ -21,7 +21,7 @@ from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import present
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time a ZIP archive can tell; every file gets it, so that the same clips make the same bytes."""
+"""The earliest time in a ZIP archive; every file gets it, so that the same clips give the same bytes."""
 
 READABLE_BY_ALL = 0o644 << 16
 
@@ -97,7 +97,7 @@ class _Exporting:
 
 
 def _place(pin: PinnedInput) -> str:
-    """A path inside the archive that leads nowhere else."""
+    """Return a path inside the archive that leads nowhere else."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
 

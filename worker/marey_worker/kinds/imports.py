@@ -26,7 +26,7 @@ def run(context: Context, params: ImportParams) -> dict[str, Any]:
 
 
 class _Importing:
-    """One job."""
+    """State of one job."""
 
     def __init__(self, context: Context, params: ImportParams) -> None:
         self._context = context

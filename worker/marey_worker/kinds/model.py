@@ -68,7 +68,7 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
 
 
 def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDocument], list[dict[str, Any]]]:
-    """Motion and info of each aligned clip."""
+    """Read the motion and the info of each aligned clip."""
     motions, infos = [], []
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(done, len(pins), f"reading {pin.name}")
@@ -83,7 +83,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDoc
 
 
 def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocument]) -> RevisionRef:
-    """The skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
     for pin, ref in zip(pins, used, strict=True):
         if ref.item != used[0].item:

@@ -69,7 +69,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 
 
 def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
-    """What the trials did over the set alone is known, but over a larger database its rows have other numbers."""
+    """Return a simulation of the set. Known records are reused only if the database has no other clips."""
     alone = database is evaluated.clips.database
     return Resimulation(
         database,

@@ -29,7 +29,7 @@ def run(context: Context, params: RetargetParams) -> dict[str, Any]:
 
 
 class _Retargeting:
-    """One job."""
+    """State of one job."""
 
     def __init__(self, context: Context, params: RetargetParams) -> None:
         self._context = context

@@ -34,7 +34,7 @@ def run(context: Context, params: SweepParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: SweepParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """All settings in order, and which groups of features matter."""
+    """Collect all settings in order, and rank the groups of features by their effect."""
     # Task i of n has made the settings i, i + n, i + 2n and so on.
     longest = max(len(result["rows"]) for result in results)
     found = [result["rows"][turn] for turn in range(longest) for result in results if turn < len(result["rows"])]

@@ -63,7 +63,7 @@ class Story:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def tell(self) -> DemoReport:
-        """All steps; what came of them."""
+        """Run all steps and return their results."""
         with self._timed("import"):
             entries = self._import()
         with self._timed("retarget"):
@@ -106,12 +106,12 @@ class Story:
         return self.project.imports.upload(self.files.files, options, notice=self.advance)
 
     def _target(self) -> SkeletonHandle:
-        """The second skeleton: made on the first run, found on later ones."""
+        """Return the second skeleton: made on the first run, found on later ones."""
         found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 
     def _retarget(self, target: SkeletonHandle) -> Job | None:
-        """Every take onto the second skeleton; None where no take was imported."""
+        """Retarget every take to the second skeleton; return None if no take was imported."""
         if next(self.project.clips.list(collection=TAKES, page_size=1), None) is None:
             return None
         job = self.project.retarget([CollectionInput(collection=TAKES)], target.id, into=RESULTS)
@@ -131,7 +131,7 @@ class Story:
         load = _clip_loader(self.project)
         takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
         path = self.data / "contact-sheet.png"
-        path.write_bytes(figures.contact_sheet(takes, heading="Takes and what became of them"))
+        path.write_bytes(figures.contact_sheet(takes, heading="Takes and their results"))
         return path
 
 
@@ -164,7 +164,7 @@ def _game_skeleton_parts() -> dict[str, Any]:
 
 
 def _clip_loader(project: ProjectHandle) -> Callable[[ClipHandle], Any]:
-    """A function from clips of the server to clips of `marey_motion`; reads each skeleton once."""
+    """Return a function from clips of the server to clips of `marey_motion`; reads each skeleton once."""
     documents = embedded.room("marey_motion.documents", "all")
     skeletons: dict[tuple[str, int], Any] = {}
 

@@ -17,10 +17,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Clock(Protocol):
-    """Tells the time inside a transaction."""
+    """A source of the current time inside a transaction."""
 
     def now_us(self, connection: Connection) -> int:
-        """Microseconds since the epoch, never going back."""
+        """Return microseconds since the epoch, which never decrease."""
         ...
 
 
@@ -47,7 +47,7 @@ class DatabaseClock:
 
 
 def stored_high_water_us(connection: Connection) -> int:
-    """The latest time known to have been used, 0 in a new database."""
+    """Return the latest time known to have been used, 0 in a new database."""
     statement = select(server_state.c.value).where(server_state.c.key == _HIGH_WATER)
     return int(connection.execute(statement).scalar() or 0)
 
@@ -70,5 +70,5 @@ def save_high_water(connection: Connection, now_us: int) -> int:
 
 
 def datetime_of(us: int) -> datetime:
-    """A stored time as documents show it."""
+    """Return a stored time as documents show it."""
     return _EPOCH + timedelta(microseconds=us)

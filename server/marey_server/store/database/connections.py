@@ -282,11 +282,11 @@ def _worth_retrying(error: Exception) -> bool:
 
 
 _TRY_AGAIN = ("40001", "40P01")
-"""Serialisation failure, deadlock."""
+"""SQLSTATE codes after which a transaction is retried: serialisation failure, deadlock."""
 
 
 def _translated(error: Exception) -> Exception:
-    """The same failure in the server's own terms, where the caller can do something about it."""
+    """Return the same failure in the server's own terms, where the caller can do something about it."""
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         return StorageFullProblem("The disk has no room left; nothing was written.") if full else error

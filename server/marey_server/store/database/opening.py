@@ -42,6 +42,6 @@ def _shown(url: str) -> str:
 
 
 def _reason(error: BaseException | None) -> str:
-    """The first line of what the driver says."""
+    """Return the first line of what the driver says."""
     said = str(getattr(error, "orig", None) or error).strip()
     return said.splitlines()[0] if said else "no reason is given"

@@ -39,13 +39,13 @@ class Prepared:
         self._forms: dict[tuple[object, ...], _Form] = {}
 
     def run(self, connection: Connection, parameters: Parameters) -> list[Any]:
-        """Run it; the rows that it gives, as named tuples."""
+        """Run the statement and return its rows as named tuples."""
         form = self._form(connection.dialect, parameters)
         rows = _run(connection, form.text, form.values(parameters), gives_rows=form.to_row is not None)
         return rows if form.to_row is None else list(map(form.to_row, rows))
 
     def run_each(self, connection: Connection, many: Sequence[Parameters]) -> None:
-        """Run it once for each of `many`, which hold the same names; rows are not given."""
+        """Run the statement once for each of `many`, which have the same keys; returns no rows."""
         if len(many) == 1:
             self.run(connection, many[0])
         elif many:
@@ -88,14 +88,14 @@ class _Form:
     constants: Mapping[str, Any]
     """Values that are part of the statement itself."""
     expansion: Mapping[str, Sequence[str]]
-    """Of lists: the names of their members."""
+    """Names of the members of each list parameter."""
     converts: Mapping[str, Convert]
     order: tuple[str, ...] | None
     """The names in the order of the text; None where the driver takes them by name."""
     to_row: Convert | None
 
     def values(self, parameters: Parameters) -> Any:
-        """The parameters as the driver takes them."""
+        """Return the parameters as the driver takes them."""
         named = {**self.constants, **parameters}
         for name, members in self.expansion.items():
             named.update(_members(members, named.pop(name)))
@@ -105,7 +105,7 @@ class _Form:
 
 
 def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:
-    """The members of a list, or of a list of tuples, under their own names."""
+    """Return the members of a list, or of a list of tuples, under their own names."""
     nested = bool(given) and isinstance(given[0], tuple)
     return zip(names, chain.from_iterable(given) if nested else given, strict=True)
 

@@ -1,4 +1,4 @@
-"""The schema of the database: bringing it up to date, and telling whether it is."""
+"""The schema of the database: upgrades, and a check whether it is current."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _upgrade(tx: Transaction) -> None:
 
 
 def schema_at_head(connection: Connection) -> bool:
-    """Whether the tables are those that this version of the server expects."""
+    """Return whether the tables are those that this version of the server expects."""
     return MigrationContext.configure(connection).get_current_heads() == _expected_heads()
 
 

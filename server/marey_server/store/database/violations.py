@@ -13,7 +13,7 @@ _POSTGRES_UNIQUE = "23505"
 
 
 def is_unique_violation(error: exc.IntegrityError) -> bool:
-    """Whether a unique index refused the row."""
+    """Return whether a unique index refused the row."""
     state = getattr(error.orig, "sqlstate", None)
     return state == _POSTGRES_UNIQUE if state else "UNIQUE constraint failed" in str(error.orig)
 

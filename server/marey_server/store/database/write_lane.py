@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_TOGETHER = 16
-"""The first of them waits for the last."""
+"""Greatest number of writes in one transaction; the first of them waits for the last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class WriteLane:
         return one.future
 
     def close(self) -> None:
-        """Write all that waits."""
+        """Run all waiting writes, then stop the thread."""
         self._thread.shutdown(wait=True)
 
     def _write_waiting(self) -> None:
@@ -75,7 +75,7 @@ class WriteLane:
                 one.end(lambda one=one: self._write(one.principal, one.function))  # type: ignore[misc]
 
     def _write_together(self, group: Sequence[_Write]) -> bool:
-        """Whether it came to a commit. Where a write breaks, instead of being refused, nothing is written."""
+        """Run writes in one transaction; return whether it was committed. An unexpected failure undoes all."""
         finishes: list[Callable[[], Any]] = []
 
         def run_all(tx: Transaction) -> None:
@@ -95,7 +95,7 @@ class WriteLane:
 
 
 def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
-    """Do it; what remains to be done once it is committed. Of a write that is refused nothing is left to commit."""
+    """Run a write; return its completion, to be called after the commit. A refused write leaves nothing to commit."""
     own = tx.beside(one.principal)
     run_text(tx.connection, "SAVEPOINT this_write")
     try:

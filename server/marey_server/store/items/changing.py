@@ -48,7 +48,7 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
-    """A new item. Raises `ConflictProblem` where the name is taken in its collection."""
+    """Create an item. Raises `ConflictProblem` if the name is used in its collection."""
     project_row = projects.require(tx, project)
     draft = Draft(
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
@@ -69,7 +69,7 @@ def put_part(
     expected_rev: ExpectedRev,
     message: str = "",
 ) -> Item:
-    """A new revision in which one part is replaced; the same content makes none.
+    """Create a revision in which one part is replaced; the same content makes none.
 
     Raises `PreconditionFailedProblem` where the item is not at `expected_rev` any more.
     """

@@ -84,7 +84,7 @@ def read_lineage(
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """The other ends of the lineage rows that meet `condition`."""
+    """Return the other ends of the lineage rows that meet `condition`."""
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
         .add_columns(lineage.c.job_id.label("job"), lineage.c.role)
@@ -98,7 +98,7 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
-    """Whether anything the newest revision was made from, directly or through others, has a newer revision.
+    """Return whether anything the newest revision was made from, directly or through others, has a newer revision.
 
     What an item was made from of itself, such as the model that its tree was made for, is no older state of an input:
     it is looked through.

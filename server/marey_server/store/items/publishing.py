@@ -85,7 +85,7 @@ def _load_parts(tx: Transaction, draft: Draft) -> dict[str, _Part]:
 
 @dataclass(frozen=True)
 class _Head:
-    """An item as it stands, with the documents of its newest revision."""
+    """An item with the documents of its newest revision."""
 
     id: str
     number: int

@@ -38,13 +38,13 @@ def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests:
 
 
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
-    """An item at its newest revision. Raises `NotFoundProblem`."""
+    """Return an item at its newest revision. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project)
     return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]
 
 
 def item_rows() -> Select[Any]:
-    """Rows of items with the path of their collection."""
+    """Return the rows of items with the path of their collection."""
     return select(item, collection.c.path).join(collection, collection.c.id == item.c.collection_id)
 
 
@@ -155,7 +155,7 @@ class FoundPart:
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """The part of the newest revision, or of `revision`. Raises `NotFoundProblem` where there is none."""
+    """Return the part of the newest revision, or of `revision`. Raises `NotFoundProblem` where there is none."""
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
@@ -175,7 +175,7 @@ def load_part(
     joints: Sequence[str] | None = None,
     arrays: Literal["encoded", "decoded", "none"] = "encoded",
 ) -> dict[str, Any]:
-    """The document of a part, its arrays as `arrays` says.
+    """Return the document of a part, its arrays as `arrays` says.
 
     `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion. Raises
     `InvalidProblem` where they do not fit it.

@@ -33,7 +33,7 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """A part `tree` with the digest of the model of its own write, where it names that as `PartDigestRef`."""
+    """Return a part `tree` with the digest of the model of its own write, where it names that as `PartDigestRef`."""
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
@@ -61,7 +61,7 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
-    """The tree with each reference to a draft replaced by the revision it became."""
+    """Return the tree with each reference to a draft replaced by the revision it became."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and tree["output"] in done:
             published = done[tree["output"]]
@@ -153,7 +153,7 @@ class ReferenceCheck:
 
 
 def _escaped(name: str) -> str:
-    """A name as a part of a JSON Pointer."""
+    """Return a name as a part of a JSON Pointer."""
     return name.replace("~", "~0").replace("/", "~1")
 
 

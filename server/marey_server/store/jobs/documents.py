@@ -43,7 +43,7 @@ _UNSAID = {column.key: None if column.default is None else column.default.arg fo
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
-    """The document of a job of the caller's, other than a gathering one, whose row is as it was inserted by this
+    """Return the document of a job of the caller's, other than a gathering one, whose row is as it was inserted by this
     transaction: what `job_documents` would read.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}

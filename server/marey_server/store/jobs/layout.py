@@ -64,7 +64,7 @@ class NewJob:
         return self.submission.unbound
 
     def end(self) -> Ended:
-        """The end of a job that never starts because a dependency did not succeed."""
+        """Return the end of a job that never starts because a dependency did not succeed."""
         return Ended(self.id, self.project_id, self.state, self.parent_id, self.failure)
 
 
