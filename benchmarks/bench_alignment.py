@@ -37,7 +37,7 @@ PUBLISHED_SET_S = 12.7
 
 
 def run() -> list[Row]:
-    """All on one thread. Peers must find the same totals; which of equally cheap ways they name is theirs."""
+    """Measure on one thread. Peers must find the same totals, but may choose other paths of equal cost."""
     _require_same_totals()
     rows = [row for size in SIZES for row in _pair(*size)]
     return [*rows, _published_pair(), _published_set(), _large_set()]
@@ -114,7 +114,7 @@ def _against(
 
 
 def _each(calls: int, repeats: int, *contenders: Callable[[], object]) -> list[Timing]:
-    """Seconds of one of so many calls."""
+    """Time each of so many calls, in seconds."""
 
     def many(call: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -167,7 +167,7 @@ def _large_set() -> Row:
 
 
 def _examples(count: int, frames: tuple[int, int]) -> tuple[list[SourceExample], MatchingBody]:
-    """One walk, played unevenly (a sine of 0.08), smaller and larger (0.9 to 1.1) and with drifting joints (0.002)."""
+    """Make variants of one walk: timing (a sine of 0.08), size (0.9 to 1.1) and joint drift (0.002)."""
     random = np.random.default_rng(5)
     walk = generate_gait(1.3, 0.2, 50 / 60)
     motion = Motion.of(walk)

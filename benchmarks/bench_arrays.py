@@ -35,7 +35,7 @@ Ask = Callable[[], object]
 
 
 def run() -> list[Row]:
-    """A server that keeps no answers in memory, so that each is made."""
+    """Measure a server that keeps no answers in memory, so that each one is computed."""
     with local_server(MAREY_ANSWER_CACHE_BYTES="0") as server, _tiled() as tiled, httpx.Client() as http:
         clip = seed(server, FRAMES, JOINTS).clip
 

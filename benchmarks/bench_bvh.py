@@ -26,7 +26,7 @@ GOAL_PYMOTION, GOAL_PLAIN = 20, 5
 
 
 def run() -> list[Row]:
-    """A generated file, and a real one where there is one."""
+    """Measure a generated file, and a real one where there is one."""
     with tempfile.TemporaryDirectory() as folder:
         generated = Path(folder, "generated.bvh")
         generated.write_bytes(write_bvh(captured_walk(FRAMES, JOINTS)))
@@ -74,7 +74,7 @@ def _load_with_pymotion(path: Path) -> NDArray[np.float64]:
 
 
 def _check_agreement(path: Path) -> int:
-    """All three must find the same rotations; answers how many frames there are."""
+    """Check that all three find the same rotations; return the number of frames."""
     ours = read_bvh(path.read_bytes(), path.name).rotations
     assert ours is not None
     for theirs in (_load_with_pymotion(path), load_plainly(path)):

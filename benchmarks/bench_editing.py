@@ -45,7 +45,7 @@ COMMANDS: tuple[NamedCommand, ...] = (
 
 
 def run() -> list[Row]:
-    """Every command as users get it: from a clip in single precision to one, checked before and after."""
+    """Measure every command as users get it: from and to a clip in single precision, checked before and after."""
     walk = generate_gait(1.3, 0.1, FRAMES / RATE_HZ, RATE_HZ)
     run_clip = generate_gait(3.0, -0.2, 20.0, RATE_HZ)
     rows = [_alone(walk, run_clip, command) for command in COMMANDS]

@@ -50,7 +50,7 @@ Solver = Callable[..., SolvedPoses]
 
 
 def run() -> list[Row]:
-    """All on one thread."""
+    """Measure everything on one thread."""
     clip = generate_gait(1.3, 0.2, BATCH / 60.0)
     skeleton = clip.skeleton
     motion = Motion.of(clip)
@@ -81,7 +81,7 @@ def _each(
     solver: Solver,
     stated_ms: float,
 ) -> Row:
-    """One call per constraint, as somebody who drags a hand makes them."""
+    """Make one call per constraint, as a user who drags a hand does."""
     solved = [solver(skeleton, one, targets, freedom=freedom) for one, targets in problems]
     reached = sum(bool(one.reached[0]) for one in solved)
 
@@ -107,7 +107,7 @@ def _each(
 
 
 def _with_scipy(skeleton: Skeleton, motion: Motion, targets: list[Target], freedom: Freedom) -> float:
-    """The same objective by trust regions and finite differences; kinematics are the project's own."""
+    """Solve the same objective by trust regions and finite differences, with the project's kinematics."""
     carried = {joint for target in targets for joint in skeleton.path_to_root(target.joint)}
     joints = sorted(carried if freedom.joints is None else carried & set(freedom.joints))
     rotations = motion.rotations.copy()
@@ -174,7 +174,7 @@ def _batch(skeleton: Skeleton, motion: Motion, near: Floats, freedom: Freedom) -
 
 
 def _edit(skeleton: Skeleton, motion: Motion, near: Floats) -> Row:
-    """One constrained frame in the middle of a walk with fingers, whose change is spread over the whole of it."""
+    """Constrain one frame in the middle of a walk with fingers, and spread the change over the whole walk."""
     body = with_fingers(skeleton, 78, skeleton.joint_names[map_joints(skeleton).indices(skeleton, ("left_wrist",))[0]])
     rotations = np.asarray(quaternions.identity(FRAMES, body.joint_count), dtype=np.float64)
     rotations[:, [body.index_of(name) for name in skeleton.joint_names]] = motion.rotations[:FRAMES]

@@ -25,7 +25,7 @@ PREDECESSOR_MS = 145
 
 
 def run() -> list[Row]:
-    """The first page in several orders, and a page in the middle."""
+    """Measure the first page in several orders, and a page in the middle."""
     with local_server(lambda data: fill(data, CLIPS)) as server, Connection(server.port, server.token) as connection:
         pages = PAGES | {"page 100 of 200": f"cursor={_cursor_in_the_middle(connection)}"}
         return [_row(name, list(_latencies_ms(connection, query))) for name, query in pages.items()]

@@ -41,7 +41,7 @@ class _Play:
 
 
 def run() -> list[Row]:
-    """All on one thread; each contender answers the same queries, and those in float64 must find the same rows."""
+    """Measure on one thread; all contenders answer the same queries, and those in float64 must find the same rows."""
     faiss.omp_set_num_threads(1)
     return [_race(*size, hard) for size in SIZES for hard in (False, True)]
 

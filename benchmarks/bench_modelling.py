@@ -32,7 +32,7 @@ WITHOUT_REPORT = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 
 def run() -> list[Row]:
-    """All on one thread. Peers must find the same shares of variance."""
+    """Measure everything on one thread. Peers must find the same shares of variance."""
     with one_thread():
         return [_one_channel(), _all_channels(), _mixtures(), _whole_model(), _report()]
 

@@ -44,7 +44,7 @@ Floats = NDArray[np.floating]
 
 
 def run() -> list[Row]:
-    """One server, one worker with one slot."""
+    """Measure one server and one worker with one slot."""
     clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
     with local_server() as server, _worker(server), server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
@@ -98,7 +98,7 @@ def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
 
 
 def _timed(marey: Marey, submit: Callable[[], Job]) -> float:
-    """Seconds from the submission of a job to its end."""
+    """Measure the seconds from the submission of a job to its end."""
     started = time.perf_counter()
     ended = marey.jobs.wait(submit().id)
     seconds = time.perf_counter() - started
@@ -134,7 +134,7 @@ def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list
 
 
 def _write_with_pymotion(moved: list[Floats], target: Skeleton) -> float:
-    """Seconds to write clips as BVH files."""
+    """Measure the seconds to write clips as BVH files."""
     rest = np.tile(np.concatenate([target.offsets[0], target.rest_rotations.ravel()]), (FRAMES, 1)).astype(np.float32)
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
         template = Path(folder, "template.bvh")

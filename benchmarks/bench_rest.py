@@ -31,7 +31,7 @@ Start = Callable[..., Future[Any]]
 
 
 def run() -> list[Row]:
-    """All on one server, but for what it answers from memory: that once more on one that keeps nothing there."""
+    """Measure one server; answers from memory are measured again on a server that keeps none."""
     with load.in_processes(2) as start:
         with local_server() as server:
             seeded = seed(server, FRAMES, JOINTS)

@@ -59,7 +59,7 @@ class _Material(NamedTuple):
 
 
 def run() -> list[Row]:
-    """All on one thread."""
+    """Measure everything on one thread."""
     return [*_trees(), *_searches(), _refinement()]
 
 

@@ -31,7 +31,7 @@ PACE = 0.1
 
 
 def main(row_count: int, threads: int) -> dict[str, float | str]:
-    """Seconds of each step, and the largest memory the process had."""
+    """Print the seconds of each step and the largest memory of the process."""
     sources = list(_sources(row_count))
     options = EvaluationOptions()
     # Kernels load and the machine's caches warm up on something small.
@@ -54,7 +54,7 @@ def main(row_count: int, threads: int) -> dict[str, float | str]:
 
 
 def _peak_mb() -> float:
-    """The largest memory this program had; getrusage would count what the process was forked from, too."""
+    """Read the largest memory of this program; getrusage would include that of its parent process."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     return int(found[1]) / 1024 if found else float("nan")
 

@@ -51,7 +51,7 @@ class Load:
 
 @contextmanager
 def in_processes(count: int) -> Iterator[Callable[..., Future[Any]]]:
-    """A function that starts another one in one of `count` processes."""
+    """Make a function that starts another one in one of `count` processes."""
     with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
         yield pool.submit
 

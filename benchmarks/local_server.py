@@ -48,7 +48,7 @@ class LocalServer:
 
     @property
     def token(self) -> str:
-        """The administrator's."""
+        """Token of the administrator."""
         return (self.data / "admin.token").read_text().strip()
 
     def processor_s(self) -> float:
@@ -57,7 +57,7 @@ class LocalServer:
         return float(times.user + times.system)
 
     def client(self) -> Marey:
-        """An administrator's client."""
+        """Make an administrator's client."""
         return Marey(self.url, self.token)
 
 
@@ -112,7 +112,7 @@ def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> 
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on just now."""
+    """Find a port of this machine that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -141,7 +141,7 @@ def seed(server: LocalServer, frames: int, joints: int) -> Seeded:
 
 
 def clip_parts(clip: Clip, skeleton: RevisionRef) -> dict[str, dict[str, object]]:
-    """The documents of a clip on a stored skeleton."""
+    """Make the documents of a clip on a stored skeleton."""
     return {
         "motion": clip_to_document(clip, skeleton).model_dump(by_alias=True),
         "info": ClipInfo().model_dump(mode="json", by_alias=True),

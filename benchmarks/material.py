@@ -26,7 +26,7 @@ _REAL_LOCOMOTION = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh", "cmu-bvh/*.b
 
 
 def real_folder() -> Path | None:
-    """The folder of real motion capture, if there is one."""
+    """Find the folder of real motion capture, if there is one."""
     folder = os.environ.get("MAREY_TEST_MOCAP")
     return Path(folder) if folder else None
 
@@ -55,7 +55,7 @@ def _harmonics(
 
 
 def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
-    """A tree of `joints` with limbs of about five joints."""
+    """Make a tree of `joints` with limbs of about five joints."""
     parents: NDArray[np.int32] = np.array([-1, *(max(0, j - 1) if j % 5 else 0 for j in range(1, joints))], np.int32)
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
     return Skeleton(
@@ -64,7 +64,7 @@ def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
 
 
 def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
-    """A generated walk at 120 Hz as a capture system would deliver it: with fingers, and with noise on every channel.
+    """Make a generated walk at 120 Hz like one of a capture system: with fingers, and noise on every channel.
 
     The fingers make up for the joints that the generated body lacks of `joints`; they move like everything else.
     """
@@ -83,7 +83,7 @@ def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
 
 
 def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:
-    """The skeleton with finger joints, three to a finger, at one hand, so that it has `joints`."""
+    """Add finger joints, three to a finger, to one hand of a skeleton, so that it has `joints`."""
     old, new = skeleton.joint_count, joints - skeleton.joint_count
     names = tuple(f"{hand}Finger{index // 3 + 1}_{index % 3 + 1}" for index in range(new))
     parents = [old + index - 1 if index % 3 else skeleton.index_of(hand) for index in range(new)]

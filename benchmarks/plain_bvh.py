@@ -59,7 +59,7 @@ def _product(a: Floats, b: Floats) -> Floats:
 
 
 def _continuous(rotations: Floats) -> Floats:
-    """The same rotations with signs that do not jump from frame to frame."""
+    """Flip signs of quaternions so that they do not jump from frame to frame."""
     for frame in range(1, len(rotations)):
         flipped = (rotations[frame - 1] * rotations[frame]).sum(axis=-1) < 0
         rotations[frame][flipped] *= -1

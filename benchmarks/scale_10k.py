@@ -113,7 +113,7 @@ def _upload(server: LocalServer, clips: int, console: Console) -> None:
 
 
 def _shaken(walk: Clip, seed: int) -> Clip:
-    """The walk with capture noise of its own."""
+    """Add capture noise to the walk."""
     noise = np.random.default_rng(seed).normal(scale=1e-4, size=walk.poses.shape)
     return replace(walk, poses=(walk.poses + noise).astype(np.float32))
 

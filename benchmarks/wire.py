@@ -28,7 +28,7 @@ class Connection:
         self._socket.close()
 
     def head(self, method: str, path: str, *, length: int = 0, token: str | None = None, **headers: str) -> bytes:
-        """The head of a request, which may be sent many times."""
+        """Make the head of a request, which may be sent many times."""
         fields = {"Host": "127.0.0.1", "Authorization": f"Bearer {token or self._token}"}
         fields |= {name.replace("_", "-"): text for name, text in headers.items()}
         if length or method != "GET":

@@ -125,7 +125,7 @@ class Motion(NamedTuple):
 
 
 def _unit_and_continuous(rotations: Floats) -> Floats:
-    """Rotations (F, J, 4) of nearly unit length, changed in place: sums of four as one product, which is what costs."""
+    """Normalise rotations (F, J, 4) of nearly unit length and make signs continuous, in place."""
     rotations /= np.sqrt(np.einsum("fjc,fjc->fj", rotations, rotations))[..., None]
     turned_over = np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]) < 0.0
     if turned_over.any():

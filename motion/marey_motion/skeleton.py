@@ -107,7 +107,9 @@ class Skeleton:
             )
         for site in self.end_sites:
             if not 0 <= site.joint < self.joint_count:
-                raise SkeletonError(f"end site on joint {site.joint} of {self.joint_count}", where="end_sites")
+                raise SkeletonError(
+                    f"an end site is on joint {site.joint}, the skeleton has {self.joint_count}", where="end_sites"
+                )
 
     def _check_rest_rotations(self) -> None:
         norms = np.linalg.norm(self.rest_rotations, axis=1)

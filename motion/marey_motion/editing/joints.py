@@ -19,7 +19,7 @@ from marey_motion.resampling import sample_motion
 from marey_motion.skeleton import Skeleton
 
 SAME_AXES_RAD = 0.02
-"""Rest rotations up to so far apart count as the same axes: subjects of one rig are measured one by one."""
+"""Largest angle between rest rotations that count as equal: subjects of one rig differ a little."""
 
 
 def paste(

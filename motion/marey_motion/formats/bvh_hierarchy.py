@@ -158,7 +158,7 @@ class _HierarchyReader:
             raise FormatLimit(f"more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number)
         name = decode_name(rest) or f"joint{len(header.names)}"
         if len(name) > MAX_NAME_LENGTH:
-            raise self.lines.error(f"a joint name of {len(name)} characters; {MAX_NAME_LENGTH} are the most")
+            raise self.lines.error(f"a joint name of {len(name)} characters, more than the limit of {MAX_NAME_LENGTH}")
         self.brace_due = True
         header.parents.append(self.open[-1] if self.open else -1)
         self.open.append(len(header.names))

@@ -89,7 +89,7 @@ def _check_range(source: SourceMotion, file: str) -> None:
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
-            message = f"a length of {np.abs(values).max():.3g} units; {_LARGEST_LENGTH:.0e} are the most"
+            message = f"a length of {np.abs(values).max():.3g} units, more than the limit of {_LARGEST_LENGTH:.0e}"
             raise FormatError(message, code="value-range", file=file)
 
 

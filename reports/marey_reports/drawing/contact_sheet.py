@@ -53,7 +53,7 @@ class TakePair(NamedTuple):
 
 
 def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6) -> bytes:
-    """A PNG with one row per take: at each moment the source's figure and, on a tinted ground, the result's.
+    """Draw a PNG with one row per take: at each moment the figure of the source and, on a tinted ground, of the result.
 
     The figures of a take are drawn at one scale and seen from one side, to the left of where the source faces at first.
     Each stands over its own spot of the floor y = 0, with an arrow where it faces.
@@ -141,7 +141,7 @@ class _SheetCell:
     ground: str
 
     def placed(self, seen: AnyFloats) -> AnyFloats:
-        """Points (..., 2) on the page of points (..., 3) that a camera sees."""
+        """Project points (..., 3) to points (..., 2) on the page, as a camera sees them."""
         return seen[..., :2] * self.scale + self.centre
 
 
@@ -204,7 +204,7 @@ def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats
 
 
 def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats, head_m: float) -> None:
-    """Bones from back to front, each with an edge in the colour of the ground that sets it off from those behind."""
+    """Draw bones from back to front, each with an edge in the ground's colour that separates it from those behind."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle
 
@@ -230,5 +230,5 @@ def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats
 
 
 def _write(axes: Axes, place: tuple[float, float], text: str, size: float, colour: str = INK, **options: Any) -> None:
-    """Text as it is: dollar signs in a title are not mathematics."""
+    """Write text literally: dollar signs in a title are not mathematics."""
     axes.text(*place, text, fontsize=size, color=colour, parse_math=False, **options)

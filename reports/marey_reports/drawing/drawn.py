@@ -66,7 +66,7 @@ class DrawnFigure:
         }
 
     def files(self) -> dict[str, bytes]:
-        """All of it as files by name: PNG, SVG, the data as JSON and one CSV per table."""
+        """Make files by name: PNG, SVG, the data as JSON and one CSV per table."""
         files = {
             f"{self.name}.png": self.png,
             f"{self.name}.svg": self.svg.encode(),
@@ -91,7 +91,7 @@ def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
 
 
 def listed(values: Column) -> list[Any]:
-    """A column as a list of plain values; None for not-a-number."""
+    """Convert a column to a list of plain values; None for not-a-number."""
     rows = values.tolist() if isinstance(values, np.ndarray) else [_plain(value) for value in values]
     return [None if isinstance(value, float) and not math.isfinite(value) else value for value in rows]
 
@@ -101,7 +101,7 @@ def _plain(value: Any) -> Any:
 
 
 def as_csv(columns: Mapping[str, Column]) -> str:
-    """A table with a header, lines ended by LF; numbers in the shortest form that reads back the same."""
+    """Write a table as CSV with a header and LF at line ends; numbers have the shortest form that reads back equal."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)

@@ -41,7 +41,7 @@ class Section(NamedTuple):
 
 
 def page(title: str, lead: Content, sections: Sequence[Section], ending: Content) -> str:
-    """A whole HTML document."""
+    """Make a whole HTML document."""
     links = [element("li", element("a", section.heading, href=f"#{section.anchor}")) for section in sections]
     head = element(
         "head",
@@ -73,7 +73,7 @@ def _section(section: Section) -> Html:
 
 
 def shown(figures: Mapping[str, DrawnFigure], *names: str) -> Html:
-    """Figures by name, those that there are."""
+    """Show the given figures that exist, by name."""
     return joined(_shown(figures[name], f"f{list(figures).index(name)}") for name in names if name in figures)
 
 
@@ -83,7 +83,7 @@ def _shown(figure: DrawnFigure, prefix: str) -> Html:
 
 
 def _inline(figure: DrawnFigure, prefix: str) -> Html:
-    """A figure's SVG as part of a page: in the page's colours and font, without ids that others have, too."""
+    """Embed a figure's SVG in a page: with the page's colours and font, and ids that are unique in the page."""
     svg = _NEEDLESS.sub("", figure.svg)
     svg = _BLANKS.sub(" ", _STANDING.sub("", _FONTS.sub("", svg))).replace("xlink:href", "href")
     for colour, themed in _THEMED.items():

@@ -60,7 +60,7 @@ class Place(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty page."""
+    """Make an empty page."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
@@ -87,7 +87,7 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
 def add_colour_bar(
     figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
 ) -> Axes:
-    """A colour bar at a place, upright when it is higher than wide."""
+    """Draw a colour bar at a place, upright when it is higher than wide."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
@@ -102,13 +102,13 @@ def add_colour_bar(
 
 
 def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> None:
-    """Text as it is: dollar signs in a name are not mathematics."""
+    """Write text literally: dollar signs in a name are not mathematics."""
     look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
     axes.text(*place, plain(text), **look)
 
 
 def add_keys(axes: Axes, **options: Any) -> None:
-    """A legend without a frame, names as they are."""
+    """Draw a legend without a frame, with names as they are."""
     legend = axes.legend(frameon=False, fontsize=SMALL, **options)
     for text in legend.get_texts():
         text.set_color(INK)
@@ -116,7 +116,7 @@ def add_keys(axes: Axes, **options: Any) -> None:
 
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
-    """Names of clips down the vertical axis, `others` that are no clips below them."""
+    """Write names of clips along the vertical axis, and below them `others`, which are not clips."""
     labels = [plain(label) for label in (*labels_of(names), *others)]
     axes.set_yticks(list(places), labels, parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
@@ -130,12 +130,12 @@ def tick_whole_numbers(axis: Axis) -> None:
 
 
 def plain(text: str) -> str:
-    """A name on one line, without signs that cannot be drawn or written to an SVG."""
+    """Put a name on one line, without characters that cannot be drawn or written to an SVG."""
     return "".join(sign if sign.isprintable() else "�" for sign in text)
 
 
 def without_shared_folder(names: Sequence[str]) -> list[str]:
-    """Names as they read within the folder that all of them lie in."""
+    """Drop the folders that all names share."""
     places = [name.split("/") for name in names]
     levels = zip(*(folders for *folders, _ in places), strict=False)
     shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))
@@ -143,7 +143,7 @@ def without_shared_folder(names: Sequence[str]) -> list[str]:
 
 
 def told_apart(names: Sequence[str]) -> list[str]:
-    """Names as they read within the folder that all of them lie in, and without the words that all begin with."""
+    """Drop the folders and the first words that all names share."""
     within = without_shared_folder(names)
     words = [re.split(r"(?<=[ _-])", name) for name in within]
     shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*words, strict=False)))
@@ -173,7 +173,7 @@ def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
 
 
 def shortened(name: str, longest: int = LONGEST_NAME) -> str:
-    """A name cut in its middle, where names of takes differ least."""
+    """Shorten a name in its middle, where names of takes differ least."""
     if len(name) <= longest:
         return name
     tail = (longest - 1) // 2
@@ -189,7 +189,7 @@ def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
 
 
 def nice_ceiling(value: float) -> float:
-    """The next number of the form 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for what is not above zero."""
+    """Round up to 1, 1.5, 2, 3, 4, 5, 6 or 8 times a power of ten; 1 for a number not above zero."""
     if not value > 0.0 or not np.isfinite(value):
         return 1.0
     scale = 10.0 ** np.floor(np.log10(value))
@@ -226,14 +226,14 @@ def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 
 def to_png(figure: Figure) -> bytes:
-    """The same bytes for the same figure and version of matplotlib."""
+    """Write a PNG: the same bytes for the same figure and version of matplotlib."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def to_svg(figure: Figure, title: str) -> str:
-    """The same text for the same figure and version of matplotlib; letters stay letters."""
+    """Write an SVG: the same text for the same figure and version of matplotlib; text stays text, not outlines."""
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     with _svg_settings():

@@ -27,7 +27,7 @@ class Camera:
     tilt_rad: float
 
     def seen(self, points: AnyFloats) -> AnyFloats:
-        """Points (..., 3) as (right, up, towards the viewer) in metres, shape (..., 3)."""
+        """Project points (..., 3) to (right, up, towards the viewer) in metres, shape (..., 3)."""
         turn, tilt = self.direction_rad, self.tilt_rad
         right = points[..., 0] * np.cos(turn) - points[..., 2] * np.sin(turn)
         near = points[..., 0] * np.sin(turn) + points[..., 2] * np.cos(turn)
@@ -71,7 +71,7 @@ class Stances:
 
 
 def body_of(skeleton: Skeleton) -> StickFigure:
-    """The bones of a body, without roots on the floor, props and helpers; all bones where no pelvis is known."""
+    """Choose the bones of a body, without roots on the floor, props and helpers; all bones if no pelvis is known."""
     mapping = map_joints(skeleton)
     standard = {skeleton.index_of(name): key for key, name in mapping.joints.items() if key != "root"}
     pelvis = next((joint for joint, key in standard.items() if key == "pelvis"), None)
@@ -114,7 +114,7 @@ def runs_of(bones: Indices) -> list[Indices]:
 
 
 def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
-    """The body in these frames (K,); only they are computed, however long the clip is."""
+    """Compute the body in these frames (K,) alone, however long the clip is."""
     points = kinematics.forward_kinematics(
         clip.skeleton,
         clip.poses[frames].astype(np.float64),
@@ -132,7 +132,7 @@ def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
 
 
 def _tips(skeleton: Skeleton, pelvis: int, sides: dict[int, int]) -> list[tuple[int, int]]:
-    """Bones to the end sites of the chains that are drawn."""
+    """List the bones to end sites of the chains that are drawn."""
     size = float(np.ptp(skeleton.rest_global_positions[[pelvis, *sides]], axis=0).max())
     inner = {int(skeleton.parents[joint]) for joint in sides}
     return [

@@ -71,7 +71,7 @@ def draw_strips(
     cell_in: tuple[float, float],
     legend: Sequence[tuple[str, str]] = (),
 ) -> Figure:
-    """A page of strips, seen from `direction_rad` about +Y (0 looks from +z).
+    """Draw a page of strips, seen from `direction_rad` about +Y (0 is a view from +z).
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class _StripCell:
     scale: float
 
     def placed(self, points: Floats) -> Floats:
-        """Points (..., 3) as (right, up, towards the viewer) in inches on the page."""
+        """Project points (..., 3) to (right, up, towards the viewer) in inches on the page."""
         seen = self.camera.seen(points - np.array((self.middle[0], 0.0, self.middle[1]))) * self.scale
         below = np.array((self.corner[0] + 0.5 * self.size[0], self.corner[1] + FLOOR_SHARE * self.size[1], 0.0))
         return np.asarray(seen + below, dtype=np.float64)
@@ -214,7 +214,7 @@ def _shapes(body: StickFigure, rows: Sequence[StripRow]) -> _Shapes:
 
 
 def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, look: _Look, frame: Rectangle) -> None:
-    """Bones at points (P, 3), each side as one shape, from the far side to the near one."""
+    """Draw bones at points (P, 3), each side as one shape, the far side before the near one."""
     from matplotlib.patches import Circle, PathPatch
 
     seen = stage.placed(points)
@@ -237,7 +237,7 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
 
 
 def _middles(bones: Floats) -> list[Floats]:
-    """Bones (n, 2, 2) short of the joints, where a rim would cut off the neighbouring bones."""
+    """Shorten bones (n, 2, 2) before the joints, where a rim would cut off the neighbouring bones."""
     middle = bones.mean(axis=1, keepdims=True)
     length = np.linalg.norm(bones[:, 1] - bones[:, 0], axis=-1)[:, None, None]
     return list(middle + (bones - middle) * np.maximum(1.0 - 2.0 * RIM_STOPS / np.maximum(length, RIM_STOPS), 0.0))

@@ -21,7 +21,7 @@ Cell = Number | Content
 
 
 def number(value: float | None, digits: int = 2, *, signed: bool = False, look: str = "") -> Number:
-    """A number with so many decimals; a dash for none."""
+    """Format a number with so many decimals; a dash for None."""
     if value is None or not math.isfinite(value):
         return Number(None, "–")
     written = round(value, digits) + 0.0  # not -0.00
@@ -29,14 +29,14 @@ def number(value: float | None, digits: int = 2, *, signed: bool = False, look: 
 
 
 def share(value: float) -> Number:
-    """A share in percent."""
+    """Format a share in percent."""
     return Number(value, f"{100 * value:.1f} %")
 
 
 def table(
     caption: str, heads: Sequence[str], rows: Iterable[Sequence[Cell]], *, numbers: Sequence[int], sortable: bool = True
 ) -> Html:
-    """A table whose first column names its rows.
+    """Make a table whose first column names its rows.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def _cell(cell: Cell, column: int) -> Html:
 
 
 def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:
-    """The few numbers that a report begins with: what, how much, and a note below."""
+    """Make the summary at the top of a report: a few numbers, each with a title and a note below."""
     tiles = [
         element("div", element("dt", name), element("dd", value), element("dd", note, class_="note") if note else None)
         for name, value, note in pairs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def span(low: float, high: float) -> str:
-    """A range of numbers, or the one number."""
+    """Format a range of numbers, or the one number."""
     return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
 
 

@@ -32,7 +32,7 @@ MOST_NAMES = 40  # more unused clips than this are folded away
 
 
 def headline(result: EvaluationResult) -> Html:
-    """The numbers that answer most questions."""
+    """Make the summary of the most important numbers."""
     judgement, coverage = judge(result), result.coverage
     sources = sum_by_source(result.clips, result.usage)
     used = sum(1 for source in sources if source.ticks)
@@ -154,7 +154,7 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def baseline_chapter(result: EvaluationResult) -> Section:
-    """The suite's numbers, beside those of generated clips that own every cell."""
+    """Compare the suite's numbers with those of generated clips that fill every cell."""
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
     rows: list[Sequence[Cell]] = []
@@ -176,7 +176,7 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 
 
 def appendix_chapter(result: EvaluationResult) -> Section:
-    """Every trial and every clip."""
+    """List every trial and every clip."""
     trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
     clips = table(
         "All clips",

@@ -43,13 +43,13 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
 
 
 def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
-    """The trials that both have, in the order of the first."""
+    """Pair the trials that both have, in the order of the first."""
     known = {each.trial.name: each for each in after.trials}
     return [(each, known[each.trial.name]) for each in before.trials if each.trial.name in known]
 
 
 def headline_of_two(before: EvaluationResult, after: EvaluationResult, labels: tuple[str, str]) -> Html:
-    """The numbers that answer most questions, old and new."""
+    """Make the summary of the most important numbers, old and new."""
     first, second = judge(before), judge(after)
     cells = before.coverage, after.coverage
     sources = [sum_by_source(each.clips, each.usage) for each in (before, after)]
@@ -164,7 +164,7 @@ def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
 
 
 def _shift(old: TrialResult, new: TrialResult) -> float:
-    """Change of the mean offset in metres; 0 where one of the two is not defined."""
+    """Compute the change of the mean offset in metres; 0 where one of the two is not defined."""
     first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
     return 0.0 if first is None or second is None else second - first
 

@@ -42,7 +42,7 @@ __all__ = ["compared", "render_comparison", "render_report", "verdict"]
 
 
 def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str, DrawnFigure] | None = None) -> str:
-    """The report of one evaluation as an HTML document.
+    """Render the report of one evaluation as an HTML document.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def render_comparison(
     labels: tuple[str, str] = ("before", "after"),
     figures: Mapping[str, DrawnFigure] | None = None,
 ) -> str:
-    """The report of two evaluations as an HTML document.
+    """Render the report of two evaluations as an HTML document.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def find_holes(coverage: Coverage) -> list[CoverageGap]:
 
 
 def turning(low_deg_s: float, high_deg_s: float) -> str:
-    """A range of turn rates of one side."""
+    """Describe a range of turn rates of one side."""
     least, most = sorted((abs(low_deg_s), abs(high_deg_s)))
     if most <= STRAIGHT_DEG_S:
         return "straight ahead"

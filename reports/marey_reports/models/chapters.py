@@ -24,7 +24,7 @@ CM_PER_M = 100.0
 
 
 def headline(trained: TrainedPrimitive) -> Html:
-    """The numbers that answer most questions."""
+    """Make the summary of the most important numbers."""
     primitive, report = trained.primitive, trained.report
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"

@@ -36,7 +36,7 @@ def render_model_report(
     title: str,
     origin: Mapping[str, Any],
 ) -> str:
-    """The report of a model as an HTML document.
+    """Render the report of a model as an HTML document.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class NearDuplicate:
-    """Two sources that show nearly the same, `second` when `mirrored` after being mirrored.
+    """Two sources of nearly the same motion; if `mirrored`, that of `second` is its mirror image.
 
     Parameters
     ----------

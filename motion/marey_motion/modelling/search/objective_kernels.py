@@ -24,7 +24,7 @@ _SMALL = 1e-4
 
 @compiled
 def _pose(chains, latent, channels, local, positions, rotations):  # type: ignore[no-untyped-def]
-    """Channels of the constrained frames, and where the joints on their chains are; lengths of raw quaternions last."""
+    """Compute channels of the constrained frames, poses of joints on their chains, and lengths of raw quaternions."""
     channels[:] = chains.mean
     for component in range(chains.directions.shape[0]):
         score = latent[component]

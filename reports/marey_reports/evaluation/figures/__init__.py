@@ -101,7 +101,7 @@ def draw_figures(
     labels: tuple[str, str] = ("before", "after"),
     options: FigureOptions | None = None,
 ) -> dict[str, DrawnFigure]:
-    """Every figure that can be drawn of a result, or of two, by name.
+    """Draw every possible figure of a result, or of two, by name.
 
     Left out are those of trials that there are not, and those that need records where these were not kept.
     """

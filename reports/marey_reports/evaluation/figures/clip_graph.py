@@ -102,7 +102,7 @@ def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[
 
 
 def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
-    """All transitions between the circles, those between the same stretches as one, the most frequent first.
+    """List all jumps between the circles, the most frequent first; those between the same two dots count as one.
 
     The stretches are dots of the circles, or so many dots taken together that no more than `MOST_LINES` lines remain.
     """
@@ -166,7 +166,7 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
 
 
 def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], most: int, logarithmic: bool) -> None:
-    """One dot per stretch that was shown, in one of a few sizes: an SVG keeps one shape per size."""
+    """Draw one dot per range that was displayed, in one of a few sizes: an SVG keeps one shape per size."""
     colours = _colours(circles)
     places, levels, looks = [np.empty((0, 2))], [np.empty(0, np.int64)], []
     for uid, total in dots.items():
@@ -192,7 +192,7 @@ def _labels(subjects: Sequence[Subject], uids: Collection[str], longest: int) ->
 
 
 def _draw_rings(panel: Axes, circles: dict[str, Circle], names: dict[str, str]) -> None:
-    """The outline of each clip, open above, and its name outside; dotted where this subject has no such clip."""
+    """Draw each clip's outline, open at the top, and its name outside; dotted if this subject lacks the clip."""
     from matplotlib.patches import Arc
 
     for uid, circle in circles.items():

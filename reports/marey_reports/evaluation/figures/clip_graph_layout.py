@@ -31,7 +31,7 @@ class Circle:
         return np.asarray(np.minimum(frames * self.dots // max(self.frames, 1), self.dots - 1), dtype=np.int64)
 
     def coarser(self, factor: int) -> Circle:
-        """The same circle with fewer dots."""
+        """Make the same circle with fewer dots."""
         return replace(self, dots=max(1, self.dots // factor))
 
     @property
@@ -40,7 +40,7 @@ class Circle:
         return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
 
     def middle_of(self, dots: Any) -> Any:
-        """The frame in the middle of each dot."""
+        """Find the frame in the middle of each dot."""
         bounds = self.bounds
         return (bounds[dots] + bounds[np.asarray(dots) + 1]) // 2
 

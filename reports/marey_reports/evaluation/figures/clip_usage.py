@@ -73,7 +73,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
 def _draw_bars(
     panel: Axes, places: AnyFloats, values: Sequence[int], use: _Use, number: int, thick: float, others: bool
 ) -> None:
-    """A subject's bars with their numbers: clips, then the others, then the transitions, which are hatched."""
+    """Draw a subject's bars with numbers: clips, then the others, then the transitions, which are hatched."""
     total = sum(use.ticks.values())
     colours = [COLOURS[number]] * (len(values) - others) + [REFERENCE] * others
     panel.barh(places[:-1], values, height=thick, color=colours, lw=0)

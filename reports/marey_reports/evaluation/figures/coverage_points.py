@@ -43,7 +43,7 @@ class _Points(NamedTuple):
 
 
 def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
-    """One point per window of a second, of up to `MOST_POINTS` windows at even intervals."""
+    """Draw a point per window of one second, of up to `MOST_POINTS` evenly spaced windows."""
     chosen = _choose(subjects, min(options.most_clips, CATEGORIES))
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5

@@ -166,7 +166,7 @@ def _norm(ceiling: float) -> Any:
 
 
 def _frame(panel: Axes, coverage: Coverage, plane: _Plane) -> None:
-    """The outline of the grid of trials, or where forward and sideways speed are zero."""
+    """Draw the outline of the grid of trials, or the lines of zero forward and sideways speed."""
     look: dict[str, Any] = {"color": LIGHT, "lw": 0.8, "alpha": 0.8}
     if plane is DIRECTIONS:
         panel.axhline(0.0, **look)

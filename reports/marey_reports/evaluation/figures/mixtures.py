@@ -29,7 +29,7 @@ class Normals(NamedTuple):
 
 
 def fit_one(values: AnyFloats) -> Normals:
-    """Mean and population standard deviation."""
+    """Compute mean and population standard deviation."""
     return Normals(np.ones(1), np.array([values.mean()]), np.array([max(values.std(), LEAST_DEVIATION)]))
 
 

@@ -43,7 +43,7 @@ class _Field(NamedTuple):
 
 
 def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """A row per family of trials; two subjects share the scale, and a third column shows the change."""
+    """Draw a row per family of trials; two subjects share the scale, and a third column shows the change."""
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
@@ -166,7 +166,7 @@ def _draw_field(
 
 
 def _mark_extreme(panel: Axes, field: _Field, signed: bool) -> None:
-    """The value of the dot that is farthest from zero, beside it."""
+    """Write the value of the dot farthest from zero beside it."""
     row, column = np.unravel_index(np.nanargmax(np.abs(field.offset_m)), field.offset_m.shape)
     right, up = column <= field.offset_m.shape[1] // 2, row <= field.offset_m.shape[0] // 2
     panel.annotate(

@@ -78,7 +78,7 @@ def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, 
 
 
 def _limits(paths: Sequence[Floats]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """A square that holds all paths, the same for both panels."""
+    """Compute a square that contains all paths, the same for both panels."""
     low = np.min([path.min(axis=0) for path in paths], axis=0)
     high = np.max([path.max(axis=0) for path in paths], axis=0)
     centre, half = 0.5 * (low + high), 0.56 * max(float((high - low).max()), 0.5)

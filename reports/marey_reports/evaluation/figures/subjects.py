@@ -52,7 +52,7 @@ class Subject:
         return f"{self.label}: " if self.label else ""
 
     def column(self, name: str) -> str:
-        """Name of a table's column that only this subject fills."""
+        """Name a table's column that only this subject fills."""
         return f"{self.label}_{name}" if self.label else name
 
     def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
@@ -86,13 +86,13 @@ class TrialView:
 
 
 def view_trial(subject: Subject, trial: Trial) -> TrialView:
-    """One trial with its record. Raises `MotionError` when it was not kept."""
+    """Find a trial with its record. Raises `MotionError` if the record was not stored."""
     record = find_record(subject, trial.name)
     return TrialView(subject, trial, record, trial_series(trial, reference(trial, record.rate_hz), record))
 
 
 def find_record(subject: Subject, name: str) -> TrialRecord:
-    """The record of a trial by its name. Raises `MotionError` when there is none."""
+    """Find the record of a trial by its name. Raises `MotionError` if there is none."""
     names = [each.trial.name for each in subject.result.trials]
     if name not in names:
         raise MotionError(f"the evaluation has no trial {name!r}", code="unknown-trial")
@@ -102,7 +102,7 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """The trial of a name that all subjects have, from the first of the families that has it.
+    """Choose a trial that all subjects have, from the first of the families that has one.
 
     Without a name it is the one that the first subject follows worst.
 

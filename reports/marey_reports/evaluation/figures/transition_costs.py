@@ -17,7 +17,7 @@ LEAST_TOP_M = 0.01
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Speeds above, cost below, one line per subject; a tick under the cost is a switch to another place."""
+    """Draw speeds above and costs below, a line per subject; a tick under the cost is a jump to another place."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     first = views[0].series

@@ -48,12 +48,12 @@ PUBLISHED = {"samples": "17"}
 
 
 def draw_alignment_figures(aligned: AlignedSet) -> dict[str, DrawnFigure]:
-    """Every figure of an alignment, by name."""
+    """Draw every figure of an alignment, by name."""
     return _drawn({name: (title, partial(draw, aligned)) for name, (title, draw) in ALIGNMENT_FIGURES.items()})
 
 
 def draw_model_figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
-    """Every figure of a model, by name; the components one by one, as `component-1` and so on."""
+    """Draw every figure of a model, by name; components are named `component-1` and so on."""
     swept = {
         f"component-{number + 1}": (f"Component {number + 1} of the poses", partial(draw_component, subject, number))
         for number in range(min(SWEPT_COMPONENTS, subject.primitive.spatial.count))

@@ -17,7 +17,7 @@ CELL_IN = (1.2, 1.3)
 
 
 def draw_mean(subject: ModelSubject) -> Sketch:
-    """The mean motion."""
+    """Draw the mean motion."""
     frames, moments = subject.moments()
     points = subject.points(subject.mean_poses[frames])
     duration_s = float(subject.primitive.durations_s(np.zeros((1, subject.primitive.dimensions)))[0])
@@ -31,7 +31,7 @@ def draw_mean(subject: ModelSubject) -> Sketch:
 
 
 def draw_component(subject: ModelSubject, component: int) -> Sketch:
-    """One spatial component, the mean motion behind every figure in grey."""
+    """Draw one spatial component, with the mean motion in grey behind every figure."""
     frames, moments = subject.moments()
     swept = sweep(subject, component)
     points = subject.points(swept[:, frames])
@@ -64,12 +64,12 @@ def sweep(subject: ModelSubject, component: int) -> Floats:
 
 
 def written(deviation: float) -> str:
-    """A number of deviations as rows are called."""
+    """Format a number of deviations as the name of a row."""
     return "mean" if not deviation else f"{'+' if deviation > 0 else '−'}{abs(deviation):g} sd"
 
 
 def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
-    """The joint that differs most between the first and the last row of (rows, T, P, 3), and by how much, in cm."""
+    """Find the joint that differs most between first and last row of (rows, T, P, 3), and the difference in cm."""
     joints = subject.primitive.skeleton.joint_names
     apart = np.linalg.norm(points[-1] - points[0], axis=-1)[:, : len(joints)].max(axis=0)
     joint = int(np.argmax(apart))

@@ -167,14 +167,14 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
 
 
 def _deviations(judged: Floats) -> Floats:
-    """Log-likelihoods as robust deviations from the middle one; 0 where they do not differ."""
+    """Convert log-likelihoods to robust deviations from the median; 0 where they do not differ."""
     away = judged - np.median(judged)
     spread = DEVIATION_OF_MEDIAN * float(np.median(np.abs(away)))
     return np.asarray(away / spread if spread > 0.0 else np.zeros(len(judged)), dtype=np.float64)
 
 
 def _judged(example: ExampleReport) -> float:
-    """The likelihood by which unusual examples are found: the held-out one where it is known."""
+    """Choose the likelihood by which unusual examples are found: the held-out one where it is known."""
     held_out = example.held_out_log_likelihood
     return example.log_likelihood if held_out is None else held_out
 

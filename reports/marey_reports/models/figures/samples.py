@@ -78,7 +78,7 @@ def _count(drawn: int, total: int) -> str:
 
 
 def _spread_cm(subject: ModelSubject, points: Floats) -> float:
-    """Mean distance of the joints of (m, T, P, 3) from their mean place, centimetres."""
+    """Compute the mean distance of the joints of (m, T, P, 3) from their mean position, centimetres."""
     joints = points[:, :, : subject.primitive.skeleton.joint_count]
     return 100.0 * float(np.linalg.norm(joints - joints.mean(axis=0), axis=-1).mean())
 
@@ -134,7 +134,7 @@ def _path_table(names: list[str], joints: list[str], frames: NDArray[np.int64], 
 
 
 def _followed(subject: ModelSubject) -> dict[str, int]:
-    """The wrists and ankles that are known; where there are none, ends of chains."""
+    """Choose the known wrists and ankles; ends of chains where there are none."""
     skeleton = subject.primitive.skeleton
     known = map_joints(skeleton).joints
     named = {name: skeleton.index_of(known[key]) for name, (key, _, _) in FOLLOWED.items() if key in known}
@@ -143,7 +143,7 @@ def _followed(subject: ModelSubject) -> dict[str, int]:
 
 
 def _extent(places: Floats) -> tuple[Floats, Floats]:
-    """The middle of (n, 3) places, and how far an axis has to reach."""
+    """Compute the centre of positions (n, 3), and the length that an axis needs."""
     low, high = places.min(axis=0), places.max(axis=0)
     return 0.5 * (low + high), np.maximum(1.08 * (high - low), 0.2)
 

@@ -16,7 +16,7 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Errors of searches for what examples reached; None where they were not measured."""
+    """Draw errors of searches for targets from examples; None where they were not measured."""
     check = subject.check
     if check is None:
         return None
@@ -28,7 +28,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
-    """Errors of the same targets after the search of the tree and after refinement.
+    """Draw errors of the same targets after the search of the tree and after refinement.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ MOST_BARS = 40
 
 
 def draw_variance(subject: ModelSubject) -> Sketch:
-    """The share of the variance that the first 1, 2, ... components hold, of poses and of time."""
+    """Draw the share of the variance in the first 1, 2, ... components, of poses and of time."""
     kinds = {
         "poses": (subject.report.spatial_energy, subject.primitive.spatial.count),
         "time": (subject.report.temporal_energy, subject.primitive.temporal.count),
@@ -81,7 +81,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
 
 
 def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
-    """Error of rebuilt examples over the number of components; None where it was not measured."""
+    """Draw the error of rebuilt examples over the number of components; None where it was not measured."""
     errors = subject.report.reconstruction
     if errors is None:
         return None

@@ -91,12 +91,12 @@ class ModelSubject:
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
-        """The canonical frames that strips show, and their columns; all look at where the mean motion is."""
+        """Choose the canonical frames that strips show, and their columns, centred on the mean motion."""
         return choose_moments(self, count)
 
 
 def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Indices of all of so many things, or of at most `most` of them, evenly spread."""
+    """Choose evenly spaced indices of all items, or of at most `most` of them."""
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, most))).astype(np.int64))
 
 
@@ -129,7 +129,7 @@ def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64]
 def position_table(
     subject: ModelSubject, frames: NDArray[np.int64], rows: Sequence[tuple[str, Floats]]
 ) -> dict[str, object]:
-    """Positions (T, P, 3) of the joints by row as columns of a table, metres in the canonical frame."""
+    """Make columns of a table from positions (T, P, 3) of joints, in metres in the canonical frame."""
     joints = subject.primitive.skeleton.joint_names
     cells = len(frames) * len(joints)
     places = np.concatenate([points[:, : len(joints)].reshape(-1, 3) for _, points in rows])

@@ -36,7 +36,7 @@ SPEED_SPAN = (0.1, 10.0)
 
 
 def draw_time_warps(aligned: AlignedSet) -> Sketch:
-    """Time functions on the left, speeds on the right; the reference and the ones most unlike it are named."""
+    """Draw time functions and speeds; the reference and the clips most unlike it are named."""
     times_s = aligned.time_functions / aligned.frame_rate_hz
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)
@@ -59,7 +59,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
 
 
 def _most_unlike(aligned: AlignedSet, reference: int) -> list[int]:
-    """The clips whose time differs most from the reference's, their different lengths apart."""
+    """Find the clips whose time differs most from the reference's, apart from their length."""
     paths = aligned.time_functions / aligned.time_functions[:, -1:]
     apart = np.abs(paths - paths[reference]).max(axis=1)
     order = sorted(range(len(paths)), key=lambda place: (-apart[place], aligned.clips[place].uid))
