@@ -55,7 +55,7 @@ class DatabaseOptions(Options):
         "on the ground as the character does.",
     )
     weights: FeatureWeights = Field(FeatureWeights(), description="Weight of each group of features.")
-    horizons_s: tuple[Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)], ...] = Field(
+    horizons_s: tuple[Annotated[float, Field(gt=0, le=3, allow_inf_nan=False)], ...] = Field(
         (1 / 3, 2 / 3, 1.0),
         min_length=1,
         max_length=8,

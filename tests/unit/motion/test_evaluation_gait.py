@@ -6,6 +6,8 @@ from math import radians
 import numpy as np
 import pytest
 
+from marey_motion.clip import Clip
+from marey_motion.errors import MotionError
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.scenario import reference, suite_trials
@@ -181,7 +183,14 @@ def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch):
     assert second.suite == first.suite
 
 
-def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named():
+def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named(monkeypatch):
+    def generate_slow_gait(speed_m_s: float, *arguments: float) -> Clip:
+        if speed_m_s >= IMPOSSIBLE_M_S:
+            raise MotionError("the legs are too short", code="gait-out-of-reach")
+        return generate_gait(speed_m_s, *arguments)
+
+    monkeypatch.setattr(suites, "generate_gait", generate_slow_gait)
+    monkeypatch.setattr(suites, "_baselines", {})
     options = SMALL.replace(speeds_m_s=(2.0, IMPOSSIBLE_M_S), turn_rates_deg_s=(0.0,), families=("circle",))
     baseline = evaluate_baseline(options)
 

@@ -173,7 +173,7 @@ def test_only_models_are_searched(lab: ProjectHandle) -> None:
         lab.transport.send("POST", f"{clip.url}/search", content=b'{"constraints": []}')
 
 
-def test_from_the_command_line(run: CommandLine, walk: ModelHandle, tmp_path: Path) -> None:
+def test_from_the_command_line(run: CommandLine, walk: ModelHandle, bare: ModelHandle, tmp_path: Path) -> None:
     asked = ("--at", "end:left_wrist=_,0.9,1.2", "--stand", "start=0,0", "--lambda", 0.01)
     told = run("search", "lab/models/walk", *asked, "--out", "found.bvh").stdout
     assert "joint_position left_wrist" in told
@@ -181,7 +181,7 @@ def test_from_the_command_line(run: CommandLine, walk: ModelHandle, tmp_path: Pa
     assert (tmp_path / "found.bvh").read_bytes().startswith(b"HIERARCHY")
     answer = json.loads(run("search", "lab/models/walk", "--face", "end=5", "--json").stdout)["answer"]
     assert answer["errors"][0]["type"] == "root_heading"
-    assert "500 samples" in run("tree", "lab/models/bare", "--samples", "500").stdout
+    assert "500 samples" in run("tree", f"lab/models/{bare.name}", "--samples", "500").stdout
     assert "nothing is asked for" in run("search", "lab/models/walk", status=2).stderr
     assert "WHEN:JOINT" in run("search", "lab/models/walk", "--at", "left_wrist", status=2).stderr
     assert "no keyframe 'never'" in run("search", "lab/models/walk", "--stand", "never=0,0", status=1).stderr
