@@ -9,7 +9,17 @@ from pydantic import Field, StringConstraints, model_validator
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import (
+    CANDIDATES,
+    CONSTRAINT_WEIGHT,
+    LOOK_AXIS,
+    PASSES,
+    TOLERANCE_DEG,
+    TOLERANCE_M,
+    TOLERANCE_S,
+    TRANSITION_TOLERANCE_M,
+    RefineOptions,
+)
 
 MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
@@ -62,11 +72,11 @@ class _SearchConstraint(Request):
     at: Moment = Field(
         description="Time of the constraint: the label of a keyframe of the model, start, end, or a canonical frame."
     )
-    weight: Positive = Field(1.0, description="Weight of the constraint.")
+    weight: Positive = Field(CONSTRAINT_WEIGHT, description="Weight of the constraint.")
 
 
 class _PlaceConstraint(_SearchConstraint):
-    tolerance_m: Distance = Field(0.01, description="Distance in metres at which the weighted error is 1.")
+    tolerance_m: Distance = Field(TOLERANCE_M, description="Distance in metres at which the weighted error is 1.")
     tolerance_cm: Tolerance | None = _in_centimetres("tolerance_m")
 
     @model_validator(mode="after")
@@ -93,7 +103,7 @@ class JointOrientationConstraint(_SearchConstraint):
     rotation: tuple[Component, Component, Component, Component] = Field(
         description="Target rotation in the world, as a quaternion (w, x, y, z)."
     )
-    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
+    tolerance_deg: Tolerance = Field(TOLERANCE_DEG, description="Angle in degrees at which the weighted error is 1.")
 
 
 class LookDirectionConstraint(_SearchConstraint):
@@ -108,9 +118,9 @@ class LookDirectionConstraint(_SearchConstraint):
         None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
     )
     axis: tuple[Component, Component, Component] = Field(
-        (0.0, 0.0, 1.0), description="Axis that shall point there, in the joint's own frame."
+        LOOK_AXIS, description="Axis that shall point there, in the joint's own frame."
     )
-    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
+    tolerance_deg: Tolerance = Field(TOLERANCE_DEG, description="Angle in degrees at which the weighted error is 1.")
 
 
 class RootPositionConstraint(_PlaceConstraint):
@@ -127,7 +137,7 @@ class RootHeadingConstraint(_SearchConstraint):
 
     type: Literal["root_heading"]
     heading_deg: Degrees = Field(description="Target heading in degrees: 0 along +z, positive to the left.")
-    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
+    tolerance_deg: Tolerance = Field(TOLERANCE_DEG, description="Angle in degrees at which the weighted error is 1.")
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
@@ -135,7 +145,7 @@ class KeyframeTimeConstraint(_SearchConstraint):
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
-    tolerance_s: Tolerance = Field(0.05, description="Deviation in seconds at which the weighted error is 1.")
+    tolerance_s: Tolerance = Field(TOLERANCE_S, description="Deviation in seconds at which the weighted error is 1.")
 
 
 SearchConstraint = Annotated[
@@ -181,10 +191,13 @@ class SearchRequest(RefineOptions):
     )
     start: StartPlacement = StartPlacement()
     candidates: int = Field(
-        8, ge=1, le=MOST_CANDIDATES, description="Number of nodes of the tree that the search follows at each level."
+        CANDIDATES,
+        ge=1,
+        le=MOST_CANDIDATES,
+        description="Number of nodes of the tree that the search follows at each level.",
     )
     passes: int = Field(
-        2,
+        PASSES,
         ge=1,
         le=4,
         description="Number of passes; 1: only the tree's samples; each further pass searches near the best "
@@ -192,7 +205,7 @@ class SearchRequest(RefineOptions):
     )
     refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(
-        0.02,
+        TRANSITION_TOLERANCE_M,
         description="Discontinuity of hands, feet and height between two steps at which the weighted error "
         "is 1, in metres.",
     )

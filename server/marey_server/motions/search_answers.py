@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from marey_schemas import search as wire
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.formats import MotionFormat
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import RefineOptions, TransitionOptions
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_server.errors import InvalidProblem, TooLargeProblem
@@ -68,7 +68,7 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
     from marey_motion.modelling.search.finishing import finish_motion
     from marey_motion.modelling.search.found_motions import found_motion
     from marey_motion.modelling.search.step_search import search_steps
-    from marey_motion.modelling.search.steps import SeveralSteps, TransitionOptions
+    from marey_motion.modelling.search.steps import SeveralSteps
 
     steps, trees = _steps_of(searchables, request), [one.tree for one in searchables]
     refining = RefineOptions.of(request) if request.refine else None

@@ -20,12 +20,12 @@ from marey_motion.modelling.search.constraints import (
 from marey_motion.modelling.search.finishing import finish_motion
 from marey_motion.modelling.search.found_motions import found_motion
 from marey_motion.modelling.search.step_search import search_steps
-from marey_motion.modelling.search.steps import MOST_STEPS, Step, TransitionOptions
+from marey_motion.modelling.search.steps import MOST_STEPS, Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
 from marey_schemas.options.modelling import TreeOptions
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import RefineOptions, TransitionOptions
 
 START = Placement(0.5, 1.0, -2.0)
 

@@ -13,6 +13,7 @@ from math import isfinite, radians
 
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import MotionPrimitive
+from marey_schemas.options.searching import CONSTRAINT_WEIGHT, LOOK_AXIS, TOLERANCE_DEG, TOLERANCE_M, TOLERANCE_S
 
 Moment = str | float
 Coordinates = tuple[float | None, float | None, float | None]
@@ -20,9 +21,7 @@ Vector = tuple[float, float, float]
 Rotation = tuple[float, float, float, float]
 
 START, END = "start", "end"
-TOLERANCE_M = 0.01
-TOLERANCE_RAD = radians(5.0)
-TOLERANCE_S = 0.05
+TOLERANCE_RAD = radians(TOLERANCE_DEG)
 
 
 class InvalidConstraint(MotionError):
@@ -47,7 +46,7 @@ class JointPosition:
     at: Moment
     target_m: Coordinates
     tolerance_m: float = TOLERANCE_M
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         known = [value for value in self.target_m if value is not None]
@@ -69,7 +68,7 @@ class JointOrientation:
     at: Moment
     rotation: Rotation
     tolerance_rad: float = TOLERANCE_RAD
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         _require_direction(self.rotation, 4, "rotation")
@@ -91,9 +90,9 @@ class LookDirection:
     at: Moment
     direction: Vector | None = None
     point_m: Vector | None = None
-    axis: Vector = (0.0, 0.0, 1.0)
+    axis: Vector = LOOK_AXIS
     tolerance_rad: float = TOLERANCE_RAD
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         _require((self.direction is None) != (self.point_m is None), "give a direction or a point", "direction")
@@ -117,7 +116,7 @@ class RootPosition:
     at: Moment
     target_m: tuple[float | None, float | None]
     tolerance_m: float = TOLERANCE_M
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         known = [value for value in self.target_m if value is not None]
@@ -138,7 +137,7 @@ class RootHeading:
     at: Moment
     heading_rad: float
     tolerance_rad: float = TOLERANCE_RAD
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         _require(isfinite(self.heading_rad), "a heading is a finite number", "heading_rad")
@@ -157,7 +156,7 @@ class KeyframeTime:
     at: Moment
     seconds: float
     tolerance_s: float = TOLERANCE_S
-    weight: float = 1.0
+    weight: float = CONSTRAINT_WEIGHT
 
     def __post_init__(self) -> None:
         _require(isfinite(self.seconds) and self.seconds >= 0, "a time is not negative", "seconds")

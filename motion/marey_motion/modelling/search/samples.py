@@ -12,11 +12,8 @@ from marey_motion.arrays import Floats, Indices
 from marey_motion.errors import MotionError
 from marey_motion.modelling.search.objective import Objective
 from marey_motion.modelling.search.tree import SampleTree
+from marey_schemas.options.searching import CANDIDATES, PASSES
 
-CANDIDATES = 8
-"""Four are the published number; eight come a sixth nearer in a millisecond."""
-
-PASSES = 2
 NARROWING = 0.25
 """Factor of the distances between samples for each further pass."""
 

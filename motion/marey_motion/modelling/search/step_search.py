@@ -13,17 +13,16 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling.search.constraints import START, JointPosition
 from marey_motion.modelling.search.objective import AT_ORIGIN, build_objective
 from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, refine
-from marey_motion.modelling.search.samples import CANDIDATES, PASSES, FoundSamples, search_closely
+from marey_motion.modelling.search.samples import FoundSamples, search_closely
 from marey_motion.modelling.search.steps import (
     DEFAULT_TRANSITIONS,
     CarriedOn,
     Measured,
     SeveralSteps,
     Step,
-    TransitionOptions,
 )
 from marey_motion.modelling.search.tree import SampleTree
-from marey_schemas.options.searching import RefineOptions
+from marey_schemas.options.searching import CANDIDATES, PASSES, RefineOptions, TransitionOptions
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,12 +23,9 @@ from marey_motion.modelling.search import slope_kernels
 from marey_motion.modelling.search.constraints import Constraint, InvalidConstraint
 from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
 from marey_motion.modelling.search.tracking import Chains, Tracked, body_place, facing, track_points
+from marey_schemas.options.searching import TransitionOptions
 
 MOST_STEPS = 32
-TRANSITION_JOINTS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Standard joints that are asked to go on where they were: hands and feet."""
-
-TRANSITION_TOLERANCE_M = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +41,6 @@ class Step:
     primitive: MotionPrimitive
     constraints: tuple[Constraint, ...]
     standard_joints: Mapping[str, int]
-
-
-@dataclass(frozen=True)
-class TransitionOptions:
-    """Continuity between steps.
-
-    Parameters
-    ----------
-    joints : standard names; those count that the skeletons of all steps have
-    tolerance_m, weight : of the distance that each of them jumps, and of the pelvis' height
-    """
-
-    joints: tuple[str, ...] = TRANSITION_JOINTS
-    tolerance_m: float = TRANSITION_TOLERANCE_M
-    weight: float = 1.0
 
 
 DEFAULT_TRANSITIONS = TransitionOptions()
