@@ -1,4 +1,4 @@
-"""Bytes by digest: ask which the server lacks, send them, fetch them."""
+"""Blobs, identified by digest: find those that the server lacks, send and download them."""
 
 from __future__ import annotations
 

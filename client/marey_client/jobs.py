@@ -82,7 +82,9 @@ class Jobs:
             if job.state.terminal:
                 return self._ended(job, require_success)
             if deadline is not None and time.monotonic() >= deadline:
-                raise WaitedTooLong(f"job {job_id} is still {job.state} after {timeout_s:g} s; it goes on")
+                raise WaitedTooLong(
+                    f"job {job_id} is still {job.state} after {timeout_s:g} s; it continues on the server"
+                )
             if time.monotonic() - asked < pause_s:  # the server answered at once
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, 1.0)

@@ -71,12 +71,12 @@ class ProjectHandle(ProjectItems):
 
     @cached_property
     def coverage_streams(self) -> CoverageStreams:
-        """Its coverage streams: performances that are measured while they are recorded."""
+        """The coverage streams of the project: performances that are measured during their recording."""
         return CoverageStreams(self.transport, self.name)
 
     @cached_property
     def members(self) -> Members:
-        """Its members and their roles."""
+        """The members of the project and their roles."""
         return Members(self.transport, self.name)
 
     # -- jobs ----------------------------------------------------------------------------------------------------------

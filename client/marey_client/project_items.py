@@ -39,41 +39,41 @@ class ProjectItems:
 
     @cached_property
     def clips(self) -> Items[ClipHandle]:
-        """Its clips."""
+        """The clips of the project."""
         return Items(self.transport, self.name, Kind.CLIP, ClipHandle)
 
     @cached_property
     def skeletons(self) -> Items[SkeletonHandle]:
-        """Its skeletons."""
+        """The skeletons of the project."""
         return Items(self.transport, self.name, Kind.SKELETON, SkeletonHandle)
 
     @cached_property
     def annotations(self) -> Items[AnnotationHandle]:
-        """Its annotations."""
+        """The annotations of the project."""
         return Items(self.transport, self.name, Kind.ANNOTATION, AnnotationHandle)
 
     @cached_property
     def processed(self) -> Items[ProcessedHandle]:
-        """Its processed data: clips aligned to a reference, with their time functions."""
+        """The processed data of the project: clips aligned to a reference, with their time functions."""
         return Items(self.transport, self.name, Kind.PROCESSED, ProcessedHandle)
 
     @cached_property
     def edits(self) -> Edits:
-        """Its edits."""
+        """The edits of the project."""
         return Edits(self.transport, self.name, Kind.EDIT, EditHandle)
 
     @cached_property
     def models(self) -> Items[ModelHandle]:
-        """Its models."""
+        """The models of the project."""
         return Items(self.transport, self.name, Kind.MODEL, ModelHandle)
 
     @cached_property
     def evaluations(self) -> Items[EvaluationHandle]:
-        """Its evaluations."""
+        """The evaluations of the project."""
         return Items(self.transport, self.name, Kind.EVALUATION, EvaluationHandle)
 
     def items(self, kind: Kind) -> Items[Any]:
-        """Its items of any kind."""
+        """The items of the project, of any kind."""
         known: tuple[Items[Any], ...] = (
             self.clips, self.skeletons, self.annotations, self.processed, self.edits, self.models, self.evaluations,
         )  # fmt: skip
@@ -81,7 +81,7 @@ class ProjectItems:
 
     @cached_property
     def collections(self) -> Collections:
-        """Its tree of folders."""
+        """The folders of the project."""
         return Collections(self.transport, self.name)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:

@@ -20,7 +20,7 @@ class Role(StrEnum):
 
 
 class Visibility(StrEnum):
-    """Who may read a project without being a member: nobody, or everybody with the address."""
+    """Visibility of a project to users who are not members: private or public."""
 
     PRIVATE = "private"
     PUBLIC = "public"
@@ -74,7 +74,7 @@ class User(Answer):
 
 
 class Me(Answer):
-    """Who the caller is and what the credential allows."""
+    """The caller and the rights of the credential."""
 
     user: User | None
     scopes: tuple[str, ...]

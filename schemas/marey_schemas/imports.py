@@ -29,7 +29,7 @@ class ImportRequest(ImportOptions):
 
 
 class Refusal(Answer):
-    """Why a file was refused."""
+    """Refusal of a file, with the reason."""
 
     code: str
     detail: str

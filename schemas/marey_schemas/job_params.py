@@ -43,7 +43,7 @@ class SuffixedResults(TaggedResults):
 
 
 MOST_EXAMPLES = 2000
-"""That are all compared with each other, mirrored ones counted."""
+"""Greatest number of examples that are all compared with each other, including mirrored ones."""
 
 
 class AlignParams(AlignOptions, SuffixedResults):
@@ -220,7 +220,7 @@ class TreeParams(TreeOptions):
     """Parameters of `tree`."""
 
     def unclear_place(self, into: str) -> str | None:
-        """Why the tree cannot go into this collection."""
+        """Return the reason why the tree cannot be stored in a collection, or None."""
         return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
 
 
@@ -243,7 +243,7 @@ class EditParams(SuffixedResults):
         return self
 
     def unclear_place(self, into: str) -> str | None:
-        """Why results that go into this collection would change the clips themselves unasked, or not though asked."""
+        """Return the reason why `into` contradicts `in_place` for these results, or None."""
         if self.in_place and into:
             return f"the results cannot both take the place of the clips and go to {into}"
         if not (self.in_place or into or self.suffix):

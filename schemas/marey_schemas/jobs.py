@@ -30,7 +30,7 @@ class JobState(StrEnum):
 
 
 class FailureReason(StrEnum):
-    """Why a job failed for good."""
+    """Reason of the final failure of a job."""
 
     ERROR = "error"
     TIMEOUT = "timeout"
@@ -92,7 +92,7 @@ class JobOutputsInput(Request):
 
 
 JobInput = ItemInput | CollectionInput | JobOutputsInput
-"""What can stand for an input of a job."""
+"""Forms of an input of a job."""
 
 
 class Resources(Request):
@@ -138,7 +138,7 @@ class Progress(Request):
 
 
 class JobFailure(Answer):
-    """Why a job failed, for the person who reads it."""
+    """Failure of a job, described for people."""
 
     reason: FailureReason
     code: str

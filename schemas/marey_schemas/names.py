@@ -15,7 +15,7 @@ ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LE
 """Any printable name without a slash."""
 
 NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$")]
-"""What may be appended to a name."""
+"""Text that can be appended to a name."""
 
 CollectionPath = Annotated[
     str, StringConstraints(max_length=1024, pattern=r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$")

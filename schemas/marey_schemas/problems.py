@@ -10,7 +10,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 class FieldError(Answer):
-    """One thing that is wrong with a request, and where."""
+    """An error in a request and its place."""
 
     pointer: str = Field(description="JSON Pointer into the body, or the name of a query parameter or header.")
     code: str

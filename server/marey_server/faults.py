@@ -42,7 +42,7 @@ _faults = [_Fault(text) for text in os.environ.get(VARIABLE, "").split(",") if t
 
 
 def point(name: str) -> None:
-    """Do what the environment asks for here: ordinarily nothing."""
+    """Trigger the fault that the environment requests for this point, if any."""
     for fault in _faults:
         if fault.name == name:
             fault.act()

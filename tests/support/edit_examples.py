@@ -3,7 +3,7 @@
 from typing import Any
 
 SOURCE = "other"
-"""What the examples call the other clip."""
+"""Id of the other clip in the examples."""
 
 EXAMPLES: dict[str, list[dict[str, Any]]] = {
     "trim": [{"start": 10, "stop": 170}, {"start": 3}],

@@ -23,7 +23,7 @@ HEAD_START_S = 0.1
 
 @dataclass(frozen=True)
 class Step:
-    """What one of the two does, over which connection, for whom."""
+    """A transaction of one side: its function, its connection and its principal."""
 
     database: Database
     principal: Principal
@@ -35,7 +35,7 @@ class Abandoned(Exception):
 
 
 def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:
-    """What both answered, or the errors they were refused with. Without `commit`, the first one rolls back."""
+    """Run two transactions interleaved; return their results or errors. Without `commit`, the first rolls back."""
     wrote, may_end = threading.Event(), threading.Event()
 
     def held_open(tx: Transaction) -> Any:

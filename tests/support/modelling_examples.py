@@ -1,4 +1,4 @@
-"""Aligned examples that are known to the last number, for tests of models."""
+"""Synthetic aligned examples with exactly known values, for tests of models."""
 
 import numpy as np
 

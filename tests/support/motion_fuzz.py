@@ -86,7 +86,7 @@ def broken(data: bytes, source: random.Random) -> bytes:
 
 
 def read_broken(seed: Seed, source: random.Random) -> str:
-    """What became of one broken file: "read" or the code of its error; other exceptions are faults of the reader."""
+    """Read a broken file; return "read" or the code of the error. Other exceptions are faults of the reader."""
     name, data, companion = seed
     if companion is not None and source.random() < 0.3:
         companion = broken(companion, source)

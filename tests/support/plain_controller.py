@@ -17,7 +17,7 @@ from marey_schemas.options.matching import ControllerOptions
 
 @dataclass
 class PlainRun:
-    """What the loop did, tick by tick; `searches` are the ticks at which it looked for another row."""
+    """Record of the loop, tick by tick; `searches` are the ticks with a search for another row."""
 
     rows: list[int] = field(default_factory=list)
     positions: list[complex] = field(default_factory=list)

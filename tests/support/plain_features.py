@@ -1,4 +1,4 @@
-"""Rows of a matching database by loops and library calls alone: what the vectorised code is compared with."""
+"""Reference computation of a matching database's rows in plain loops, to test the vectorised code."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def layout_3(seed=1, joints=ANIMATED):
 
 
 def flat(seed=1, joints=ANIMATED):
-    """What layouts 1 and 2 share."""
+    """Return the members that layouts 1 and 2 share."""
     generator = np.random.default_rng(seed)
     mean, vectors = space(generator, joints)
     weights, means, covariances = mixture(generator)

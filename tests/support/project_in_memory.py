@@ -19,7 +19,7 @@ PARAMS = EvaluateParams(
 
 @dataclass
 class ProjectInMemory:
-    """What a job may use of its project: a context without a pipe."""
+    """The project of a job in memory: a context without a pipe."""
 
     scratch: object
     task: Task = field(default_factory=lambda: Task(0, 1))

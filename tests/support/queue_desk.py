@@ -129,7 +129,7 @@ class Desk:
         return self.database.write(self.user, reading.cancel_job, job_id, self.policy)
 
     def outputs(self, job_id: str) -> list[Any]:
-        """What a job published."""
+        """Return the results that a job published."""
         return list(self.database.read(self.user, reading.list_outputs, job_id).items)
 
     def things(self, count: int, collection: str = "raw") -> list[str]:

@@ -32,7 +32,7 @@ class ModelJob:
     cancel_requested: bool = False
     signatures: set[str] = field(default_factory=set)
     answers: dict[tuple[int, str], str] = field(default_factory=dict)
-    """What `complete` and `fail` were answered, by fence and write id: the state the job went to."""
+    """Answers of `complete` and `fail`, the new state of the job, by fence and write id."""
 
 
 @dataclass
@@ -161,5 +161,5 @@ class ModelQueue:
         return {job.id: (job.state, job.fence, job.attempt, job.interruptions) for job in self.jobs.values()}
 
     def ids(self) -> Iterable[str]:
-        """Of every job."""
+        """Return the ids of all jobs."""
         return self.jobs

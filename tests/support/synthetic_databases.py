@@ -20,7 +20,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
 
 FOLLOWS = ("time", "path", "open_loop")
 EXACT = ControllerOptions(root_inertialisation=False)
-"""Nothing blended: what a root does is what the rows say."""
+"""Options without blending, so that the root moves exactly as in the rows."""
 
 HORIZONS = (20, 40, 60)
 POSE_DIMENSIONS = 15

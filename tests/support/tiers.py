@@ -25,7 +25,7 @@ EXAMPLES, STEPS = 100, 50
 
 @dataclass(frozen=True)
 class Tier:
-    """What one tier leaves out, by reason, and how far generated tests search."""
+    """A tier of tests: the tests it leaves out, with reasons, and the effort of generated tests."""
 
     examples: int
     steps: int

@@ -113,7 +113,7 @@ class Stop(Enum):
 
 @dataclass
 class Watch:
-    """Looks after the limits of one attempt."""
+    """The limits of one attempt: lease, time and memory."""
 
     lease: Lease
     keeper: LeaseKeeper

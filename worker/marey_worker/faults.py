@@ -21,7 +21,7 @@ _passes: Counter[str] = Counter()
 
 
 def point(name: str) -> None:
-    """Do what the environment asks for here: ordinarily nothing."""
+    """Trigger the fault that the environment requests for this point, if any."""
     wanted = os.environ.get(VARIABLE)
     if not wanted:
         return

@@ -162,7 +162,7 @@ class Folder:
         return self.project.collections.move(self.collection, f"{folder}/{name}".lstrip("/"))
 
     def delete(self) -> None:
-        """Hide it with all it holds."""
+        """Delete the item or folder with its contents; it can be restored."""
         self.project.collections.delete(self.collection)
 
     def restore(self) -> Collection:
@@ -183,7 +183,7 @@ class SingleItem:
 
     @property
     def kind(self) -> str:
-        """Its kind."""
+        """The kind of the item or folder."""
         return self.handle.item.kind.value
 
     @property

@@ -152,7 +152,7 @@ class _Option:
 
     @property
     def help(self) -> str:
-        """Meaning, range and default; how several values are written."""
+        """Return the help text of an option: description, range, default, and the form of several values."""
         meaning = self.schema.get("description", "")
         notes = [
             range_text(self._schema),

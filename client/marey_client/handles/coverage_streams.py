@@ -70,7 +70,7 @@ class CoverageStreamHandle:
 
     @property
     def id(self) -> str:
-        """Its id."""
+        """The id of the stream."""
         return self.stream.id
 
     def send(

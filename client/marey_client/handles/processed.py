@@ -16,7 +16,7 @@ from marey_schemas.kinds import Kind
 
 
 class ProcessedHandle(ItemHandle):
-    """One aligned clip: canonical frames of an action, and the way back to the clip that they come from."""
+    """An aligned clip: canonical frames of an action, and the mapping to the frames of its source clip."""
 
     def motion(
         self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None

@@ -62,7 +62,7 @@ class _Layout:
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
 
     def group(self, index: int) -> slice:
-        """Columns of a group."""
+        """Number of columns in a group of tiles."""
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:

@@ -1,1 +1,1 @@
-"""Who may do what: principals, roles, scopes, passwords and token secrets. Pure rules; the rows are in `store`."""
+"""Access control: principals, roles, scopes, passwords and token secrets. Pure rules; the rows are in `store`."""

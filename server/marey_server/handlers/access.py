@@ -1,4 +1,4 @@
-"""Who is who: the caller, sign-in, tokens, users."""
+"""Resources of the caller, sign-in, tokens and users."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class TokenResource(Resource):
 
 
 class AllUsers(Resource):
-    """Everybody who can sign in."""
+    """All users."""
 
     path = "/users"
     tag = "Access"

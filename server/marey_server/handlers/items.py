@@ -176,7 +176,7 @@ class RevisionResource(Resource):
 
 
 class LineageQuery(Request):
-    """Of which revision."""
+    """Query of a lineage: the revision that it starts from."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
 

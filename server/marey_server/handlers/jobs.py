@@ -43,7 +43,7 @@ class JobKinds(Resource):
 
 
 class JobKindResource(Resource):
-    """One thing that can be done."""
+    """A kind of job."""
 
     path = "/job-kinds/{job_kind}"
     tag = "Jobs"

@@ -29,7 +29,7 @@ FIGURE_TYPES = {
     "json": "application/json",
 }
 SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src 'unsafe-inline'; img-src data:"
-"""What is served shows itself and nothing else: no requests, and no access to what the browser keeps for the site."""
+"""Content-Security-Policy that forbids the page to load, send or store anything."""
 
 
 class ReportQuery(Request):

@@ -17,7 +17,7 @@ from marey_server.motions.searching import FoundSearchable, Searchable, Searchab
 
 
 class FoundFileQuery(Request):
-    """As which file."""
+    """Query of a search whose result is a file: its format and unit."""
 
     format: MotionFormat = Field("bvh", description="File format of the motion.")
     unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")

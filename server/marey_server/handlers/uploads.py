@@ -11,7 +11,7 @@ from marey_server.store import uploads
 from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
-"""Of a piece that is cut off, less than this is lost."""
+"""Bytes that are written at a time; an interrupted request loses at most as many."""
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:

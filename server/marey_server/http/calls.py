@@ -102,6 +102,6 @@ def only_identify(tx: Transaction) -> None:
 
 
 def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Do something on behalf of the caller and hand its result back."""
+    """Run a function on behalf of the caller and return its result."""
     caller.identify(tx)
     return function(tx, *args, **kwargs)

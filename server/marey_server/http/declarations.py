@@ -28,7 +28,7 @@ Declared = Callable[..., Coroutine[Any, Any, None]]
 
 
 class Access(StrEnum):
-    """Who may do it at least. Roles are roles in the project of the path, including every higher role."""
+    """Least access for an operation. Roles are roles in the project of the path, including every higher role."""
 
     ANYONE = "anyone"
     SIGNED_IN = "signed_in"
@@ -52,7 +52,7 @@ class Document:
 
 
 class Bytes:
-    """Marks a body or an answer that is bytes as they are."""
+    """Marker of a body or an answer that consists of plain bytes."""
 
 
 class Files:

@@ -24,7 +24,7 @@ class Precondition:
     """Precondition of a write: one or several states, any state (`*`), or no existing resource."""
 
     expected_rev: ExpectedRev = None
-    """What to require in the UPDATE."""
+    """The `rev` that the UPDATE requires, or None."""
     absent: bool = False
 
 

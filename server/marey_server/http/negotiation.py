@@ -33,10 +33,10 @@ BSON_BLOCKS = MediaType(codecs.BSON, "bson-blocks", "blocks")
 EVENT_STREAM = MediaType("text/event-stream", "events")
 
 MODEL_FORMS = (JSON, MSGPACK, BSON)
-"""What every answer without arrays comes in."""
+"""Media types of answers without arrays."""
 
 DOCUMENT_FORMS = (JSON, MSGPACK, BSON, MSGPACK_BLOCKS, BSON_BLOCKS)
-"""What documents come in; `arrays=blocks` passes stored arrays on as they are."""
+"""Media types of documents; `arrays=blocks` returns stored arrays without decoding them."""
 
 
 @dataclass(frozen=True, slots=True)

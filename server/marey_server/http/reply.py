@@ -1,4 +1,4 @@
-"""Answers: what a handler says, and the bytes it becomes. Rendering needs no request, so it can run in any thread."""
+"""Answers of handlers and their rendering to bytes. Rendering needs no request and can run in any thread."""
 
 from __future__ import annotations
 

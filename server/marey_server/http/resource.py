@@ -78,7 +78,7 @@ class Resource(Exchange):
 
     @property
     def principal(self) -> Principal | None:
-        """Who asked, once it is known."""
+        """The principal of the request, once it is authenticated."""
         caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
         return caller.principal if caller is not None else None
 
@@ -125,7 +125,7 @@ class Resource(Exchange):
         return await asyncio.wrap_future(self.services.compute_threads.submit(function, *args, **kwargs))
 
     async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """As `compute`, for what may take seconds: some of the threads are left to others."""
+        """Run a computation that may take seconds, like `compute`; some threads are reserved for short ones."""
         async with self.services.compute_threads.long_place():
             return await self.compute(function, *args, **kwargs)
 

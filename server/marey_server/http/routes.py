@@ -1,4 +1,4 @@
-"""The table of every route: what is served, what is documented, and what the access test walks through."""
+"""The table of all routes, used for serving, for the documentation and for the access test."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ LARGEST_ANSWER_SHARE = 8
 ANSWER_ENTRY_BYTES = 512
 """Memory of an entry of the cache of answers besides its body."""
 MODEL_CACHE_BYTES = 64 << 20
-"""Of parsed models; models with their search trees may take as much again."""
+"""Greatest size of the cache of parsed models; models with search trees have a cache of the same size."""
 TOKENS_REMEMBERED = 10_000
 
 

@@ -58,7 +58,7 @@ _CHUNK = Prepared(
 
 
 class DatabaseBlobs:
-    """In the database, in rows of 1 MiB."""
+    """Blobs stored in the database, in rows of 1 MiB."""
 
     def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
         """Keep bytes."""
@@ -91,7 +91,7 @@ class DatabaseBlobs:
 
 
 class DirectoryBlobs:
-    """In files of a directory: `<root>/ab/cdef...`, written aside, synced and renamed."""
+    """Blobs stored in files, `<root>/ab/cdef...`; each is written under another name, synced and renamed."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

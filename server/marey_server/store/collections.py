@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 MAX_PATH_LENGTH = 1024
 MAX_PATH_BYTES = 2048
-"""What an index of Postgres holds, with room to spare."""
+"""Greatest size of a path in bytes, well below the limit of an index entry in Postgres."""
 
 _ALIVE = collection.c.deleted_us.is_(None)
 

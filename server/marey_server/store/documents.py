@@ -47,9 +47,9 @@ class PreparedDocument:
     body: Tree
     size_bytes: int
     arrays: dict[str, tuple[str, bytes]]
-    """By JSON Pointer: digest and bytes of the blob that holds the array."""
+    """Digest and bytes of each array's blob, by JSON Pointer."""
     files: dict[str, str]
-    """By JSON Pointer: digests of blobs that the document names."""
+    """Digests of the blobs that the document refers to, by JSON Pointer."""
 
 
 def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:

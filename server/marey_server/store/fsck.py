@@ -39,7 +39,7 @@ PAGE = 100
 
 @dataclass(frozen=True, slots=True)
 class StoreDefect:
-    """One thing that is wrong: a stable code, what it is about, and a sentence."""
+    """A defect of the store: a stable code, the place, and a sentence."""
 
     code: str
     subject: str

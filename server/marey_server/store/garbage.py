@@ -95,7 +95,7 @@ def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_
 
 
 def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of these documents that nothing refers to."""
+    """Delete those of the given documents that have no references."""
     going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
     tx.execute(delete(document_blob).where(document_blob.c.document_digest.in_(going)))
     tx.execute(delete(document).where(document.c.digest.in_(going)))
@@ -115,7 +115,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
 
 
 def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of these blobs that nothing refers to."""
+    """Delete those of the given blobs that have no references."""
     going = _still_garbage(tx, blob, digests, grace_us)
     for digest in going:
         tx.blobs.release(tx.connection, digest)

@@ -29,5 +29,5 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
 
 
 def give_up_lead(tx: Transaction, name: str, holder: str) -> None:
-    """Let another one lead at once."""
+    """Give up the lead, so that another process can take it at once."""
     tx.execute(update(leader).where(leader.c.name == name, leader.c.holder == holder).values(expires_us=tx.now_us))

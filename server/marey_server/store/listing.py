@@ -36,7 +36,7 @@ class Order:
     """Each with whether it falls."""
 
     def clauses(self) -> list[UnaryExpression[Any]]:
-        """For ORDER BY."""
+        """Return the clauses of ORDER BY."""
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:

@@ -1,4 +1,4 @@
-"""Who belongs to a project, in which role. A project always keeps an owner."""
+"""Members of projects and their roles. A project always keeps an owner."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Wakeups:
 
 
 class Listener:
-    """One coroutine's ear."""
+    """A waiting coroutine and the topics that wake it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

@@ -38,7 +38,7 @@ MOST_KEPT = 1
 
 @dataclass(frozen=True)
 class MatchingClips:
-    """Clips as motion matching searches them."""
+    """A matching database of clips, with its search index."""
 
     database: MatchingDatabase
 

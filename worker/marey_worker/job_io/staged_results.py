@@ -1,4 +1,4 @@
-"""Results handed over as they get ready, so that the server takes them in while the next ones are computed."""
+"""Staging of results one by one, so that they are sent while the next ones are computed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class StagedResults:
         return len(self.names)
 
     def add(self, output: StagedOutput) -> None:
-        """One more; handed over with its neighbours.
+        """Add a result; several results are sent together.
 
         Raises `JobRefused` for a second one of the same name, which would replace the first without a word.
         """

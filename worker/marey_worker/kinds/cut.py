@@ -35,7 +35,7 @@ def run(context: Context, params: CutParams) -> dict[str, Any]:
 
 
 class _AnnotatedClip(NamedTuple):
-    """An annotation, the clip it is of, and the segments to cut out with the names that the pieces get."""
+    """An annotation, its clip, and the segments to cut out with the names of the pieces."""
 
     pin: PinnedInput
     annotation: Annotation
@@ -124,7 +124,7 @@ class _Cutting:
             labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
             known = f"the labels there are: {', '.join(labels)}" if labels else "they have none"
             raise JobRefused(
-                "nothing-to-cut", f"no segment of {len(todo)} annotations is asked for; {known}{self._refusals.first}"
+                "nothing-to-cut", f"no segment of {len(todo)} annotations was selected; {known}{self._refusals.first}"
             )
         (folder, name), count = places.most_common(1)[0]
         if count > 1:

@@ -58,7 +58,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
 
 
 class _Exporting:
-    """One job's clips as files."""
+    """Export of the clips of one job."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context

@@ -202,7 +202,7 @@ class Database:
         return self._readers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
 
     def close(self) -> None:
-        """Finish what runs, then close every connection."""
+        """Finish the running transactions, then close all connections."""
         if self._write_lane is not None:
             self._write_lane.close()
         self._readers.shutdown(wait=True)

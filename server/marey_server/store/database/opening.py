@@ -1,4 +1,4 @@
-"""Why a database cannot be opened, in a sentence for the person who starts the server."""
+"""Errors of a database that cannot be opened, described for the person who starts the server."""
 
 from __future__ import annotations
 

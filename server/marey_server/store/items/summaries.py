@@ -10,7 +10,7 @@ from typing import Any
 from marey_schemas.kinds import Kind
 
 LABELS_SHOWN = 32
-"""Of an annotation, those of most segments."""
+"""Greatest number of labels in the summary of an annotation, those with the most segments."""
 
 
 @dataclass(frozen=True, slots=True)
