@@ -97,7 +97,8 @@ class SharedPostgres:
         schema_version = sqlalchemy.table("alembic_version", sqlalchemy.column("version_num"))
         tables = [schema_version, *metadata.sorted_tables]
         self._deletes = ";".join(f'DELETE FROM "{table.name}"' for table in reversed(tables))
-        self._engine = sqlalchemy.create_engine(url, isolation_level="AUTOCOMMIT")
+        # Tests of outages end every connection, this one included.
+        self._engine = sqlalchemy.create_engine(url, isolation_level="AUTOCOMMIT", pool_pre_ping=True)
         with self._engine.connect() as connection:
             self._first_rows = {
                 table: [dict(row) for row in connection.execute(table.select()).mappings()] for table in tables
