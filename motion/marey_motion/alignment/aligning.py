@@ -143,7 +143,7 @@ def align_clips(
 
 
 class _Aligning:
-    """One run."""
+    """One alignment of a set of clips, with its options, threads and callbacks."""
 
     on_refusal: OnRefusal | None = None
 

@@ -17,7 +17,7 @@ CM_PER_M = 100.0
 
 @dataclass(frozen=True)
 class FootQuality:
-    """Feet of motions, by the joints that touch the ground.
+    """Measures of feet in motions: frames below the floor and sliding of the joints that touch the ground.
 
     Parameters
     ----------

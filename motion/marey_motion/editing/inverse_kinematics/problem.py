@@ -117,7 +117,7 @@ class IkProblem(NamedTuple):
 
     @property
     def found(self) -> SolverResult:
-        """Empty arrays for the results of a solver."""
+        """Make empty arrays for the results of a solver."""
         frames, count = len(self.roots), len(self.targets.kinds)
         return SolverResult(
             np.zeros((frames, count)), np.zeros((frames, count)), np.zeros(frames, np.int64), np.zeros(frames, np.bool_)

@@ -144,7 +144,7 @@ def _multiply(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
-    """Inverse of the left Jacobian of a rotation vector: it has no pole, up to half a turn."""
+    """Compute the inverse left Jacobian of a rotation vector; it is finite up to half a turn."""
     angle = math.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
     factor = 1.0 / 12.0
     if angle > _SMALL_ANGLE:
