@@ -366,7 +366,7 @@ def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
 
 
 def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
-    """Offsets (F, 3) of the joints whose offset is not constant."""
+    """Collect the offsets (F, 3) of the joints whose offset is not constant."""
     return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 

@@ -1,4 +1,4 @@
-"""Rotations given as quaternions in files: checked, normalised, and continuous in sign."""
+"""Quaternions read from files: checked, normalised, and made continuous in sign."""
 
 from __future__ import annotations
 

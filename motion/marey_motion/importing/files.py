@@ -177,7 +177,7 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
     apart = np.abs(own.offsets[order] - skeleton.offsets)[1:].max(initial=0.0)
     if parents != wanted or apart > SAME_OFFSET_M:
         raise FormatError(
-            f"its bones are not those of the skeleton asked for (offsets differ by up to {apart:.4f} m); "
+            f"its bones are not those of the chosen skeleton (offsets differ by up to {apart:.4f} m); "
             "leave the skeleton out and retarget instead",
             code="skeleton-mismatch",
             file=file,

@@ -61,7 +61,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     found = model_of_document(source.document, name, skeleton=given)
     own = found.primitive.skeleton
     if given is not None and not same_hierarchy(own, given, tolerance_m=SAME_OFFSET_M):
-        message = "its skeleton is not the one asked for; leave that out, and it is imported with its own"
+        message = "its skeleton is not the one that was chosen; choose none, and it is imported with its own"
         raise FormatError(message, code="skeleton-mismatch", file=name)
     ref = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
     item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts(file, found, ref))

@@ -57,7 +57,7 @@ class JointPosition:
 
 @dataclass(frozen=True)
 class JointOrientation:
-    """A joint is turned so; the error is the angle of the rotation that is missing, about any axis.
+    """A joint has the given rotation; the error is the angle between that and its rotation, about any axis.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class Circle:
 
 
 def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> dict[str, Circle]:
-    """Circles of clips by uid, those with most transitions between them side by side.
+    """Arrange circles of clips by uid; clips with many transitions between them are side by side.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def reach_of(subject: ModelSubject) -> list[Reach]:
 
 
 def draw_samples(subject: ModelSubject) -> Sketch:
-    """Examples and samples at the same moments, all of a kind on top of each other."""
+    """Draw examples and samples at the same moments, all examples in one row and all samples in another."""
     frames, moments = subject.moments()
     chosen = evenly(len(subject.poses), len(subject.samples))
     examples = subject.points(subject.poses[chosen][:, frames])
