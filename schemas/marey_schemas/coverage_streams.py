@@ -17,7 +17,7 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import ItemId, JointName
-from marey_schemas.options.evaluation import Grid, Speed, TurnRate
+from marey_schemas.options.evaluation import COVERAGE_LEAST_S, TARGET_PATH_S, Grid, Speed, TurnRate
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
 MOST_CELLS = 2000
@@ -55,11 +55,11 @@ class CoverageStreamCreate(Request):
         gt=0,
         le=3600,
         allow_inf_nan=False,
-        description="Seconds of data that each cell needs. Absent: those of the evaluation, or 1.",
+        description=f"Seconds of data that each cell needs. Absent: those of the evaluation, or {COVERAGE_LEAST_S:g}.",
     )
     target_count: int = Field(3, ge=0, le=16, description="Number of targets in each answer.")
     path_s: float = Field(
-        4.0, ge=0.5, le=20, allow_inf_nan=False, description="Duration of a target's path, in seconds."
+        TARGET_PATH_S, ge=0.5, le=20, allow_inf_nan=False, description="Duration of a target's path, in seconds."
     )
 
     @model_validator(mode="after")

@@ -29,7 +29,7 @@ from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
-from marey_schemas.options.evaluation import Grid
+from marey_schemas.options.evaluation import COVERAGE_LEAST_S, TARGET_PATH_S, Grid
 
 MOST_CELLS = 2000
 FARTHEST_M = 1e6
@@ -81,7 +81,12 @@ class OnlineCoverage:
     """
 
     def __init__(
-        self, rate_hz: float, grid: Grid | None = None, *, least_s: float = 1.0, seconds: Floats | None = None
+        self,
+        rate_hz: float,
+        grid: Grid | None = None,
+        *,
+        least_s: float = COVERAGE_LEAST_S,
+        seconds: Floats | None = None,
     ) -> None:
         self.grid, self.least_s = grid or Grid(), least_s
         self.speed_edges_m_s = cell_edges(self.grid.speeds_m_s, SPEED_STEP_M_S)
@@ -195,7 +200,7 @@ class OnlineCoverage:
         x, z, facing_x, facing_z = newest.tolist()
         return PerformerState(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
 
-    def targets(self, count: int, *, path_s: float = 4.0) -> tuple[Target, ...]:
+    def targets(self, count: int, *, path_s: float = TARGET_PATH_S) -> tuple[Target, ...]:
         """List the cells that lack data, nearest first to the performer's motion, or to standing still.
 
         Distances are counted in cells.

@@ -13,6 +13,11 @@ Family = Literal["circle", "switching"]
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 
+COVERAGE_LEAST_S = 1.0
+"""Seconds of data that a cell needs to count as covered, unless other ones are chosen."""
+TARGET_PATH_S = 4.0
+"""Duration of the path to record for a cell without enough data, in seconds, unless another one is chosen."""
+
 
 class Grid(Options):
     """Speeds and turn rates of a suite of trials, each with each; the defaults are the published ones."""
@@ -58,7 +63,11 @@ class EvaluationOptions(Grid):
         "circle", description="Part of a trial that is measured. circle: the circle only; all: also the approach."
     )
     coverage_least_s: float = Field(
-        1.0, gt=0, le=3600, allow_inf_nan=False, description="Seconds of data that a cell needs to count as covered."
+        COVERAGE_LEAST_S,
+        gt=0,
+        le=3600,
+        allow_inf_nan=False,
+        description="Seconds of data that a cell needs to count as covered.",
     )
     literal_formulas: bool = Field(False, description="Add the values of the published formulas taken literally.")
     database: DatabaseOptions = Field(

@@ -78,11 +78,11 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
     """Start a stream; return it with the computed members of `CoverageStreamState`."""
     from marey_motion.evaluation.online import OnlineCoverage
-    from marey_schemas.options.evaluation import Grid
+    from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
 
     asked = request.model_dump(include={"speeds_m_s", "turn_rates_deg_s"}, exclude_none=True)
     grid = Grid(**asked)
-    least_s, seconds = request.least_s or 1.0, None
+    least_s, seconds = request.least_s or COVERAGE_LEAST_S, None
     if given.evaluation is not None:
         with refusing("evaluation"):
             found = MeasuredCoverage.model_validate(given.measured)
