@@ -78,7 +78,7 @@ class House:
 
     @cached_property
     def imports(self) -> dict[str, set[str]]:
-        """Modules of the product that each module imports anywhere: inside functions and for types only, too."""
+        """Imports of each module within the product, including those inside functions and for types only."""
         return {name: set(_imported(module, self.modules)) - {name} for name, module in self.modules.items()}
 
     @cached_property

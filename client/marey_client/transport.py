@@ -163,7 +163,7 @@ class Transport:
         return self.repeat(once, repeatable=repeatable, what=f"{method} {path}")
 
     def repeat(self, once: Callable[[], T], *, repeatable: bool, what: str) -> T:
-        """Call `once` until it succeeds, or fails in a way that another try would not mend."""
+        """Call `once` until it succeeds or fails with an error that a retry cannot solve."""
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
             try:

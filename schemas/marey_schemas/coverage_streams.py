@@ -74,7 +74,7 @@ class CoverageStreamCreate(Request):
         if self.speeds_m_s and self.turn_rates_deg_s:
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
-                raise ValueError(f"these speeds and turn rates make {cells} cells, over {MOST_CELLS}")
+                raise ValueError(f"these speeds and turn rates make {cells} cells; at most {MOST_CELLS} are possible")
         return self
 
 
@@ -218,7 +218,7 @@ class MeasuredCells(Answer):
     @model_validator(mode="after")
     def _check_seconds(self) -> Self:
         if not np.all((self.seconds >= 0.0) & (self.seconds <= MOST_SECONDS)):
-            raise ValueError(f"seconds: a cell holds 0 to {MOST_SECONDS:g} s")
+            raise ValueError(f"seconds: a cell must have 0 to {MOST_SECONDS:g} s")
         return self
 
 

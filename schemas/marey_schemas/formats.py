@@ -25,7 +25,7 @@ UNITS_M = {
     "ft": 0.3048,
     "m": 1.0,
 }
-"""Metres per unit: the units that motion files have been seen in. The CMU database counts in 1/0.45 inch."""
+"""Metres per unit of length, for the units of motion files. The CMU database uses 1/0.45 inch."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,7 +155,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
     def _check_size(self) -> Self:
         if self.trial_count > MOST_TRIALS:
             raise ValueError(
-                f"these speeds, turn rates and families make {self.trial_count} trials, over {MOST_TRIALS}"
+                f"the speeds, turn rates and families make {self.trial_count} trials, more than {MOST_TRIALS}"
             )
         simulated_s = self.trial_count * (self.approach_s + self.duration_s)
         if simulated_s > MOST_SIMULATED_S:

@@ -225,7 +225,7 @@ class SearchRequest(RefineOptions):
             raise ValueError("constraints: for several motions, give them in steps")
         total = sum(len(step.constraints) for step in self.asked_steps)
         if total > MOST_CONSTRAINTS:
-            raise ValueError(f"steps: {total} constraints in all, over {MOST_CONSTRAINTS}")
+            raise ValueError(f"steps: {total} constraints in all; at most {MOST_CONSTRAINTS} are possible")
         if total * self.candidates > MOST_CANDIDATE_CONSTRAINTS:
             most = MOST_CANDIDATE_CONSTRAINTS // total
             raise ValueError(f"candidates: at most {most} where there are {total} constraints")

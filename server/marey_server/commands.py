@@ -40,7 +40,7 @@ def serve(**settings: Any) -> None:
     except DatabaseUnusable as error:
         raise CommandFailed(str(error)) from error
     except CannotListen as error:
-        raise CommandFailed(f"{error}; name others with --host and --port, 0 for any free port") from error
+        raise CommandFailed(f"{error}; choose others with --host and --port, 0 for any free port") from error
     leave()
 
 

@@ -180,8 +180,8 @@ def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
     ("seconds", "least_s", "said"),
     [
         ([[5.0]], 1.0, "1 cells"),
-        ([[5.0], [-1.0]], 1.0, "coverage: seconds: a cell holds"),
-        ([[5.0], [1e300]], 1.0, "coverage: seconds: a cell holds"),
+        ([[5.0], [-1.0]], 1.0, "coverage: seconds: a cell must have"),
+        ([[5.0], [1e300]], 1.0, "coverage: seconds: a cell must have"),
         ([[5.0], [1.0]], 0.0, "options: coverage_least_s"),
         (None, 1.0, "coverage: Field required"),
     ],

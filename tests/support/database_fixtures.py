@@ -105,7 +105,7 @@ class SharedPostgres:
             }
 
     def empty(self) -> None:
-        """Restore what a new database holds: rows, sequences, and nobody connected."""
+        """Reset the database to its initial rows and sequences, and close all connections."""
         with self._engine.connect() as connection:
             connection.exec_driver_sql(_DISCONNECT_OTHERS)
             connection.exec_driver_sql(_RESTART_SEQUENCES)

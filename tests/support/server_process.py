@@ -152,7 +152,7 @@ def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerPro
 
 
 def free_port() -> int:
-    """Return a loopback port nobody listens on just now."""
+    """Return an unused port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

@@ -131,7 +131,7 @@ class AttemptApi:
 
 @contextmanager
 def _dead_token_is_lost_lease() -> Iterator[None]:
-    """An attempt's token dies with its fence: the server may notice that first."""
+    """Turn a refused token into `LeaseLost`: the token of an attempt expires with its fence."""
     try:
         yield
     except Unauthenticated as error:

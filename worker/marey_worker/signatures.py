@@ -1,4 +1,4 @@
-"""Names for ways to fail: two attempts that end with the same one are not tried a third time."""
+"""Signatures of failures: a job is not retried after two attempts with the same signature."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class Address:
         """Read `project` or `project/path`."""
         project, _, path = text.strip("/").partition("/")
         if not project:
-            raise WrongUsage(f"{text!r} names no project; write project/folder/name")
+            raise WrongUsage(f"{text!r} contains no project; write project/folder/name")
         return cls(project, path)
 
     def __str__(self) -> str:
@@ -217,7 +217,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     """
     address = Address.parse(text)
     if not address.path:
-        raise WrongUsage(f"{text!r} is a whole project; name a folder or an item in it, or see marey project --help")
+        raise WrongUsage(f"{text!r} is a project; give a folder or an item in it, or see marey project --help")
     wanted = FOLDER if text.endswith("/") else kind
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
@@ -234,7 +234,7 @@ def require_apart(things: Sequence[Thing]) -> None:
     for place, one in enumerate(things):
         for other in (*things[:place], *things[place + 1 :]):
             if other.id == one.id:
-                raise WrongUsage(f"{one.place} is named twice")
+                raise WrongUsage(f"{one.place} is given twice")
             if other.kind == FOLDER and one.place.startswith(f"{other.place}/"):
                 raise WrongUsage(f"{one.place} is in {other.place}, which is named, too")
 

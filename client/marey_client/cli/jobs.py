@@ -104,7 +104,7 @@ def submit_job(
 def _kind_of_job(marey: Marey, name: str) -> JobKind:
     kinds = {kind.name: kind for kind in marey.jobs.kinds()}
     if name not in kinds:
-        raise WrongUsage(f"{name!r} is no kind of job of this server; there are {', '.join(kinds)}")
+        raise WrongUsage(f"{name!r} is not a kind of job of this server; the kinds are {', '.join(kinds)}")
     return kinds[name]
 
 

@@ -94,7 +94,9 @@ def _assigned(assignments: list[str], known: set[str]) -> dict[str, str]:
         if not equals or not standard:
             raise WrongUsage(f"{assignment!r}: write standard_joint=JointName")
         if joint and joint not in known:
-            raise WrongUsage(f"{joint!r} is no joint of this skeleton; it has {', '.join(sorted(known)[:8])}, ...")
+            raise WrongUsage(
+                f"{joint!r} is not a joint of this skeleton; its joints are {', '.join(sorted(known)[:8])}, ..."
+            )
         given[standard] = joint
     return given
 

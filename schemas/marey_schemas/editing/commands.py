@@ -37,7 +37,7 @@ Joints = Annotated[tuple[JointName, ...], Field(min_length=1, max_length=MOST_LI
 
 def _require_direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
     if max(map(abs, axis)) < 1e-6:
-        raise ValueError("an axis needs a direction; all three numbers are zero")
+        raise ValueError("axis: at least one of the three numbers must not be zero")
     return axis
 
 

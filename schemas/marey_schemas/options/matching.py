@@ -89,7 +89,7 @@ class DatabaseOptions(Options):
     @classmethod
     def _check_names(cls, extra_joints: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(extra_joints)) < len(extra_joints):
-            raise ValueError("a joint is named twice")
+            raise ValueError("a joint is given twice")
         return extra_joints
 
     @model_validator(mode="after")

@@ -23,7 +23,7 @@ class ProjectsQuery(PageQuery):
 
 
 class Projects(Resource):
-    """Every project the caller may see."""
+    """All projects that the caller may see."""
 
     path = "/projects"
     tag = "Projects"

@@ -98,7 +98,7 @@ class UploadResource(Resource):
 
     @writes(access=Access.SIGNED_IN)
     async def delete(self, upload: str) -> Rendered:
-        """Give an upload up."""
+        """Cancel an upload."""
         return await self.answer(uploads.abandon, upload)
 
 

@@ -22,7 +22,7 @@ from marey_server.process.services import Services
 LINGER_BYTES = 64 * 2**20
 """How much of a refused body is read and thrown away, so that its sender gets to read why."""
 _LENGTH = re.compile("[0-9]{1,4300}")
-"""What `int` takes: it refuses longer texts."""
+"""Pattern of a length; the limit on digits keeps `int` from refusing it."""
 _SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",

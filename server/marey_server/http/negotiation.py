@@ -123,7 +123,7 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
             f"A body may be {', '.join(known)}, not {name}.", context={"understood": list(known)}
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
-        raise UnsupportedMediaTypeProblem(f"Text is read as UTF-8, not {params['charset']}.")
+        raise UnsupportedMediaTypeProblem(f"Text must be sent as UTF-8, not {params['charset']}.")
     return name
 
 

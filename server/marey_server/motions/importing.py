@@ -48,7 +48,7 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """A file that was read and encoded, ready to be stored; or its entry, where there is nothing to store."""
+    """A file that was read and encoded, ready to be stored, or its entry if there is nothing to store."""
 
     name: str
     sources: tuple[SourceFile, ...] = ()
@@ -61,7 +61,7 @@ class PreparedImport:
 
 
 def require_importer(tx: Transaction, project: str) -> None:
-    """Refuse callers who may not import into the project, before their files are taken in."""
+    """Refuse callers who may not import into the project, before their files are received."""
     projects.require(tx, project)
 
 

@@ -13,7 +13,7 @@ TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
 
 
 def make_first_administrator(tx: Transaction, token_file: Path) -> None:
-    """The user `admin` of an empty database, with a token in a file; nothing where there are users."""
+    """Create the user `admin` in a database without users, and write its token to a file."""
     if users.ensure_first_administrator(tx) is not None:
         give_token(tx, users.FIRST_ADMINISTRATOR, token_file, name="first start")
 

@@ -134,7 +134,7 @@ class DirectoryBlobs:
                 yield chunk
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Leave the file to the next sweep: a transaction that rolls back must find it again."""
+        """Do nothing: the next sweep removes the file, because a transaction that rolls back still needs it."""
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
         """Digests of files; half-written ones of a process that died are removed on the way."""

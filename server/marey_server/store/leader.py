@@ -1,4 +1,4 @@
-"""Leader election among server processes: a row that is held for a while, under a fence."""
+"""Leader election among server processes by a row with a lease and a fence."""
 
 from __future__ import annotations
 

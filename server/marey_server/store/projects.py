@@ -105,7 +105,7 @@ def require(
 
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
-    """Return a project, deleted or not, for the server's own work: nobody is asked."""
+    """Return a project, even if deleted, without a check of rights; for the server's own work."""
     row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
     return _row(row, Role.READER, guest=False)
 

@@ -127,7 +127,7 @@ def drop(tx: Transaction, upload_ids: list[str]) -> None:
 
 
 def _pieces(tx: Transaction, upload_id: str) -> Iterator[bytes]:
-    """The pieces in order, one in memory at a time."""
+    """Yield the pieces in order, with one in memory at a time."""
     offset = 0
     one = select(upload_chunk.c.data)
     while data := tx.execute(

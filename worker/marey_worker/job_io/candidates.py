@@ -1,4 +1,4 @@
-"""Clips that may be added to an evaluated set: databases by the folder the clips lie in, and by their skeleton."""
+"""Clips that may be added to an evaluated set, as databases by folder and skeleton."""
 
 from __future__ import annotations
 

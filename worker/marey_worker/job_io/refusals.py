@@ -22,7 +22,7 @@ def present(pin: PinnedInput, document: Any) -> Any:
 
 
 class Refusals:
-    """The inputs that one job refused, in the order met; each is said in the job's log, too."""
+    """The inputs that a job refused, in order; each is also written to the job's log."""
 
     def __init__(self, context: Context) -> None:
         self.entries: list[dict[str, str]] = []

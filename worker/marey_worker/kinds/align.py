@@ -95,7 +95,7 @@ class _Job:
     # -- what is aligned --
 
     def _require_names(self) -> None:
-        """Raise `JobRefused` where results would get one name, or one that is too long: before anything is computed."""
+        """Raise `JobRefused` if names of results would be equal or too long; called before any computation."""
         twins = ("", MIRRORED_NAME) if self._params.mirroring == "add" else ("",)
         names = [(pin.folder, self._name(pin, twin)) for pin in self._pins.values() for twin in twins]
         require_different(names)

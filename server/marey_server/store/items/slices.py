@@ -1,4 +1,4 @@
-"""Some frames and joints of a stored motion, decoding no more than needed."""
+"""Reads frames and joints of a stored motion, and decodes only the blocks that contain them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _translation_columns(names: Sequence[str], wanted: Sequence[str]) -> NDArray
 def _cut(
     stored: EncodedArray, frames: range, columns: NDArray[np.intp] | None, *, encoded: bool
 ) -> NDArray[Any] | EncodedArray:
-    """Some frames and columns of an array of poses, or of triples; `columns` count through all axes but the first."""
+    """Return frames and columns of an array; `columns` are indices into all axes but the first, flattened."""
     if encoded and columns is None:
         return stored.cut_frames(frames.start, frames.stop)
     array = blocks.decode(stored.data, frames=slice(frames.start, frames.stop), columns=columns)

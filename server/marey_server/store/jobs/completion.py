@@ -154,7 +154,7 @@ _RECORD = Prepared(
 
 
 def _record(tx: Transaction, records: Sequence[dict[str, Any]]) -> None:
-    """Store the results of jobs that this transaction has ended."""
+    """Store the results of the jobs that this transaction completed."""
     tx.run_each(_RECORD, records)
 
 

@@ -87,7 +87,7 @@ _INSERT_ATTEMPT = Prepared(insert(attempt))
 def heartbeat(
     tx: Transaction, job_id: str, fence: int, request: Heartbeat, policy: QueuePolicy = DEFAULT_POLICY
 ) -> HeartbeatAnswer:
-    """Extend the lease, even a late one that nobody has taken; never past the grace of a cancel or of the time limit.
+    """Extend the lease, even an expired one that was not reclaimed, up to the grace period of a cancel or time limit.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job any more.
     """

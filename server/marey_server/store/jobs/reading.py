@@ -216,4 +216,4 @@ def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) 
     if roles.includes(project.role, Role.MAINTAINER):
         return
     if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:
-        raise ForbiddenProblem(f"To {what} somebody else's job needs the role maintainer.", code="insufficient-role")
+        raise ForbiddenProblem(f"Only maintainers may {what} jobs of other users.", code="insufficient-role")
