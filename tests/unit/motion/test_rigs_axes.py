@@ -217,7 +217,7 @@ def test_axes_need_two_sides(body):
 def test_an_arm_without_length_is_refused_by_its_joints_and_what_to_do(body, joint, parent):
     offsets = body.offsets.copy()
     offsets[body.index_of(joint)] = 0.0
-    told = rf"{parent} \(.*{joint} \(.*in one place.*map left_\w+ to a joint further on"
+    told = rf"{parent} \(.*{joint} \(.*at the same position.*map left_\w+ to a joint further on"
     with pytest.raises(MappingError, match=told):
         guess_axes(replace(body, offsets=offsets), map_joints(body))
 
