@@ -184,7 +184,7 @@ def refusal(project, **params):
     [
         ({"reference": "clip_z"}, "unknown-reference", "clip_z is not one of the clips"),
         ({"weights": {"Tail": 1.0}}, "unknown-joint", "Tail"),
-        ({"layer": "steps"}, "no-annotations", "no annotations are given"),
+        ({"layer": "steps"}, "no-annotations", "none are given"),
     ],
 )
 def test_what_cannot_be_done_refuses_the_job(project, params, code, said):
