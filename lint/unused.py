@@ -1,4 +1,4 @@
-"""Rule: what only tests call is dead. Every function, class and method is named by other code of the product.
+"""Rule: code that only tests call is dead. Every function, class and method is named by other code of the product.
 
 Names count, not bindings: a method is used when any code names an attribute like it. Names in the docs' code blocks
 and in benchmarks count, too: their readers are users of the SDK and of the library.

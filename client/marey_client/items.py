@@ -44,7 +44,7 @@ class ItemHandle:
 
     @property
     def url(self) -> str:
-        """The path below the API's root."""
+        """The path of the resource, relative to the API's root."""
         return f"/projects/{self.project}/{self.item.kind.plural}/{self.item.id}"
 
     def as_input(self) -> ItemInput:
@@ -135,7 +135,7 @@ class Items(Generic[Handle]):
 
     @property
     def url(self) -> str:
-        """The path below the API's root."""
+        """The path of the resource, relative to the API's root."""
         return f"/projects/{self.project}/{self.kind.plural}"
 
     def list(

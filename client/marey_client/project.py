@@ -46,7 +46,7 @@ class ProjectHandle(ProjectItems):
 
     @property
     def url(self) -> str:
-        """The path below the API's root."""
+        """The path of the resource, relative to the API's root."""
         return f"/projects/{self.name}"
 
     def read(self) -> Project:

@@ -34,7 +34,7 @@ API = "/api/v1"
 MAX_ANSWER_BYTES = 1 << 28
 
 TRIES_TO_REACH = 3
-"""A server that has never answered is more likely to be absent than to be restarting."""
+"""Number of attempts for the first request: a server that has never answered is probably not running."""
 
 log = logging.getLogger(__name__)
 

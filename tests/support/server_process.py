@@ -71,7 +71,7 @@ class MareyProcess:
         return self.process.wait(seconds)
 
     def stop(self) -> int | None:
-        """End it politely, if it runs."""
+        """Stop the server with SIGTERM if it is running."""
         if self.process is None:
             return None
         if self.process.poll() is None:

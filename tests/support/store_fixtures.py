@@ -63,7 +63,7 @@ def declared(method: str, path: str) -> RequiredRole:
 
 
 class Lab:
-    """The project `lab` in a database, and who is who in it."""
+    """The project `lab` in a database, and its members."""
 
     def __init__(self, database: Database, name: str = "lab") -> None:
         self.database = database

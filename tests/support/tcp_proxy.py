@@ -1,4 +1,4 @@
-"""A loopback TCP proxy that can go wrong on purpose: swallow one direction, cut connections, lose an answer."""
+"""A loopback TCP proxy with faults on demand: block one direction, cut connections, lose an answer."""
 
 from __future__ import annotations
 

@@ -252,7 +252,7 @@ def _state(job: Job) -> str:
 
 
 def _done(job: Job) -> str:
-    """Tasks that have ended, of those there are, or how far the job itself is."""
+    """Return the number of ended tasks of all tasks, or the progress of the job itself."""
     if job.state.terminal and job.size is None:
         return ""
     if job.size is not None:

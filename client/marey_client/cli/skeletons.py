@@ -110,7 +110,7 @@ def _vector(text: str | None) -> tuple[float, float, float] | None:
         raise WrongUsage(f"{text!r}: an axis is three numbers, x,y,z") from None
     length = (x * x + y * y + z * z) ** 0.5
     if not 0 < length < float("inf"):
-        raise WrongUsage(f"{text!r}: an axis needs a direction")
+        raise WrongUsage(f"{text!r}: at least one number of an axis must not be zero")
     return x / length, y / length, z / length
 
 

@@ -32,7 +32,7 @@ class CoverageStreams:
 
     @property
     def url(self) -> str:
-        """The path below the API's root."""
+        """The path of the resource, relative to the API's root."""
         return f"/projects/{self.project}/coverage-streams"
 
     def begin(
@@ -49,7 +49,7 @@ class CoverageStreams:
         return CoverageStreamHandle(self.transport, self.url, self.transport.post(CoverageStream, self.url, request))
 
     def get(self, stream_id: str) -> CoverageStreamHandle:
-        """Go on with a stream, perhaps in another process, where its last frame left it."""
+        """Return a stream to continue it after its last frame, also from another process."""
         return CoverageStreamHandle(
             self.transport, self.url, self.transport.get(CoverageStream, f"{self.url}/{stream_id}")
         )

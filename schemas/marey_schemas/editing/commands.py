@@ -116,7 +116,7 @@ class Retime(Request):
 
 
 class CloseLoop(Request):
-    """Make the last frame lead into the first one."""
+    """Change poses so that the last frame continues seamlessly with the first one."""
 
     command: Literal["close_loop"]
     in_place: bool = Field(

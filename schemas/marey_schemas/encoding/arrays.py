@@ -66,7 +66,7 @@ class EncodedArray:
         try:
             held = blocks.read_spec(self.data)
             if held != claimed:
-                raise ArrayError("bad-array", f"the leaf says {claimed}, its blocks say {held}")
+                raise ArrayError("bad-array", f"the leaf declares {claimed}, but its blocks contain {held}")
             return blocks.decode(self.data)
         except blocks.BlockError as error:
             raise ArrayError("bad-array", str(error)) from error

@@ -50,7 +50,9 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
     """
     _require_media_type(media_type)
     if media_type == JSON and arrays == "blocks":
-        raise CodecError("bad-media-type", "", "JSON cannot carry blocks; use application/msgpack or application/bson")
+        raise CodecError(
+            "bad-media-type", "", "JSON cannot contain blocks; use application/msgpack or application/bson"
+        )
 
     def leaf(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
         return _leaf_as_json(value) if media_type == JSON else _leaf_as_bytes(value, arrays)

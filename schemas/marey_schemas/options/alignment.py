@@ -13,7 +13,7 @@ CostMethod = Literal["turned", "plain"]
 
 MEDOID = "medoid"
 NEAREST_MEAN_LENGTH = "nearest_mean_length"
-"""Choices of a reference; any other name is that of an example."""
+"""Methods that choose the reference; any other value is the name of an example."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 

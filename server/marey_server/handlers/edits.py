@@ -1,4 +1,4 @@
-"""Edits: what commands would make of a clip."""
+"""Previews of edits: the result of commands on a clip."""
 
 from __future__ import annotations
 

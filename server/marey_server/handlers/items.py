@@ -138,7 +138,7 @@ class ItemResource(Resource):
 
 
 class ItemRestoration(Resource):
-    """Bringing a deleted item back."""
+    """Restoration of a deleted item."""
 
     path = "/projects/{project}/{kind}/{item}/restore"
     tag = "ItemsOfKind"

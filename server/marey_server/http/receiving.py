@@ -1,4 +1,4 @@
-"""Bytes on their way in: gathered on the event loop, hashed and written in threads."""
+"""Receiving of request bodies: collected on the event loop, hashed and written in threads."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class ComputeThreads:
 
 
 def compute_on_one_thread_each() -> None:
-    """Let each computation of this process have one thread: several at once would only take turns with each other."""
+    """Limit each computation of this process to one thread, because several computations run at the same time."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     for name in BLAS_VARIABLES:  # for libraries that are not loaded yet

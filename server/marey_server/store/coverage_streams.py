@@ -188,7 +188,7 @@ def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
     row = tx.execute(statement).first()
     if row is None:
         raise NotFoundProblem(
-            f"There is no coverage stream {stream_id!r} here; after a day without frames they are dropped.",
+            f"There is no coverage stream {stream_id!r} here; streams are deleted after a day without frames.",
             code="no-stream",
         )
     return Stream(**{field.name: row._mapping[field.name] for field in fields(Stream)})

@@ -48,7 +48,7 @@ _ATTEMPT_TOKEN = Prepared(
 
 
 def resolve_token(tx: Transaction, text: str) -> Principal:
-    """The principal that a bearer token stands for. Raises `UnauthenticatedProblem` where it stands for nobody."""
+    """Return the principal of a bearer token. Raises `UnauthenticatedProblem` if the token is not valid."""
     if (secret := attempt_secret(text)) is not None:
         return _resolve_attempt(tx, secret)
     if (parts := split_user_token(text)) is not None:

@@ -121,7 +121,7 @@ def abandon(tx: Transaction, upload_id: str) -> None:
 
 
 def drop(tx: Transaction, upload_ids: list[str]) -> None:
-    """Delete uploads and what came of them so far."""
+    """Delete uploads and the bytes received so far."""
     tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id.in_(upload_ids)))
     tx.execute(delete(upload).where(upload.c.id.in_(upload_ids)))
 

@@ -56,7 +56,7 @@ def test_blocks_travel_as_the_bytes_of_the_block_codec(media_type: str) -> None:
 
 
 def test_json_cannot_carry_blocks() -> None:
-    with pytest.raises(CodecError, match="JSON cannot carry blocks"):
+    with pytest.raises(CodecError, match="JSON cannot contain blocks"):
         encode_tree({"a": np.zeros(3)}, JSON, arrays="blocks")
     text = '{"a": {"dtype": "<f4", "shape": [1], "encoding": "blocks", "data": "TVJCMQ=="}}'
     assert refusal(text.encode(), JSON).pointer == "/a"

@@ -141,7 +141,7 @@ def _compile(statement: Statement, dialect: Dialect, parameters: Parameters) -> 
 
 
 def _row_maker(statement: Any, dialect: Dialect) -> Convert | None:
-    """Makes a row with names of what the driver gives; None where the statement gives no rows."""
+    """Return a function that makes named tuples of the driver's rows; None if there are no rows."""
     columns = statement.exported_columns
     if not columns:
         return None
