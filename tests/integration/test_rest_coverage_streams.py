@@ -251,8 +251,8 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleto
         (stream, {"poses": poses * np.float32(1e30)}, "rotation of length"),
         (stream, {"poses": np.hstack((poses[:, :3] + 1e30, poses[:, 3:]))}, "from the origin"),
         (stream, {"roots": np.zeros((2, 4))}, "3 columns"),
-        (stream, {"roots": np.zeros((0, 3))}, "no frames"),
-        (stream, {}, "no frames"),
+        (stream, {"roots": np.zeros((0, 3))}, "send frames, or set ends_take"),
+        (stream, {}, "send frames, or set ends_take"),
         (rootless, {"poses": poses}, "without a skeleton"),
     ]  # fmt: skip
     for to, frames, said in wrong:
