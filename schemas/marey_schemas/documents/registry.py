@@ -32,20 +32,23 @@ class OpenDocument(Request):
 
 
 SCHEMAS: dict[str, type[Request]] = {
-    "marey/skeleton@1": SkeletonHierarchy,
-    "marey/skeleton-mapping@1": SkeletonMapping,
-    "marey/motion@1": MotionDocument,
-    "marey/clip-info@1": ClipInfo,
-    "marey/annotation@1": Annotation,
-    "marey/evaluation@1": EvaluationDocument,
-    "marey/evaluation-records@1": EvaluationRecords,
-    "marey/evaluation-report@1": EvaluationReport,
-    "marey/edit@1": EditDocument,
-    "marey/alignment@1": AlignmentInfo,
-    "marey/motion-primitive@1": MotionPrimitiveDocument,
-    "marey/sample-tree@1": SampleTreeDocument,
-    "marey/model-report@1": ModelReport,
-    "marey/model-graph@1": ModelGraph,
-    "marey/document@1": OpenDocument,
+    model.model_fields["schema_"].default: model
+    for model in (
+        SkeletonHierarchy,
+        SkeletonMapping,
+        MotionDocument,
+        ClipInfo,
+        Annotation,
+        EvaluationDocument,
+        EvaluationRecords,
+        EvaluationReport,
+        EditDocument,
+        AlignmentInfo,
+        MotionPrimitiveDocument,
+        SampleTreeDocument,
+        ModelReport,
+        ModelGraph,
+        OpenDocument,
+    )
 }
 """Model by schema name."""

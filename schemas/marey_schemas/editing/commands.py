@@ -300,3 +300,28 @@ class Paste(Request):
     border_s: Seconds = Field(
         0.2, description="Seconds at either end of the replaced range in which the copied motion is blended in and out."
     )
+
+
+MotionCommand = (
+    Trim
+    | Split
+    | Concatenate
+    | Resample
+    | Retime
+    | CloseLoop
+    | Translate
+    | Rotate
+    | Face
+    | MoveToOrigin
+    | Scale
+    | FlipAxes
+    | FixDrift
+    | MoveToGround
+    | FindGround
+    | FindContacts
+    | Mirror
+    | Smooth
+    | RotateJoint
+    | Paste
+)
+"""Every command of this module, in the order of the documentation."""

@@ -188,3 +188,7 @@ class PlantFeet(Request):
         allow_inf_nan=False,
         description="Angle before full extension at which a stretching knee is damped.",
     )
+
+
+ConstraintCommand = Constrain | PlantFeet
+"""Every command of this module, in the order of the documentation."""

@@ -7,55 +7,11 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.editing.commands import (
-    CloseLoop,
-    Concatenate,
-    Face,
-    FindContacts,
-    FindGround,
-    FixDrift,
-    FlipAxes,
-    Mirror,
-    MoveToGround,
-    MoveToOrigin,
-    Paste,
-    Resample,
-    Retime,
-    Rotate,
-    RotateJoint,
-    Scale,
-    Smooth,
-    Split,
-    Translate,
-    Trim,
-)
-from marey_schemas.editing.constraints import Constrain, PlantFeet
+from marey_schemas.editing.commands import Concatenate, MotionCommand, Paste
+from marey_schemas.editing.constraints import ConstraintCommand
 
 MOST_COMMANDS = 256
-AnyCommand = (
-    Trim
-    | Split
-    | Concatenate
-    | Resample
-    | Retime
-    | CloseLoop
-    | Translate
-    | Rotate
-    | Face
-    | MoveToOrigin
-    | Scale
-    | FlipAxes
-    | FixDrift
-    | MoveToGround
-    | FindGround
-    | FindContacts
-    | Mirror
-    | Smooth
-    | RotateJoint
-    | Paste
-    | Constrain
-    | PlantFeet
-)
+AnyCommand = MotionCommand | ConstraintCommand
 EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
 COMMAND_MODELS: dict[str, type[Request]] = {
     get_args(model.model_fields["command"].annotation)[0]: model for model in get_args(AnyCommand)
