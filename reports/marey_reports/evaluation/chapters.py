@@ -15,12 +15,19 @@ from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, share, table
 from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS
-from marey_reports.evaluation.figures import DrawnFigure
+from marey_reports.evaluation.figures import (
+    COVERAGE_FIGURES,
+    SCENARIO_FIGURES,
+    TRIAL_FIGURES,
+    USE_FIGURES,
+    DrawnFigure,
+)
 from marey_reports.evaluation.words import find_holes
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
 
+HOLES = "holes"
 WORST_TRIALS = 10
 WALK_GRAPH = (
     "The graph of single frames, with the order of every walk, is written as GraphML or JSON by "
@@ -62,7 +69,8 @@ def coverage_chapter(result: EvaluationResult, figures: Figures) -> Section:
         f"{result.options.coverage_least_s:g} s of it.",
     )
     too_short = element("p", f"Shorter than a second, and so no part of this: {_listed(short)}.") if short else None
-    return Section("coverage", "What is covered", (text, too_short, shown(figures, "density", "points", "directions")))
+    pictures = shown(figures, *(name for name in COVERAGE_FIGURES if name != HOLES))  # it has a chapter of its own
+    return Section("coverage", "What is covered", (text, too_short, pictures))
 
 
 def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
@@ -79,8 +87,8 @@ def error_chapter(result: EvaluationResult, figures: Figures) -> Section:
     pictures = (
         shown(figures, "offsets"),
         listing,
-        element("div", shown(figures, "scenario-circle", "scenario-switching"), class_="pair"),
-        shown(figures, "transition-cost", "errors"),
+        element("div", shown(figures, *SCENARIO_FIGURES), class_="pair"),
+        shown(figures, *TRIAL_FIGURES),
     )
     return Section("errors", "Where the errors are", (element("p", text), pictures))
 
@@ -102,7 +110,7 @@ def load_chapter(result: EvaluationResult, figures: Figures) -> Section:
     return Section(
         "load",
         "Which clips carry the load",
-        (element("p", text), listing, shown(figures, "usage", "frame-use", "clip-graph"), element("p", WALK_GRAPH)),
+        (element("p", text), listing, shown(figures, *USE_FIGURES), element("p", WALK_GRAPH)),
     )
 
 
@@ -130,7 +138,7 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
     holes = find_holes(result.coverage)
     if not holes:
         text = element("p", "Nothing: every speed and turn rate that the trials ask for has enough data.")
-        return Section("record", "What to record next", (text, shown(figures, "holes")))
+        return Section("record", "What to record next", (text, shown(figures, HOLES)))
     missing = float(result.coverage.deficit_s.sum())
     rest = sum(hole.missing_s for hole in holes[MOST_HOLES:])
     items = [element("li", hole.words, ": ", element("b", f"{duration(hole.missing_s)} missing")) for hole in holes]
@@ -148,7 +156,7 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
             ),
             element("ol", items[:MOST_HOLES]),
             more,
-            shown(figures, "holes"),
+            shown(figures, HOLES),
         ),
     )
 

@@ -13,7 +13,13 @@ from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
 from marey_reports.evaluation.definitions import METRICS
-from marey_reports.evaluation.figures import DrawnFigure
+from marey_reports.evaluation.figures import (
+    COVERAGE_FIGURES,
+    SCENARIO_FIGURES,
+    TRIAL_FIGURES,
+    USE_FIGURES,
+    DrawnFigure,
+)
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
@@ -119,7 +125,7 @@ def trial_chapter(
         if len(rows) > MOST_TRIALS:
             everything = table("All changed trials", heads, rows, numbers=(1, 2, 3))
             listing = (listing, folded(f"All {len(rows)} changed trials", everything))
-    pictures = shown(figures, "offsets", "scenario-circle", "scenario-switching", "transition-cost", "errors")
+    pictures = shown(figures, "offsets", *SCENARIO_FIGURES, *TRIAL_FIGURES)
     return Section("trials", "Where it changed", (element("p", text), listing, pictures))
 
 
@@ -137,12 +143,12 @@ def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Fig
     content = [_names(title, sorted(uids), names) for title, uids in lists if uids]
     if not content:
         content = [element("p", "Both have the same clips and use the same ones.")]
-    return Section("clips", "Clips", (content, shown(figures, "usage", "frame-use", "clip-graph")))
+    return Section("clips", "Clips", (content, shown(figures, *USE_FIGURES)))
 
 
 def coverage_of_two_chapter(figures: Figures) -> Section:
     """Write the chapter on the change of coverage."""
-    return Section("coverage", "Coverage", shown(figures, "density", "points", "holes", "directions"))
+    return Section("coverage", "Coverage", shown(figures, *COVERAGE_FIGURES))
 
 
 def _names(title: str, uids: Sequence[str], names: Mapping[str, str]) -> Html:

@@ -24,7 +24,18 @@ from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_reports.evaluation.figures.transition_costs import draw_transition_costs
 from marey_schemas.options.evaluation import Family
 
-__all__ = ["FIGURES", "DrawnFigure", "FigureKind", "FigureOptions", "draw_figure", "draw_figures"]
+__all__ = [
+    "COVERAGE_FIGURES",
+    "FIGURES",
+    "SCENARIO_FIGURES",
+    "TRIAL_FIGURES",
+    "USE_FIGURES",
+    "DrawnFigure",
+    "FigureKind",
+    "FigureOptions",
+    "draw_figure",
+    "draw_figures",
+]
 
 
 class FigureKind(NamedTuple):
@@ -59,7 +70,13 @@ FIGURES = {
     "holes": FigureKind("", "What is missing", "none", draw_holes),
     "frame-use": FigureKind("", "Which parts of the clips are used", "any", draw_frame_use),
 }
-"""Every figure by the name it is asked for."""
+"""Every figure by its name."""
+
+COVERAGE_FIGURES = ("density", "points", "holes", "directions")
+SCENARIO_FIGURES = ("scenario-circle", "scenario-switching")
+TRIAL_FIGURES = ("transition-cost", "errors")
+USE_FIGURES = ("usage", "frame-use", "clip-graph")
+"""Figures that a chapter shows together, in the report of one evaluation and in that of two."""
 
 
 def draw_figure(
