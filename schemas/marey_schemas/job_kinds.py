@@ -12,26 +12,9 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, Literal
 
+from marey_schemas import job_params
 from marey_schemas.base import Request
 from marey_schemas.formats import IMPORTED
-from marey_schemas.job_params import (
-    AlignParams,
-    AnnotateParams,
-    CompareParams,
-    CutParams,
-    EditParams,
-    EvaluateParams,
-    ExportParams,
-    ImportParams,
-    ModelParams,
-    OptimiseParams,
-    RetargetParams,
-    SuggestParams,
-    SweepParams,
-    TreeParams,
-    count_evaluation_tasks,
-    count_sweep_tasks,
-)
 from marey_schemas.jobs import InputSpec, JobKind
 from marey_schemas.kinds import PARTS, Kind
 
@@ -155,7 +138,7 @@ def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
 IMPORT = KindDeclaration(
     name="import",
     description="Imports clips, skeletons, models and graphs from files that the server has stored.",
-    params=ImportParams,
+    params=job_params.ImportParams,
     implementation="marey_worker.kinds.imports:run",
     version=3,
     outputs={"clips": Kind.CLIP, "skeletons": Kind.SKELETON, "models": Kind.MODEL, "graphs": Kind.GRAPH},
@@ -166,7 +149,7 @@ IMPORT = KindDeclaration(
 RETARGET = KindDeclaration(
     name="retarget",
     description="Transfers the motion of clips to another skeleton.",
-    params=RetargetParams,
+    params=job_params.RetargetParams,
     implementation="marey_worker.kinds.retarget:run",
     version=2,
     inputs={
@@ -184,7 +167,7 @@ RETARGET = KindDeclaration(
 EXPORT = KindDeclaration(
     name="export",
     description="Exports clips as files of one format in one archive.",
-    params=ExportParams,
+    params=job_params.ExportParams,
     implementation="marey_worker.kinds.export:run",
     version=2,
     inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to export.")},
@@ -194,10 +177,10 @@ EXPORT = KindDeclaration(
 EVALUATE = KindDeclaration(
     name="evaluate",
     description="Measures the quality of a set of locomotion clips by simulated motion matching.",
-    params=EvaluateParams,
+    params=job_params.EvaluateParams,
     implementation="marey_worker.kinds.evaluate:run",
     gathering="marey_worker.kinds.evaluate:gather",
-    task_count=count_evaluation_tasks,
+    task_count=job_params.count_evaluation_tasks,
     version=2,
     inputs={
         "clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to evaluate, all of one skeleton."),
@@ -214,7 +197,7 @@ EVALUATE = KindDeclaration(
 COMPARE = KindDeclaration(
     name="compare",
     description="Compares two evaluations trial by trial, with confidence intervals of the changes.",
-    params=CompareParams,
+    params=job_params.CompareParams,
     implementation="marey_worker.kinds.compare:run",
     version=1,
     inputs={
@@ -240,7 +223,7 @@ _CANDIDATES = InputSpec(
 SUGGEST = KindDeclaration(
     name="suggest",
     description="Finds the clips of an evaluated set that can be removed, and other clips that would fill its gaps.",
-    params=SuggestParams,
+    params=job_params.SuggestParams,
     implementation="marey_worker.kinds.suggest:run",
     version=1,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
@@ -250,7 +233,7 @@ SUGGEST = KindDeclaration(
 OPTIMISE = KindDeclaration(
     name="optimise",
     description="Removes clips from an evaluated set and adds others, step by step, as long as the set improves.",
-    params=OptimiseParams,
+    params=job_params.OptimiseParams,
     implementation="marey_worker.kinds.optimise:run",
     version=1,
     inputs={"evaluation": _EVALUATED, "candidates": _CANDIDATES},
@@ -260,10 +243,10 @@ OPTIMISE = KindDeclaration(
 SWEEP = KindDeclaration(
     name="sweep",
     description="Evaluates a set again with other weights of the features, and ranks the features by their effect.",
-    params=SweepParams,
+    params=job_params.SweepParams,
     implementation="marey_worker.kinds.sweep:run",
     gathering="marey_worker.kinds.sweep:gather",
-    task_count=count_sweep_tasks,
+    task_count=job_params.count_sweep_tasks,
     version=1,
     inputs={"evaluation": _EVALUATED},
     outputs={"document": "file"},
@@ -272,7 +255,7 @@ SWEEP = KindDeclaration(
 EDIT = KindDeclaration(
     name="edit",
     description="Applies the commands of an edit to clips: trims, joins, smooths, places and repairs them.",
-    params=EditParams,
+    params=job_params.EditParams,
     implementation="marey_worker.kinds.edit:run",
     version=2,
     inputs={
@@ -293,13 +276,13 @@ EDIT = KindDeclaration(
     place_counts=True,
     in_place="in_place",
     named_after="clips",
-    unclear_place=EditParams.unclear_place,
+    unclear_place=job_params.EditParams.unclear_place,
 )
 
 ANNOTATE = KindDeclaration(
     name="annotate",
     description="Proposes segments and keyframes of clips: steps, pauses, or reaches of a hand.",
-    params=AnnotateParams,
+    params=job_params.AnnotateParams,
     implementation="marey_worker.kinds.annotate:run",
     version=1,
     inputs={
@@ -315,7 +298,7 @@ ANNOTATE = KindDeclaration(
 CUT = KindDeclaration(
     name="cut",
     description="Cuts clips along the segments of their annotations, and keeps the keyframes of each piece.",
-    params=CutParams,
+    params=job_params.CutParams,
     implementation="marey_worker.kinds.cut:run",
     version=2,
     inputs={
@@ -337,7 +320,7 @@ CUT = KindDeclaration(
 ALIGN = KindDeclaration(
     name="align",
     description="Aligns examples of one action with each other, in space and in time.",
-    params=AlignParams,
+    params=job_params.AlignParams,
     implementation="marey_worker.kinds.align:run",
     version=1,
     inputs={
@@ -358,7 +341,7 @@ ALIGN = KindDeclaration(
 MODEL = KindDeclaration(
     name="model",
     description="Learns a generative model of one action from aligned clips.",
-    params=ModelParams,
+    params=job_params.ModelParams,
     implementation="marey_worker.kinds.model:run",
     version=1,
     inputs={
@@ -373,7 +356,7 @@ TREE = KindDeclaration(
     name="tree",
     description="Draws samples of a model and groups them in a tree, which speeds up searches for "
     "motions that meet constraints.",
-    params=TreeParams,
+    params=job_params.TreeParams,
     implementation="marey_worker.kinds.tree:run",
     version=1,
     inputs={
@@ -383,7 +366,7 @@ TREE = KindDeclaration(
     },
     outputs={"model": Kind.MODEL},
     place_counts=True,
-    unclear_place=TreeParams.unclear_place,
+    unclear_place=job_params.TreeParams.unclear_place,
 )
 
 BUILT_IN = (
