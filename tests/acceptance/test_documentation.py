@@ -16,9 +16,9 @@ COMMANDS = get_command(app)
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 
 
-@pytest.mark.parametrize("name", ["command-line.md", "settings.md", "job-kinds.md", "checks.md", "errors.md"])
-def test_a_page_that_comes_from_the_code_is_current(name: str) -> None:
-    assert (REFERENCE / name).read_text(encoding="utf-8") == pages()[name], "run `make docs`"
+def test_the_pages_that_come_from_the_code_are_current() -> None:
+    stale = [name for name, text in pages().items() if (REFERENCE / name).read_text(encoding="utf-8") != text]
+    assert stale == [], "run `make docs`"
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(ROOT)))
