@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
-from docs.library import library_page
+from docs.motion_library import library_page
 from pydantic_core import PydanticUndefined
 
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors

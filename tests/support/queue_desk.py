@@ -44,7 +44,7 @@ class Params(Request):
 
 ERRAND = KindDeclaration(
     name="errand",
-    description="Does something and makes nothing; every time anew.",
+    description="Runs each time, and makes nothing.",
     params=Params,
     implementation="tests:errand",
     version=1,

@@ -19,7 +19,7 @@ Content = str | Html | Iterable["Content"] | None
 
 
 def text(value: str) -> Html:
-    """Escape a text; characters that HTML forbids or that reorder what follows become U+FFFD."""
+    """Escape a text for HTML; replace forbidden characters and controls of the writing direction by U+FFFD."""
     return escape(_UNSEEN.sub("\ufffd", value))
 
 

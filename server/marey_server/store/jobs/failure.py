@@ -48,7 +48,7 @@ class AttemptOutcome:
 
 
 def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:
-    """Decide what follows an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
+    """Return the outcome of an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
     if request.interrupted:
@@ -67,10 +67,10 @@ def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, 
 
 
 def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
-    """Decide what follows an attempt whose lease expired. A retry is queued at once: the lease was wait enough.
+    """Return the outcome of an attempt whose lease expired. A retry is queued without delay.
 
-    A lease that was renewed to the last moment allowed belonged to a worker that lived and did not stop in time; one
-    that ended earlier, to a worker that was lost, however late that is noticed.
+    If the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If it expired
+    earlier, the worker is lost, even if the server notices it after the deadline.
     """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
