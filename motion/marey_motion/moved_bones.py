@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
-from marey_motion.arrays import AnyFloats
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.clip import Clip
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.rigs.axes import bone_end
@@ -69,31 +69,42 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     own = clip.poses[:, 3:]
     if clip.translations is None:
         return FollowedBones(own, {})
+    from marey_motion import moved_bones_kernels as kernels
+
     still = replace(clip, translations=None, translated_joints=())
-    rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))
-    turned = kinematics.global_rotations(clip).astype(np.float64)
+    rigid, moved = (kinematics.global_positions(one) for one in (still, clip))
+    bones = [(joint, joints[end]) for name, joint in joints.items() if (end := bone_end(name, joints)) is not None]
+    turns, angles = _turns(rigid, moved, np.array(bones, np.int64).reshape(-1, 2))
     largest: dict[str, float] = {}
-    for standard, joint in joints.items():
-        end = bone_end(standard, joints)
-        name = clip.skeleton.joint_names[joint]
-        if end is None or name in largest:
-            continue
-        turns = _turns(*(points[:, joints[end]] - points[:, joint] for points in (rigid, moved)))
-        most = float(np.degrees(quaternions.angle_between(turns, quaternions.identity(len(turns)))).max())
-        if most >= LEAST_TURN_DEG:
+    chosen: list[int] = []
+    for bone, most in enumerate(np.degrees(angles.max(axis=1)).tolist()):
+        name = clip.skeleton.joint_names[bones[bone][0]]
+        if most >= LEAST_TURN_DEG and name not in largest:
             largest[name] = most
-            turned[:, joint] = quaternions.multiply(turns, turned[:, joint])
+            chosen.append(bone)
     if not largest:
         return FollowedBones(own, {})
-    local = kinematics.as_local_rotations(clip.skeleton, turned)
-    return FollowedBones(local.reshape(len(own), -1).astype(np.float32), largest)
+    local = np.empty(own.shape, np.float32)
+    turned = np.array([bones[bone][0] for bone in chosen], np.int64)
+    kernels.turn_joints(kinematics.global_rotations(clip), clip.skeleton.parents, turned, turns[chosen], local)
+    return FollowedBones(local, largest)
 
 
-def _turns(rigid: AnyFloats, moved: AnyFloats) -> AnyFloats:
-    """Compute the shortest rotations (F, 4) between bones (F, 3); none where one of them has no length."""
-    turns = quaternions.identity(len(rigid)).astype(np.float64)
-    lengths = [np.linalg.norm(bones, axis=1) for bones in (rigid, moved)]
-    known = np.minimum(*lengths) > SHORTEST_BONE_M
-    if known.any():
-        turns[known] = quaternions.between_vectors(rigid[known], moved[known])
-    return turns
+def _turns(rigid: AnyFloats, moved: AnyFloats, bones: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Compute the shortest rotations (B, F, 4) of bones (B, 2) between positions (F, J, 3), and their angles (B, F).
+
+    Angles are in radians. A bone that has no length on either side does not turn.
+    """
+    from marey_motion import moved_bones_kernels as kernels
+
+    starts, ends = np.ascontiguousarray(bones.T)
+    shape = len(bones), len(rigid)
+    turns, halves, opposite = np.empty((*shape, 4)), np.empty((2, *shape)), np.zeros(shape, np.bool_)
+    kernels.shortest_turns(
+        rigid, moved, starts, ends, SHORTEST_BONE_M, quaternions.NEARLY_OPPOSITE, turns, halves, opposite
+    )
+    bone, frame = np.nonzero(opposite)
+    ways = (points[frame, ends[bone]].astype(np.float64) - points[frame, starts[bone]] for points in (rigid, moved))
+    turns[bone, frame] = rest = quaternions.between_vectors(*ways)
+    halves[:, bone, frame] = np.linalg.norm(rest[:, 1:], axis=1), np.abs(rest[:, 0])
+    return turns, 2.0 * np.arctan2(*halves)

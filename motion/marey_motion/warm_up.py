@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -129,10 +130,9 @@ def _compile(stage: str) -> None:
 
 
 def _read(clip: Clip) -> None:
-    """Read, check, write and retarget a walk."""
+    """Read, check, write and retarget a walk, and turn a moved bone."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
     from marey_motion.gait import game_skeleton
-    from marey_motion.kinematics import global_rotations
     from marey_motion.retargeting import plan_retarget, retarget
     from marey_motion.rigs import guess_axes, map_joints
 
@@ -144,8 +144,10 @@ def _read(clip: Clip) -> None:
     for skeleton in (read.skeleton, target):
         mapping = map_joints(skeleton)
         rigs.append((skeleton, mapping, guess_axes(skeleton, mapping)))
-    result = retarget(read, plan_retarget(*rigs[0], *rigs[1]))
-    global_rotations(result)
+    plan = plan_retarget(*rigs[0], *rigs[1])
+    knee = read.skeleton.index_of(rigs[0][1].joints["left_knee"])
+    translations = np.full((read.frame_count, 1, 3), 0.1, np.float32)
+    retarget(replace(read, translations=translations, translated_joints=(knee,)), plan)
 
 
 def _edit(clip: Clip) -> None:

@@ -13,8 +13,10 @@ from marey_motion.errors import ClipError, MappingError, UnknownJoint
 from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
 from marey_motion.importing.checks import CODES
+from marey_motion.moved_bones import LEAST_TURN_DEG, SHORTEST_BONE_M, follow_moved_bones
 from marey_motion.retargeting import moved_bones, plan_retarget, retarget
 from marey_motion.rigs import JointAxes, guess_axes, map_joints
+from marey_motion.rigs.axes import bone_end
 from marey_motion.skeleton import Skeleton
 
 SIDES = ("left", "right")
@@ -367,6 +369,45 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio, game):
     assert set(warning.joints) == {studio.mapping.joints["left_shoulder"]}
     assert 5.0 < warning.values["largest_turn_deg"] < 45.0
     assert moved_bones(studio.clip, plan).warning is None
+
+
+def bones_followed_by_numpy(clip, joints):
+    """Rotations (F, 4·J) and largest turns in degrees, by the formula in numpy, bone by bone."""
+    still = replace(clip, translations=None, translated_joints=())
+    rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))
+    turned, largest = kinematics.global_rotations(clip).astype(np.float64), {}
+    for standard, joint in joints.items():
+        end, name = bone_end(standard, joints), clip.skeleton.joint_names[joint]
+        if end is None or name in largest:
+            continue
+        ways = [points[:, joints[end]] - points[:, joint] for points in (rigid, moved)]
+        turns = quaternions.identity(clip.frame_count).astype(np.float64)
+        known = np.minimum(*(np.linalg.norm(way, axis=1) for way in ways)) > SHORTEST_BONE_M
+        turns[known] = quaternions.between_vectors(*(way[known] for way in ways))
+        most = float(np.degrees(quaternions.angle_between(turns, quaternions.identity(len(turns)))).max())
+        if most >= LEAST_TURN_DEG:
+            largest[name] = most
+            turned[:, joint] = quaternions.multiply(turns, turned[:, joint])
+    local = kinematics.as_local_rotations(clip.skeleton, turned)
+    return local.reshape(clip.frame_count, -1).astype(np.float32), largest
+
+
+def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio):
+    clip = with_moved_joints(studio, "left_elbow", "right_wrist", "left_knee", "right_ankle", "left_ankle")
+    elbow, wrist = (clip.translated_joints.index(studio.joint(name)) for name in ("left_elbow", "right_wrist"))
+    translations = clip.translations.copy()
+    translations[5, elbow] = 0.0  # no length
+    translations[7:11, elbow] *= -1.0
+    translations[8, wrist] = -clip.skeleton.offsets[studio.joint("right_wrist")]  # half a circle
+    clip = replace(clip, translations=translations)
+    joints = {name: clip.skeleton.index_of(joint) for name, joint in studio.mapping.joints.items()}
+
+    found, (rotations, largest) = follow_moved_bones(clip, joints), bones_followed_by_numpy(clip, joints)
+
+    assert found.largest_turn_deg == largest
+    assert len(largest) == 5
+    assert max(largest.values()) > 179.0
+    assert found.rotations.tobytes() == rotations.tobytes()
 
 
 def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio):
