@@ -1,4 +1,4 @@
-"""Reading of BVH text to a clip of quaternions, against pymotion and a plain loader in numpy.
+"""Reading of BVH text to a clip of quaternions, one file and many, against pymotion and a plain loader in numpy.
 
 Marey is timed twice: reading alone (`read_bvh`: numbers, quaternions, every check of the text), which is what the peers
 do and what the goals are about; and importing (`read_motion`), which besides finds the body's landmarks, settles unit
@@ -11,22 +11,22 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
 
-from benchmarks.material import captured_walk, real_folder
+from benchmarks.material import captured_walk, folder_of_takes, real_folder
 from benchmarks.plain_bvh import load_plainly
+from benchmarks.pymotion_bvh import load_with_pymotion, loaded_with_pymotion
 from benchmarks.timing import Row, Timing, time_in_turn
+from marey_motion.errors import MotionError
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.formats.bvh import read_bvh
 
 FRAMES, JOINTS = 2752, 31
 REAL_FILE = Path("cmu-bvh/01_01.bvh")
-GOAL_PYMOTION, GOAL_PLAIN = 20, 5
+GOAL_PYMOTION, GOAL_PLAIN, GOAL_MANY = 20, 5, 15
 
 
 def run() -> list[Row]:
-    """Measure a generated file, and a real one where there is one."""
+    """Measure a generated file, a real one where there is one, and a folder of small ones."""
     with tempfile.TemporaryDirectory() as folder:
         generated = Path(folder, "generated.bvh")
         generated.write_bytes(write_bvh(captured_walk(FRAMES, JOINTS)))
@@ -34,7 +34,8 @@ def run() -> list[Row]:
     real = real_folder()
     if real is not None:
         rows += _rows(real / REAL_FILE, str(REAL_FILE))
-    return rows
+    with folder_of_takes() as takes:
+        return rows + _many(sorted(takes.rglob("*.bvh")), "real" if real else "generated")
 
 
 def _rows(path: Path, name: str) -> list[Row]:
@@ -42,7 +43,7 @@ def _rows(path: Path, name: str) -> list[Row]:
     reading, importing, pymotion, plain = time_in_turn(
         lambda: read_bvh(path.read_bytes(), path.name),
         lambda: read_motion(path.read_bytes(), path.name),
-        lambda: _load_with_pymotion(path),
+        lambda: load_with_pymotion(path),
         lambda: load_plainly(path),
     )
     size = f"{name}, {path.stat().st_size / 1e6:.1f} MB, {frames} frames"
@@ -66,18 +67,36 @@ def _row(job: str, size: str, ours: Timing, peer_name: str, peer: Timing, goal: 
     )
 
 
-def _load_with_pymotion(path: Path) -> NDArray[np.float64]:
-    bvh = BVH()
-    bvh.load(str(path))
-    rotations: NDArray[np.float64] = bvh.get_data()[0]
-    return rotations
+def _many(paths: list[Path], origin: str) -> list[Row]:
+    """Measure files that both can read; a folder of real capture also holds faulty ones and rigs of one pose."""
+    frames = loaded_with_pymotion(paths)
+    read = [path for path in frames if _is_read(path)]
+    reading, importing, pymotion = time_in_turn(
+        lambda: [read_bvh(path.read_bytes(), path.name) for path in read],
+        lambda: [read_motion(path.read_bytes(), path.name) for path in read],
+        lambda: [load_with_pymotion(path) for path in read],
+        repeats=3,
+    )
+    poses = sum(frames[path] for path in read)
+    size = f"{len(read)} {origin} files, those of {len(paths)} that both read, {poses:,} frames"
+    return [
+        _row("many small files read, BVH to quaternions", size, reading, "pymotion", pymotion, GOAL_MANY),
+        _row("many small files read, with landmarks, units, checks", size, importing, "pymotion", pymotion, GOAL_MANY),
+    ]
+
+
+def _is_read(path: Path) -> bool:
+    try:
+        return read_motion(path.read_bytes(), path.name).clip is not None
+    except MotionError:
+        return False
 
 
 def _check_agreement(path: Path) -> int:
     """Check that all three find the same rotations; return the number of frames."""
     ours = read_bvh(path.read_bytes(), path.name).rotations
     assert ours is not None
-    for theirs in (_load_with_pymotion(path), load_plainly(path)):
+    for theirs in (load_with_pymotion(path), load_plainly(path)):
         cosines = np.abs((ours * theirs).sum(axis=-1))
         assert cosines.min() > 1 - 1e-5, f"{path.name}: rotations differ, cosine {cosines.min()}"
     return len(ours)

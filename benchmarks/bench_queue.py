@@ -6,12 +6,9 @@ server, computed by the worker, sent back, checked and published. pymotion compu
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +17,7 @@ from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
 from pymotion.ops import skeleton as pymotion_skeleton  # type: ignore[import-untyped]
 from pymotion.rotations import quat as pymotion_quat  # type: ignore[import-untyped]
 
-from benchmarks.local_server import PROJECT, LocalServer, clean_environment, clip_parts, local_server
+from benchmarks.local_server import PROJECT, clip_parts, local_server, one_worker
 from benchmarks.material import captured_walk
 from benchmarks.timing import Row
 from marey_client import Marey
@@ -38,7 +35,6 @@ from marey_schemas.jobs import CollectionInput, Job, JobCreate
 
 CLIPS, FRAMES, JOINTS = 96, 300, 31
 GOAL_POSES_PER_S = 50_000
-WORKER_STOP_S = 60
 
 Floats = NDArray[np.floating]
 
@@ -46,7 +42,7 @@ Floats = NDArray[np.floating]
 def run() -> list[Row]:
     """Measure one server and one worker with one slot."""
     clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
-    with local_server() as server, _worker(server), server.client() as marey:
+    with local_server() as server, one_worker(server), server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
         target = _seed(project, clips)
         marey.jobs.wait(project.retarget([CollectionInput(collection="first")], target, into="warm").id)
@@ -60,24 +56,6 @@ def run() -> list[Row]:
         _row("clips to retargeted clips", retargeting_s, peer_retargeting_s, GOAL_POSES_PER_S),
         _row("clips to BVH files", writing_s, _write_with_pymotion(moved, plan.target), None),
     ]
-
-
-@contextmanager
-def _worker(server: LocalServer) -> Iterator[None]:
-    """Run a worker with one slot while the block runs."""
-    with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache],
-            env=clean_environment() | {"MAREY_URL": server.url, "MAREY_TOKEN": server.token},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        try:
-            yield
-        finally:
-            process.terminate()
-            process.wait(WORKER_STOP_S)
 
 
 def _seed(project: ProjectHandle, clips: list[Clip]) -> str:

@@ -1,4 +1,4 @@
-"""A server of its own for a benchmark: one process on a free port of this machine, its data in a folder that goes away.
+"""A server and a worker for a benchmark, each one process of this machine, their data in folders that go away.
 
 Settings are the defaults: SQLite with every commit on the disk, blobs in the database, one line of log per request.
 """
@@ -31,6 +31,8 @@ from marey_schemas.documents.references import RevisionRef
 PROJECT = "bench"
 START_S = 60
 STOP_S = 40
+WORKER_STOP_S = 60
+WARM_S = 300
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,29 @@ def running(data: Path, **settings: str) -> Iterator[LocalServer]:
     server = LocalServer(f"http://127.0.0.1:{port}", data, process.pid)
     try:
         _wait_until_ready(server, process)
+        _wait_until_warm(server)
         yield server
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(STOP_S)
+
+
+@contextmanager
+def one_worker(server: LocalServer) -> Iterator[None]:
+    """Run a worker with one slot while the block runs."""
+    with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache],
+            env=clean_environment() | {"MAREY_URL": server.url, "MAREY_TOKEN": server.token},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(WORKER_STOP_S)
 
 
 def clean_environment() -> dict[str, str]:
@@ -109,6 +130,13 @@ def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> 
         except httpx.TransportError:
             time.sleep(0.05)
     raise RuntimeError(f"the server did not start:\n{Path(server.data.parent, 'server.log').read_text()[-3000:]}")
+
+
+def _wait_until_warm(server: LocalServer) -> None:
+    """Wait for the end of the process that compiles kernels beside a new server: it would be measured, too."""
+    _, running = psutil.wait_procs(psutil.Process(server.pid).children(), timeout=WARM_S)
+    if running:
+        raise RuntimeError(f"after {WARM_S} s the server still compiles its kernels; run `make installed` first")
 
 
 def free_port() -> int:

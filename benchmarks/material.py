@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,7 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.clip import Clip
-from marey_motion.formats import read_motion
+from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import generate_dataset, generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
@@ -22,6 +25,7 @@ from marey_motion.rigs import map_joints
 from marey_motion.skeleton import Skeleton
 
 _FINGER_BONE_M = (0.0, -0.025, 0.005)
+_SMALL_FILES, _SMALL_BODIES, _LEAST_JOINTS = 120, 12, 26
 _REAL_LOCOMOTION = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh", "cmu-bvh/*.bvh")
 
 
@@ -29,6 +33,21 @@ def real_folder() -> Path | None:
     """Find the folder of real motion capture, if there is one."""
     folder = os.environ.get("MAREY_TEST_MOCAP")
     return Path(folder) if folder else None
+
+
+@contextmanager
+def folder_of_takes() -> Iterator[Path]:
+    """Give the folder of real motion capture, or a folder of small generated takes while the block runs."""
+    real = real_folder()
+    if real is not None:
+        yield real
+        return
+    with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
+        for number in range(_SMALL_FILES):
+            joints = _LEAST_JOINTS + number % _SMALL_BODIES
+            take = captured_walk(60 + 20 * (number % 13), joints, number)
+            Path(folder, f"take-{number:03}.bvh").write_bytes(write_bvh(take))
+        yield Path(folder)
 
 
 def noisy_clip(frames: int, joints: int, seed: int = 0) -> Clip:

@@ -1,0 +1,93 @@
+"""Two runs of the benchmarks in one Markdown table: `python -m benchmarks.compare before.json after.json`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from benchmarks.timing import Row
+
+_HEADINGS = ("job", "size", "before", "ratio", "after", "ratio", "goal", "")
+_VERDICTS = {True: "met", False: "**missed**", None: ""}
+_NUMBER = re.compile(r"\d[\d.,]*")
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.compare", description=__doc__)
+    parser.add_argument("before", type=Path, help="JSON of the earlier run (python -m benchmarks --json FILE)")
+    parser.add_argument("after", type=Path, help="JSON of the later run")
+    arguments = parser.parse_args()
+    try:
+        before, after = _rows_of(arguments.before), _rows_of(arguments.after)
+    except (OSError, ValueError, TypeError) as error:
+        parser.error(f"not the JSON of a run of the benchmarks: {error}")
+    print(as_markdown(before, after))
+    return 0
+
+
+def _rows_of(path: Path) -> list[Row]:
+    return [Row(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
+
+
+def as_markdown(before: Sequence[Row], after: Sequence[Row]) -> str:
+    """Make a table of both runs in the order of the later one; rows that it lacks come last."""
+    lines = [_line(_HEADINGS), _line(["---"] * len(_HEADINGS))]
+    lines += [_line(_cells(*pair)) for pair in matched(before, after)]
+    return "\n".join(lines)
+
+
+def matched(before: Sequence[Row], after: Sequence[Row]) -> Iterator[tuple[Row | None, Row | None]]:
+    """Pair rows of equal job and size, then rows whose sizes differ in numbers alone; None where a run has no such row.
+
+    Sizes may hold figures of the run itself, such as processor time, and differ from run to run.
+    """
+    left = list(before)
+    pairs = [(_take(left, row, str), row) for row in after]
+    for earlier, row in pairs:
+        yield earlier or _take(left, row, _without_numbers), row
+    for row in left:
+        yield row, None
+
+
+def _without_numbers(size: str) -> str:
+    return _NUMBER.sub("", size)
+
+
+def _take(left: list[Row], row: Row, form: Callable[[str], str]) -> Row | None:
+    """Take the first row of the same job and, in a form, the same size out of those that are left."""
+    found = next((one for one in left if one.job == row.job and form(one.size) == form(row.size)), None)
+    if found is not None:
+        left.remove(found)
+    return found
+
+
+def _cells(before: Row | None, after: Row | None) -> list[str]:
+    row = after or before
+    assert row is not None
+    return [
+        row.job,
+        row.size if before is None or before.size == row.size else f"{row.size} (before: {before.size})",
+        before.ours if before else "(new)",
+        _ratio(before),
+        after.ours if after else "(absent)",
+        _ratio(after),
+        row.goal,
+        _VERDICTS[after.met] if after else "",
+    ]
+
+
+def _ratio(row: Row | None) -> str:
+    return "" if row is None or row.ratio is None else f"{row.ratio:.1f}x"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

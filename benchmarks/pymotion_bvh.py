@@ -1,0 +1,29 @@
+"""BVH files read with pymotion, the peer of readers and of uploads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
+
+
+def load_with_pymotion(path: Path) -> NDArray[np.float64]:
+    """Read local quaternions (F, J, 4) of a file."""
+    bvh = BVH()
+    bvh.load(str(path))
+    rotations: NDArray[np.float64] = bvh.get_data()[0]
+    return rotations
+
+
+def loaded_with_pymotion(paths: Iterable[Path]) -> dict[Path, int]:
+    """Count the frames of each file that pymotion reads; it raises whatever comes up for others."""
+    frames = {}
+    for path in paths:
+        try:
+            frames[path] = len(load_with_pymotion(path))
+        except Exception as error:  # noqa: BLE001 - a peer's failure is no result of ours
+            print(f"pymotion does not read {path.name}: {type(error).__name__}")
+    return frames
