@@ -6,6 +6,7 @@ import pytest
 from lint import circles, class_names, docstrings, folders, lengths, lists, small_modules, unused, wording
 from lint.commit_subject import faults_of
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
+from lint.sample import draw
 from lint.sources import House, Module, Offence
 
 ROOT = Path("/checkout")
@@ -196,3 +197,19 @@ def test_a_commit_subject_that_is_not_in_form_is_refused(subject, fault):
 @pytest.mark.parametrize("subject", ["store: omit the password from Database.shown", 'Revert "store: omit it"'])
 def test_a_commit_subject_in_form_passes(subject):
     assert faults_of(subject) == []
+
+
+def test_a_sample_of_texts_is_the_same_for_the_same_seed():
+    text = (
+        '"""Module."""\ndef f(n):\n    """Turn."""\n    raise ValueError(f"{n} is not a number")\n'
+        'opt(help="Number of turns.")\n'
+    )
+    drawn = house({"marey_x": text}, {"docs/a.md": "A page."})
+    sample = draw(drawn, seed=1)
+    assert sample == draw(drawn, seed=1)
+    assert {sort: sorted(found) for sort, found in sample.items()} == {
+        "docstrings": [("marey_x", "Module."), ("marey_x:f", "Turn.")],
+        "error texts": [("marey_x:4", "{n} is not a number")],
+        "help texts": [("marey_x:5", "Number of turns.")],
+        "pages": [("/checkout/docs/a.md", "A page.")],
+    }
