@@ -1,4 +1,4 @@
-"""Backings that store the bytes of blobs. Rows of `blob` say which blobs exist; a backing only keeps their bytes.
+"""Backings that store the bytes of blobs; the rows of `blob` say which blobs exist.
 
 A backing is called inside the transaction that inserts or deletes the blob's row. That row is the lock: nobody else can
 write or remove the same bytes before the transaction ends.
@@ -23,22 +23,22 @@ CHUNK_BYTES = 2**20
 
 
 class BlobBacking(Protocol):
-    """Keeps the bytes of blobs."""
+    """Interface of a place that stores the bytes of blobs."""
 
     def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
-        """Keep bytes, given in pieces of `CHUNK_BYTES` and a last one that may be shorter."""
+        """Store the bytes of a blob, given in pieces of `CHUNK_BYTES` of which the last may be shorter."""
         ...
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Bytes `start` to `stop` in pieces of at most `CHUNK_BYTES`; fewer where the backing lost some."""
+        """Yield bytes `start` to `stop` in pieces of at most `CHUNK_BYTES`; fewer bytes if the backing lost some."""
         ...
 
     def release(self, connection: Connection, digest: str) -> None:
-        """The blob's row is deleted in this transaction, which may still roll back."""
+        """Free the bytes of a blob whose row is deleted in this transaction, which may still roll back."""
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Digests of bytes that were written so long ago, and that may have no row."""
+        """Yield digests of bytes that may have no row and were written before a given time."""
         ...
 
     def remove_stray(self, digest: str) -> None:
@@ -46,7 +46,7 @@ class BlobBacking(Protocol):
         ...
 
     def check_writable(self) -> None:
-        """Raise `OSError` where nothing can be written."""
+        """Raise `OSError` if bytes cannot be written."""
         ...
 
 
@@ -61,12 +61,12 @@ class DatabaseBlobs:
     """Blobs stored in the database, in rows of 1 MiB."""
 
     def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
-        """Keep bytes."""
+        """Store the bytes of a blob in rows of 1 MiB."""
         for position, chunk in enumerate(chunks):
             connection.execute(insert(blob_chunk), {"digest": digest, "position": position, "data": chunk})
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Bytes `start` to `stop`."""
+        """Yield bytes `start` to `stop` of a blob."""
         for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
             rows = _CHUNK.run(connection, {"digest": digest, "position": position})
             if not rows:
@@ -76,22 +76,22 @@ class DatabaseBlobs:
             yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Delete the rows along with the blob's."""
+        """Delete the rows of a blob's bytes, in the transaction that deletes the blob's row."""
         connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
-        """None: a foreign key holds bytes and rows together."""
+        """Yield no digests: a foreign key prevents bytes without a row."""
         return iter(())
 
     def remove_stray(self, digest: str) -> None:
-        """Nothing: there are none."""
+        """Do nothing: there are no bytes without a row."""
 
     def check_writable(self) -> None:
-        """The database is checked by itself."""
+        """Do nothing: the server checks the database separately."""
 
 
 class DirectoryBlobs:
-    """Blobs stored in files, `<root>/ab/cdef...`; each is written under another name, synced and renamed."""
+    """Blobs stored in files `<root>/ab/cdef...`; each is written under a temporary name, synced and renamed."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -103,7 +103,7 @@ class DirectoryBlobs:
         return self.root / digits[:2] / digits[2:]
 
     def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:  # noqa: ARG002
-        """Keep bytes; what a transaction that rolled back left under the same name is replaced."""
+        """Write the file of a blob, and replace a file that a rolled-back transaction left under its name."""
         path = self._path(digest)
         path.parent.mkdir(exist_ok=True)
         handle, name = tempfile.mkstemp(dir=self._incoming)
@@ -122,7 +122,7 @@ class DirectoryBlobs:
         _sync_directory(self.root)
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:  # noqa: ARG002
-        """Bytes `start` to `stop`."""
+        """Yield bytes `start` to `stop` of a blob's file."""
         try:
             file = self._path(digest).open("rb")
         except FileNotFoundError:
@@ -137,7 +137,7 @@ class DirectoryBlobs:
         """Do nothing: the next sweep removes the file, because a transaction that rolls back still needs it."""
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Digests of files; half-written ones of a process that died are removed on the way."""
+        """Yield the digests of old files, and remove half-written files that a dead process left."""
         newest = time.time() - older_than_s
         for folder in sorted(path for path in self.root.iterdir() if path.is_dir()):
             for path in folder.iterdir():
@@ -149,11 +149,11 @@ class DirectoryBlobs:
                             yield f"sha256:{folder.name}{path.name}"
 
     def remove_stray(self, digest: str) -> None:
-        """Remove a file."""
+        """Remove the file of a blob."""
         self._path(digest).unlink(missing_ok=True)
 
     def check_writable(self) -> None:
-        """Raise `OSError` where nothing can be written."""
+        """Raise `OSError` if files cannot be written to the directory."""
         with tempfile.TemporaryFile(dir=self._incoming) as file:
             file.write(b"writable")
 

@@ -1,4 +1,6 @@
-"""Blobs: bytes named by their SHA-256, stored once, readable by those who may (docs/decisions/0006-possession.md)."""
+"""Blobs: bytes named by their SHA-256, stored once, with the rules for access to them
+(docs/decisions/0006-possession.md).
+"""
 
 from __future__ import annotations
 
@@ -37,16 +39,18 @@ from marey_server.store.tables import (
 from marey_server.store.transaction import Transaction
 
 GRACE_US = 24 * 3600 * 1_000_000
-"""How long a blob or document that nothing refers to is left alone."""
+"""Time after which garbage collection deletes a blob or document that nothing refers to."""
 
 RENEW_US = GRACE_US // 2
-"""What is older than this and unreferenced must be sent again, so that it cannot vanish while somebody relies on it."""
+"""Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
 
 IN_LIST = 500
 
 
 class Spool:
-    """Bytes on their way in: hashed as they come, in memory up to 1 MiB, then in a temporary file without a name."""
+    """Temporary storage of bytes that are being received, with their running hash: 1 MiB in memory, then an unnamed
+    file.
+    """
 
     def __init__(self, directory: str | None = None) -> None:
         self._file = tempfile.SpooledTemporaryFile(max_size=CHUNK_BYTES, dir=directory)  # noqa: SIM115
@@ -61,17 +65,17 @@ class Spool:
 
     @property
     def digest(self) -> str:
-        """The name of what was written so far."""
+        """Return the digest of the bytes written so far."""
         return f"sha256:{self._hash.hexdigest()}"
 
     def chunks(self) -> Iterator[bytes]:
-        """Everything written, from the start, in pieces of 1 MiB."""
+        """Yield all bytes written so far in pieces of 1 MiB."""
         self._file.seek(0)
         while chunk := self._file.read(CHUNK_BYTES):
             yield chunk
 
     def close(self) -> None:
-        """Drop the bytes."""
+        """Discard the bytes."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -85,21 +89,21 @@ class Spool:
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """Bytes that lie elsewhere, to be read in pieces of 1 MiB when they are wanted."""
+    """Bytes in another store, read in pieces of 1 MiB on demand."""
 
     size_bytes: int
     chunks: Callable[[], Iterable[bytes]]
 
 
 def digest_of(data: bytes) -> str:
-    """`sha256:<hex>` of bytes."""
+    """Return the digest `sha256:<hex>` of bytes."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = None) -> str:
-    """Store bytes that the caller sent; from now on the caller may refer to them by their digest.
+    """Store bytes that the caller sent, and let the caller refer to them by their digest.
 
-    Raises `InvalidProblem` where they are not the bytes that `expected` names.
+    Raises `InvalidProblem` if their digest is not `expected`.
     """
     require_sender(tx.principal)
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
@@ -115,7 +119,7 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
 
 
 def require_sender(principal: Principal) -> None:
-    """Raise unless the caller may send bytes: users with the scope `write`, whatever it is bound to, and attempts."""
+    """Check that the caller may send bytes: users with the scope `write`, for any project, and attempts."""
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to send bytes.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
@@ -123,7 +127,7 @@ def require_sender(principal: Principal) -> None:
 
 
 def store_blob(tx: Transaction, digest: str, content: bytes | Spool | Pieces) -> None:
-    """Store bytes under their digest, once; bytes that are there already count as new again."""
+    """Store bytes under their digest; if they are stored already, only renew their age."""
     size_bytes = len(content) if isinstance(content, bytes) else content.size_bytes
     row = {"digest": digest, "size_bytes": size_bytes, "created_us": tx.now_us}
     if insert_new(tx, blob, row):
@@ -139,9 +143,9 @@ def _chunks(content: bytes | Spool | Pieces) -> Iterable[bytes]:
 
 
 def insert_new(tx: Transaction, table: Table, row: dict[str, Any]) -> bool:
-    """Insert a row keyed by `digest`, or renew the one that is there. True if it is new.
+    """Insert a row keyed by `digest`, or renew the age of the existing row; return whether the row is new.
 
-    Either way the row is locked until the transaction ends, so that garbage collection cannot take it.
+    Either way the row is locked until the transaction ends, so that garbage collection cannot delete it.
     """
     added = tx.insert_or_ignore(table, row).returning(table.c.digest)
     renew = update(table).where(table.c.digest == row["digest"]).values(created_us=tx.now_us)
@@ -153,7 +157,7 @@ def insert_new(tx: Transaction, table: Table, row: dict[str, Any]) -> bool:
 
 
 def add_holder(tx: Transaction, digest: str) -> None:
-    """Note that the caller has shown to possess the bytes."""
+    """Record that the caller possesses the bytes and may refer to them."""
     if tx.principal.user_id is None:
         return
     row = {"digest": digest, "user_id": tx.principal.user_id, "created_us": tx.now_us}
@@ -161,16 +165,16 @@ def add_holder(tx: Transaction, digest: str) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return those of `digests` that the caller may refer to, locked so that they stay until this write has done so."""
+    """Return those of `digests` that the caller may refer to, locked against deletion until the end of this write."""
     allowed = sorted(readable(tx, digests))
     renew = update(blob).values(created_us=tx.now_us).returning(blob.c.digest)
     return {digest for digest in allowed if tx.execute(renew.where(blob.c.digest == digest)).first() is not None}
 
 
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
-    """Keep blobs that a job's parameters or result name; who may read the job's project may read them.
+    """Protect the blobs named by a job's parameters or result; readers of the job's project may then read them.
 
-    Raises `ConflictProblem` (`missing-blobs`) where the caller may not refer to one, or it is not there.
+    Raises `ConflictProblem` (`missing-blobs`) if one is not stored or the caller may not refer to it.
     """
     wanted = set(digests)
     if lacking := wanted - hold(tx, wanted):
@@ -180,7 +184,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> ConflictProblem:
-    """Something names blobs that are not here."""
+    """Return the error for a document or job that names blobs which are not stored."""
     detail = "This names blobs that are not here; send them first."
     return ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
@@ -194,7 +198,7 @@ def readable(tx: Transaction, digests: Iterable[str]) -> set[str]:
 
 
 def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
-    """Return those of `digests` that the caller must send before referring to them, in the order asked."""
+    """Return those of `digests` that the caller must send before referring to them, in the order of `digests`."""
     digests = list(dict.fromkeys(digests))
     there = _referenced(tx, digests)
     there |= _held(tx, [digest for digest in digests if digest not in there], since_us=tx.now_us - RENEW_US)
@@ -202,7 +206,7 @@ def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
 
 
 def require_readable(tx: Transaction, digest: str) -> int:
-    """Size of a blob in bytes. Raises `NotFoundProblem` where there is none that the caller may read."""
+    """Return the size of a blob in bytes. Raises `NotFoundProblem` if the caller may not read such a blob."""
     size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar()
     if size is None or not readable(tx, [digest]):
         raise NotFoundProblem(f"There is no blob {digest} that you may read.")
@@ -210,14 +214,14 @@ def require_readable(tx: Transaction, digest: str) -> int:
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:
-    """Return bytes `start` to `stop` of a blob, for callers who have checked that they may be read."""
+    """Return bytes `start` to `stop` of a blob without a check of access; the caller has done that."""
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))
 
 
 def read_range(tx: Transaction, digest: str, start: int, stop: int) -> bytes:
-    """Return bytes `start` to `stop` of a blob that the caller may read; ask for at most a few MiB at a time."""
+    """Return bytes `start` to `stop`, a few MiB at most, of a blob that the caller may read."""
     size = require_readable(tx, digest)
     return read_blob(tx, digest, start, min(stop, size))
 

@@ -1,4 +1,4 @@
-"""Collections: the folders of a project. The root is the collection with the empty path; it is made when needed."""
+"""Collections: the folders of a project. The root is the collection with the empty path, created on first use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ALIVE = collection.c.deleted_us.is_(None)
 
 
 def ensure(tx: Transaction, project_row: ProjectRow, path: str) -> str:
-    """Id of the collection at `path`, made with those above it where there is none; it cannot be deleted meanwhile."""
+    """Return the id of the collection at `path`, created with its parents if missing, and locked against deletion."""
     check_length(path)
     found = _lock(tx, project_row.id, path)
     while found is None:
@@ -51,7 +51,7 @@ def _lock(tx: Transaction, project_id: str, path: str) -> str | None:
 
 
 def check_length(path: str) -> None:
-    """Raise `InvalidProblem` for a path that is too long to be stored."""
+    """Raise `InvalidProblem` if a path is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
         raise InvalidProblem(
             f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
@@ -59,7 +59,7 @@ def check_length(path: str) -> None:
 
 
 def at_or_below(path: str) -> ColumnElement[bool]:
-    """Condition on rows of `collection`: the folder at `path`, or in it at any depth."""
+    """Return the condition for rows of `collection`: the folder at `path` and all folders below it."""
     if not path:
         return literal(True)
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(path) + 1) == f"{path}/")
@@ -69,7 +69,7 @@ def at_or_below(path: str) -> ColumnElement[bool]:
 
 
 def read_collection(tx: Transaction, project: str, collection_id: str) -> Collection:
-    """Return a collection."""
+    """Return a collection as a document."""
     return _shown(_find(tx, projects.require(tx, project), collection_id, _ALIVE))
 
 
@@ -82,7 +82,7 @@ def list_collections(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """Collections at and below `path`, by path, without the root; or those that were deleted."""
+    """List the collections at and below `path` by path, without the root; or the deleted ones."""
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
     statement = select(collection).where(
@@ -99,7 +99,7 @@ def list_collections(
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Row of a collection; with `lock`, nobody else changes it before this write ends. Raises `NotFoundProblem`."""
+    """Return the row of a collection, locked for this write with `lock`. Raises `NotFoundProblem`."""
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )
@@ -138,7 +138,7 @@ def _path_taken(path: str) -> ConflictProblem:
 def move_collection(
     tx: Transaction, project: str, collection_id: str, request: CollectionChange, *, expected_rev: ExpectedRev
 ) -> Collection:
-    """Rename or move a folder with all it holds. Raises `ConflictProblem` where there is a folder at the new path."""
+    """Rename or move a folder with its contents. Raises `ConflictProblem` if the new path is taken."""
     project_row = projects.require(tx, project)
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
@@ -171,10 +171,10 @@ def _inside(project_row: ProjectRow, path: str) -> tuple[ColumnElement[bool], ..
 
 
 def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequence[str]:
-    """The paths of the folders in a locked one, at any depth; none changes, and none is added, before this write ends.
+    """Lock all folders below a locked one and return their paths; none is changed or added before this write ends.
 
-    Whoever adds one holds the folder above it until it is there (`ensure`). One that was waited for may have got others
-    meanwhile, which only another look finds.
+    `ensure` locks the parent while it adds a folder. A folder that this function waited for may have got new subfolders
+    in the meantime, so the search is repeated.
     """
     statement = select(collection.c.path).where(*_inside(project_row, path)).order_by(collection.c.path)
     paths: Sequence[str] = []
@@ -184,7 +184,7 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 
 
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide a folder with all it holds; it can be restored."""
+    """Hide a folder and its contents; `restore_collection` brings them back."""
     project_row = projects.require(tx, project)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)
@@ -208,9 +208,9 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
 def restore_collection(
     tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev = None
 ) -> Collection:
-    """Bring back a folder with what was deleted along with it.
+    """Restore a deleted folder with the contents that were deleted along with it.
 
-    Raises `ConflictProblem` where its path is taken again.
+    Raises `ConflictProblem` if another folder has its path now.
     """
     project_row = projects.require(tx, project)
     gone = _find(tx, project_row, collection_id, collection.c.deleted_us.is_not(None), lock=True)

@@ -1,7 +1,7 @@
-"""Streams of frames whose coverage is measured while they come: one row each, moved on by compare-and-swap.
+"""Streams of frames whose coverage is measured as the frames arrive: one row each, updated by compare-and-swap.
 
-A row holds all that is needed to go on. What the last request was answered is kept with it, so that a sender who did
-not hear the answer gets it by asking again.
+A row holds the whole state of a stream, and the answer to the last request, so that a sender who missed the answer gets
+it by repeating the request.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ MOST_STREAMS = 64
 """Greatest number of streams in a project."""
 
 LIFETIME_US = 86400 * 1_000_000
-"""A stream that got no frames for so long is dropped."""
+"""Time without new frames after which a stream is deleted."""
 
 Tree = dict[str, Any]
 
 
 class CoverageOffset(ConflictProblem):
-    """The stream goes on at another offset."""
+    """Frames were sent for another offset than the one at which the stream continues."""
 
     code = "coverage-offset"
 
 
 @dataclass(frozen=True, slots=True)
 class NewStream:
-    """First state of a stream.
+    """Initial state of a stream.
 
-    `settings` are the members of `CoverageStream` that never change; `rig` the skeleton of its poses.
+    `settings` are the members of `CoverageStream` that never change; `rig` is the skeleton of its poses.
     """
 
     settings: Tree
@@ -49,7 +49,7 @@ class NewStream:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """A stored stream."""
+    """Stored state of a stream."""
 
     id: str
     settings: Tree
@@ -63,7 +63,7 @@ class Stream:
     rev: int
 
     def shown(self) -> Tree:
-        """Return the members of `CoverageStream`."""
+        """Return the stream as members of `CoverageStream`."""
         return {
             **self.settings,
             "id": self.id,
@@ -77,7 +77,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class StreamStep:
-    """A step of a stream: digest of the request, its answer, and the state after it."""
+    """Update of a stream: digest of the request, its answer, and the state after it."""
 
     said: str
     answer: Tree
@@ -104,7 +104,7 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
 def list_streams(
     tx: Transaction, project: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """Return the streams of a project, the newest first."""
+    """List the streams of a project, newest first."""
     project_row = projects.require(tx, project)
     statement = select(*_LISTED).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     order = listing.parse_order("-id", {"id": coverage_stream.c.id})
@@ -113,20 +113,20 @@ def list_streams(
 
 
 def read_stream(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream, for who may read it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may read it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def read_to_advance(tx: Transaction, project: str, stream_id: str) -> Stream:
-    """Return a stream, for who may send frames to it. Raises `NotFoundProblem`."""
+    """Return a stream to a caller who may send frames to it. Raises `NotFoundProblem`."""
     return _find(tx, projects.require(tx, project).id, stream_id)
 
 
 def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep) -> Tree:
-    """Move a stream on from where `held` was, and return the answer.
+    """Store the next state of a stream if it is still at the state `held`, and return the answer.
 
-    Raises `CoverageOffset` with the true offset where somebody else moved it in between, `NotFoundProblem` where it is
-    gone.
+    Raises `CoverageOffset` with the current offset if another request was faster, and `NotFoundProblem` if the stream
+    was deleted.
     """
     project_row = projects.require(tx, project)
     where = coverage_stream.c.id == held.id, coverage_stream.c.rev == held.rev
@@ -147,7 +147,7 @@ def answered_before(stream: Stream, said: str) -> Tree | None:
 
 
 def require_offset(stream: Stream, offset: int) -> None:
-    """Raises `CoverageOffset` with the true offset where the stream does not go on at this one."""
+    """Raise `CoverageOffset` with the current offset if the stream does not continue at the given one."""
     if stream.offset != offset:
         raise _elsewhere(stream)
 
@@ -158,7 +158,7 @@ def _elsewhere(stream: Stream) -> CoverageOffset:
 
 
 def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
-    """Drop a stream. Raises `NotFoundProblem`."""
+    """Delete a stream. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project)
     found = _find(tx, project_row.id, stream_id)
     tx.execute(delete(coverage_stream).where(coverage_stream.c.id == found.id))

@@ -1,6 +1,6 @@
-"""Documents: JSON of a known schema, named by content; array leaves and named files are blobs.
+"""Documents: JSON with a known schema, named by the digest of its content; array leaves and named files are blobs.
 
-In the database an array leaf stands as `{"dtype", "shape", "content"}`; `document_blob` says which blob holds it.
+In the database an array leaf is stored as `{"dtype", "shape", "content"}`; `document_blob` says which blob holds it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class PreparedDocument:
-    """A document that was checked and encoded. Making one takes most of the time and needs no database."""
+    """Document that is checked and encoded, which takes most of the time of storing it and needs no database."""
 
     digest: str
     schema: str
@@ -53,9 +53,9 @@ class PreparedDocument:
 
 
 def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Check a document against its schema (`schema` if given, else the one it names) and encode its arrays.
+    """Check a document against its schema (`schema`, or else the one it names) and encode its arrays.
 
-    Raises `InvalidProblem` with one entry per thing that is wrong.
+    Raises `InvalidProblem` with one entry for each fault.
     """
     name = _check(tree, schema)
     tree = {**tree, "schema": name}
@@ -83,7 +83,7 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
 
 
 def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
-    """`content` itself if it is prepared already for `schema`."""
+    """Return `content` as a document prepared for `schema`; unchanged if it is one already."""
     if not isinstance(content, PreparedDocument):
         return prepare_document(content, schema=schema)
     if schema not in (None, OPEN_SCHEMA, content.schema):
@@ -92,7 +92,7 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
 
 
 def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
-    """Return the document with other text and the same arrays and files."""
+    """Return the document with another body and the same arrays and files."""
     canonical = canonical_json(body)
     return replace(content, digest=blobs.digest_of(canonical), body=body)
 
@@ -126,7 +126,7 @@ _LEAVES = (str, float, int, bool, type(None))
 
 
 def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
-    """Every member of a tree with its JSON Pointer, containers before what they hold."""
+    """Yield every member of a tree with its JSON Pointer, containers before their members."""
     yield pointer, value
     if type(value) in _LEAVES:  # most members; asking whether they are mappings takes far longer
         return
@@ -139,7 +139,7 @@ def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, str]]:
-    """References of a stored document by JSON Pointer: its array leaves, and digests of blobs that it names.
+    """Return the references of a stored document by JSON Pointer: its array leaves, and digests of blobs it names.
 
     Blobs are named in the fields that the schema has for them, and in members called `blob`.
     """
@@ -166,9 +166,9 @@ def _check_pointers(pointers: list[str]) -> None:
 
 
 def store_document(tx: Transaction, content: Any, *, schema: str | None = None) -> str:
-    """Store a document, given as a tree or prepared, and return its digest. The same document again adds no rows.
+    """Store a document, given as a tree or prepared, and return its digest. Storing it again adds no rows.
 
-    Raises `ConflictProblem` (`missing-blobs`) where it names blobs that the caller has not sent and may not read.
+    Raises `ConflictProblem` (`missing-blobs`) if it names blobs that the caller has not sent and may not read.
     """
     ready = prepared(content, schema=schema)
     if ready.files:
@@ -189,7 +189,7 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 
 
 def store_variant(tx: Transaction, digest: str, body: Tree) -> str:
-    """Store a document with the arrays and files of another and the text of `body`; return its digest."""
+    """Store a document with the arrays and files of another one and the text `body`; return its digest."""
     original = tx.execute(select(document.c.schema, document.c.size_bytes).where(document.c.digest == digest)).one()
     row = {
         "digest": blobs.digest_of(canonical_json(body)),
@@ -236,14 +236,14 @@ _BLOBS_OF_DOCUMENTS = Prepared(
 
 
 def load_document(tx: Transaction, digest: str, *, arrays: Literal["encoded", "decoded", "none"] = "encoded") -> Tree:
-    """Load a stored document with its arrays as stored, as numpy arrays, or as references."""
+    """Load a stored document; its arrays are returned encoded, as numpy arrays, or as references."""
     return load_documents(tx, [digest], arrays=arrays)[digest]
 
 
 def load_documents(
     tx: Transaction, digests: Collection[str], *, arrays: Literal["encoded", "decoded", "none"] = "encoded"
 ) -> dict[str, Tree]:
-    """Load stored documents by digest, as `load_document` does. Raises `NotFoundProblem` where one is missing."""
+    """Load stored documents by digest, as `load_document` does. Raises `NotFoundProblem` if one is missing."""
     bodies = load_bodies(tx, digests)  # freshly read, so that they may be changed
     if bodies and arrays != "none":
         _attach_stored(tx, bodies, (lambda stored: stored.decode()) if arrays == "decoded" else None)
@@ -268,7 +268,7 @@ def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
 def _attach_stored(
     tx: Transaction, bodies: Mapping[str, Tree], convert: Callable[[EncodedArray], Any] | None = None
 ) -> None:
-    """Put arrays in place of the references in documents, given by digest, each passed through `convert`."""
+    """Replace the references in documents, given by digest, by their arrays, each passed through `convert`."""
     loaded: dict[str, Any] = {}
     for row in tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)}):
         holder, key = _place(bodies[row.document_digest], row.pointer)
@@ -283,7 +283,7 @@ def _attach_stored(
 
 
 def _place(tree: Any, pointer: str) -> tuple[Any, str | int]:
-    """Return the object or list that holds what a JSON Pointer names, and its key there."""
+    """Return the object or list that contains the member named by a JSON Pointer, and the member's key in it."""
     steps = [step.replace("~1", "/").replace("~0", "~") for step in pointer.split("/")[1:]]
     for step in steps[:-1]:
         tree = tree[int(step) if isinstance(tree, list) else step]

@@ -1,4 +1,4 @@
-"""The feed of events: what happened, in the order it became visible."""
+"""Feed of events, in the order in which they became visible."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ MAX_EVENTS = 1000
 def list_events(
     tx: Transaction, project_name: str | None = None, *, after: int = 0, limit: int = 100, subject: str | None = None
 ) -> list[Event]:
-    """Events behind the one numbered `after`: of a project, or as an administrator of the whole server.
+    """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
-    With `subject`, only those of one thing.
+    With `subject`, only events of that object are listed.
 
-    Numbers come in the order of the feed, but on Postgres not always ascending: go on after the last one received.
-    An event is never inserted before one that was handed out: those of transactions that began before a running one
-    wait for it.
+    Numbers follow the order of the feed, but on Postgres they do not always ascend: continue after the last one
+    received. Events of a transaction are held back while an older transaction is running, so that no event is later
+    inserted before one that was already listed.
     """
     statement = select(event, project.c.name.label("project")).outerjoin(project, project.c.id == event.c.project_id)
     if project_name is None:

@@ -1,6 +1,6 @@
-"""Checks of the store: whether it can serve, whether blobs match their digests, and whether references resolve.
+"""Checks of the store: its readiness to serve, the digests of blobs, and references between rows.
 
-Works beside a running server, in short reads of bounded size.
+The checks run beside a running server, in short reads of bounded size.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PAGE = 100
 
 @dataclass(frozen=True, slots=True)
 class StoreDefect:
-    """A defect of the store: a stable code, the place, and a sentence."""
+    """Defect of the store: a stable code, the place, and a sentence."""
 
     code: str
     subject: str
@@ -47,7 +47,7 @@ class StoreDefect:
 
 
 def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[StoreDefect]:
-    """Yield all defects as they are found. `progress(what, count)` is called after each page."""
+    """Yield all defects as they are found; call `progress(check, count)` after each page."""
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
         ("blobs", blob, _check_blob),
@@ -75,7 +75,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Check the database file itself; Postgres enforces its foreign keys, SQLite is asked to check them."""
+    """Check the database file and its foreign keys on SQLite; Postgres enforces its own."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -210,7 +210,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def find_faults(tx: Transaction) -> list[str]:
-    """Return the faults that keep the server from serving, as sentences for its operator; empty if there are none."""
+    """Return sentences for the operator about faults that keep the server from serving; empty if there are none."""
     faults = []
     if not schema_at_head(tx.connection):
         faults.append("the database's tables are not those of this version: run `marey db upgrade`")

@@ -1,8 +1,8 @@
-"""Garbage collection: documents and blobs that nothing refers to, uploads and coverage streams that nobody continues,
-keys that have expired.
+"""Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, and expired keys.
 
-Candidates are looked for in a read. Each batch is then deleted in a transaction of its own that locks the rows and
-looks again. Whoever takes up a document or blob renews its row first: either he finds it gone, or we find it young.
+A read finds the candidates. Each batch is then deleted in a transaction of its own that locks the rows and checks them
+again. A write that starts to refer to a document or blob renews its row first, so it either sees that the row is gone
+or keeps it from being deleted.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from marey_server.store.transaction import Transaction
 
 BATCH = 200
 MOST_UPLOADS = 10_000
-"""Dropped in one round: a statement takes only so many parameters."""
+"""Number of rows deleted in one round; databases limit the parameters of a statement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Collected:
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
-    """Delete data that has had no reference for `grace_us`. Safe at any time and in several processes at once."""
+    """Delete data that has had no reference for `grace_us`; safe at any time and in several processes at once."""
     return Collected(
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
@@ -88,7 +88,7 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Return those of `digests` that may go now, locked so that it stays so."""
+    """Return those of `digests` that may still be deleted, locked so that this stays true."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())
@@ -104,9 +104,10 @@ def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GR
 
 
 def _staged_documents(tx: Transaction) -> set[str]:
-    """Documents that running attempts have staged. One staged after this was read is renewed, and so not garbage.
+    """Return the documents that running attempts have staged.
 
-    What completed attempts staged is kept for identical jobs only as long as something else refers to it.
+    A document staged after this read has a renewed row, and so is not garbage. Documents staged by completed attempts
+    are kept for identical jobs only as long as something else refers to them.
     """
     running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))
@@ -126,7 +127,7 @@ def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_
 
 
 def _sweep_strays(database: Database, grace_us: int) -> int:
-    """Remove files of a directory that have no row: what transactions that never committed left, or deleted rows."""
+    """Remove files without a row from a directory, left by rolled-back transactions or deleted rows."""
     return sum(
         database.write(SYSTEM, _remove_stray, digest)
         for digest in database.blobs.stray_digests(older_than_s=grace_us / 1_000_000)
@@ -134,7 +135,7 @@ def _sweep_strays(database: Database, grace_us: int) -> int:
 
 
 def _remove_stray(tx: Transaction, digest: str) -> int:
-    """Remove the bytes if there is no row; while we hold the row's place, nobody can store them again."""
+    """Remove the bytes if there is no row; the lock on the row's key keeps others from storing them meanwhile."""
     row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
     if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
         return 0

@@ -1,6 +1,7 @@
-"""Idempotency keys: a request that is sent again gets the answer it got before (docs/reference).
+"""Idempotency keys: a repeated request gets the answer of the first one (docs/reference).
 
-Key, answer and work are written in one transaction: all are there or none is, and whoever asks meanwhile waits for it.
+Key, answer and effects are written in one transaction, so that all exist or none. A concurrent request with the same
+key waits for that transaction.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ LIFETIME_US = 7 * 86400 * 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class StoredAnswer:
-    """Answer of the first request."""
+    """Answer to the first request with a key."""
 
     status: int
     headers: dict[str, str]
@@ -32,9 +33,9 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request and return None, or return the stored answer of the same request.
 
-    `fingerprint` distinguishes requests; one that was sent with a token of another reach is another request, so that no
-    narrower token hears what it may not ask for. Raises `InvalidProblem` where the key stands for another request. The
-    caller says `finish` in the same transaction.
+    `fingerprint` identifies the request and the reach of the token, so that a token with fewer rights cannot get the
+    answer given to one with more. Raises `InvalidProblem` if the key was used for another request. The caller must call
+    `finish` in the same transaction.
     """
     fingerprint = _with_reach(fingerprint, tx.principal)
     mine = _mine(tx.principal, key)
@@ -53,7 +54,7 @@ def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
 
 
 def finish(tx: Transaction, key: str, status: int, headers: Mapping[str, str], body: bytes) -> None:
-    """Keep the answer of the request that `begin` claimed the key for."""
+    """Store the answer to the request for which `begin` claimed the key."""
     answer = {"status": status, "headers": dict(headers), "body": body}
     tx.execute(update(idempotency_key).where(*_mine(tx.principal, key)).values(**answer))
 

@@ -1,4 +1,4 @@
-"""Names of things: opaque, sortable by time of making, prefixed by type, never reused."""
+"""Ids: opaque, sortable by time of creation, prefixed by type, never reused."""
 
 import secrets
 import time

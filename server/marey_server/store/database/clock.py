@@ -1,4 +1,4 @@
-"""The database's clock: the only one that leases are compared with."""
+"""Clock of the database, the only clock that leases are compared with."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ class Clock(Protocol):
     """A source of the current time inside a transaction."""
 
     def now_us(self, connection: Connection) -> int:
-        """Return microseconds since the epoch, which never decrease."""
+        """Return the time in microseconds since the epoch; it never decreases."""
         ...
 
 
 class DatabaseClock:
-    """Postgres: the server's own clock. SQLite: wall clock or stored high-water mark, whichever is later, sampled once
-    and then advanced by the monotonic clock, so that a jump of the wall clock neither revives nor kills a lease.
+    """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
+
+    On SQLite it starts at the wall clock or the stored high-water mark, whichever is later, and is then advanced by the
+    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease.
     """
 
     def __init__(self) -> None:
@@ -35,7 +37,7 @@ class DatabaseClock:
         self._start_monotonic_ns = 0
 
     def now_us(self, connection: Connection) -> int:
-        """Microseconds since the epoch."""
+        """Return the time in microseconds since the epoch."""
         if connection.dialect.name == "postgresql":
             now = text("SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint")
             return int(connection.execute(now).scalar_one())
@@ -47,16 +49,16 @@ class DatabaseClock:
 
 
 def stored_high_water_us(connection: Connection) -> int:
-    """Return the latest time known to have been used, 0 in a new database."""
+    """Return the latest time that earlier processes may have used, 0 in a new database."""
     statement = select(server_state.c.value).where(server_state.c.key == _HIGH_WATER)
     return int(connection.execute(statement).scalar() or 0)
 
 
 def save_high_water(connection: Connection, now_us: int) -> int:
-    """See that no time up to `now_us` is ever used again, whatever the wall clock says after a restart.
+    """Store a time after `now_us`, so that no restart uses an earlier time, whatever the wall clock says.
 
-    What is stored lies a second ahead, so that it need not be written more often. It is returned: until then nothing
-    needs to be saved.
+    The stored time is a second ahead, so that it need not be written more often. It is returned: nothing needs to be
+    saved until then.
     """
     stored = stored_high_water_us(connection)
     if now_us < stored:
@@ -70,5 +72,5 @@ def save_high_water(connection: Connection, now_us: int) -> int:
 
 
 def datetime_of(us: int) -> datetime:
-    """Return a stored time as documents show it."""
+    """Return a stored time as the `datetime` of documents."""
     return _EPOCH + timedelta(microseconds=us)

@@ -1,7 +1,7 @@
-"""Connections and transactions, for SQLite and Postgres.
+"""Connections and transactions for SQLite and Postgres.
 
-A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that an UPDATE's conditions are
-checked against the present row when it gets the lock. SQLite has one writer lane: writes run one after another, each
+A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that the conditions of an UPDATE
+are checked against the current row once it is locked. SQLite has one writer lane: writes run one after another, each
 starting with `BEGIN IMMEDIATE`, and reads run beside it.
 """
 
@@ -39,7 +39,7 @@ CACHE_KIB = 4096
 WAL_LIMIT_BYTES = 64 * 2**20
 WAL_CHECK_EVERY_S = 5.0
 WAL_PATIENCE_MS = 250
-"""How long a write waits for readers to let the log be written back: most reads are shorter, but a backup is not."""
+"""Time that a write waits for readers before the log is written back: longer than most reads, shorter than a backup."""
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
@@ -52,7 +52,7 @@ _POSTGRES_SETTINGS = {
 
 
 class Database:
-    """The connections of one server process."""
+    """Connections of one server process to its database."""
 
     def __init__(
         self,
@@ -99,7 +99,7 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
-        """Run `function(tx, ...)` in a read-only transaction of the calling thread; again if the connection breaks."""
+        """Run `function(tx, ...)` in a read-only transaction in the calling thread; retry if the connection breaks."""
         for attempt in range(READ_TRIES):
             try:
                 with self._read_engine.connect() as connection, connection.begin():
@@ -118,8 +118,8 @@ class Database:
     ) -> T:
         """Run `function(tx, ...)` and commit, in the calling thread.
 
-        Runs again, from the start, when the database asks for it (deadlock, serialisation failure) or the connection
-        breaks before the commit: `function` must have no effect but through its transaction.
+        The function runs again from the start after a deadlock, a serialisation failure, or a connection that broke
+        before the commit. So it must have no effect except through its transaction.
         """
         for attempt in range(WRITE_TRIES):
             try:
@@ -164,9 +164,9 @@ class Database:
         return answer
 
     def _keep_wal_short(self, connection: Connection) -> None:
-        """Write a long log back to the file: under steady reads SQLite itself never finds a moment to begin it again.
+        """Write a long log back to the database file; under steady reads SQLite never restarts it by itself.
 
-        Where somebody reads for long, it is tried again later.
+        If a reader takes too long, a later write tries again.
         """
         now_s = time.monotonic()
         if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
@@ -186,7 +186,7 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """`read` in a thread of the pool, for callers on an event loop."""
+        """Run `read` in a thread of the pool, for callers on an event loop."""
         return self._readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
 
     def submit_write(
@@ -196,7 +196,7 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """`write` in a thread of the pool (SQLite: in the writer lane), for callers on an event loop."""
+        """Run `write` in a thread of the pool (SQLite: in the writer lane), for callers on an event loop."""
         if self._write_lane is not None:
             return self._write_lane.submit(principal, function, *args, **kwargs)
         return self._readers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
@@ -286,7 +286,7 @@ _TRY_AGAIN = ("40001", "40P01")
 
 
 def _translated(error: Exception) -> Exception:
-    """Return the same failure in the server's own terms, where the caller can do something about it."""
+    """Return the server's own error for a failure of the database that the caller can act on, else the failure."""
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         return StorageFullProblem("The disk has no room left; nothing was written.") if full else error

@@ -17,7 +17,7 @@ class DatabaseUnusable(Exception):
 
 @contextmanager
 def opening(url: str) -> Iterator[None]:
-    """Raise `DatabaseUnusable` for what goes wrong inside the block with the database at `url`."""
+    """Raise `DatabaseUnusable` for errors inside the block, which opens the database at `url`."""
     try:
         yield
     except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
@@ -42,6 +42,6 @@ def _shown(url: str) -> str:
 
 
 def _reason(error: BaseException | None) -> str:
-    """Return the first line of what the driver says."""
+    """Return the first line of the driver's message."""
     said = str(getattr(error, "orig", None) or error).strip()
     return said.splitlines()[0] if said else "no reason is given"

@@ -1,4 +1,4 @@
-"""The schema of the database: upgrades, and a check whether it is current."""
+"""Schema of the database: upgrades, and the check that it is current."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CHECKOUT = Path(__file__).parents[4] / "migrations"
 
 
 def upgrade_schema(url: str) -> None:
-    """Create or upgrade the tables of the database at `url`, all or nothing. Servers that start together take turns."""
+    """Create or upgrade the tables of the database at `url`, all or nothing; concurrent calls run in turn."""
     database = Database(url, readers=1)
     try:
         database.write(SYSTEM, _upgrade)
@@ -38,7 +38,7 @@ def _upgrade(tx: Transaction) -> None:
 
 
 def schema_at_head(connection: Connection) -> bool:
-    """Return whether the tables are those that this version of the server expects."""
+    """Return whether the database has the schema that this version of the server needs."""
     return MigrationContext.configure(connection).get_current_heads() == _expected_heads()
 
 

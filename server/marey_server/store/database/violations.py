@@ -1,4 +1,4 @@
-"""Recognises the error of a database about a name that is taken."""
+"""Recognition of database errors that mean that a name is taken."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _POSTGRES_UNIQUE = "23505"
 
 
 def is_unique_violation(error: exc.IntegrityError) -> bool:
-    """Return whether a unique index refused the row."""
+    """Return whether an error is the violation of a unique index."""
     state = getattr(error.orig, "sqlstate", None)
     return state == _POSTGRES_UNIQUE if state else "UNIQUE constraint failed" in str(error.orig)
 
 
 @contextmanager
 def taken(error: ApiProblem) -> Iterator[None]:
-    """Raise `error` where a statement inside fails because a unique name is taken. The transaction is then over."""
+    """Raise `error` if a statement in the block violates a unique index; the transaction cannot be used afterwards."""
     try:
         yield
     except exc.IntegrityError as violation:

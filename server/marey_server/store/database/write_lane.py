@@ -1,7 +1,7 @@
-"""Writes to SQLite one after another, and those that wait for their turn together in one transaction.
+"""Lane of writes to SQLite: they run one after another, and waiting writes share a transaction.
 
-A commit waits for the disk, which takes longer than what most requests write. So a write is answered once a commit has
-it, but need not have one of its own: each runs under a savepoint, and one that is refused takes back only its own part.
+A commit waits for the disk, which takes longer than most writes. So waiting writes share one commit: each runs under a
+savepoint, a refused write rolls back only its own part, and each is answered after the commit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_TOGETHER = 16
-"""Greatest number of writes in one transaction; the first of them waits for the last."""
+"""Greatest number of writes in one transaction; the first of them is answered only after the last has run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class _Write:
     future: Future[Any]
 
     def end(self, finish: Callable[[], Any]) -> None:
-        """Hand over what `finish` returns or raises."""
+        """Set the future to the result or the error of `finish`."""
         try:
             answer = finish()
         except BaseException as error:  # noqa: BLE001 - for whoever waits
@@ -43,7 +43,7 @@ class _Write:
 
 
 class WriteLane:
-    """A thread that writes. `write(principal, function)` runs a function in a transaction and commits."""
+    """Thread that runs writes. `write(principal, function)` runs a function in a transaction and commits."""
 
     def __init__(self, write: Callable[[Principal, Callable[[Transaction], Any]], Any]) -> None:
         self._write = write
@@ -57,7 +57,7 @@ class WriteLane:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """Run `function(tx, ...)` when its turn comes; the future holds what it returned once that is committed."""
+        """Queue `function(tx, ...)`; the future holds its return value once the transaction is committed."""
         one = _Write(principal, lambda tx: function(tx, *args, **kwargs), Future())
         self._waiting.append(one)
         self._thread.submit(self._write_waiting)
@@ -75,7 +75,7 @@ class WriteLane:
                 one.end(lambda one=one: self._write(one.principal, one.function))  # type: ignore[misc]
 
     def _write_together(self, group: Sequence[_Write]) -> bool:
-        """Run writes in one transaction; return whether it was committed. An unexpected failure undoes all."""
+        """Run writes in one transaction; return whether it was committed. An unexpected error rolls back all."""
         finishes: list[Callable[[], Any]] = []
 
         def run_all(tx: Transaction) -> None:
@@ -95,7 +95,7 @@ class WriteLane:
 
 
 def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
-    """Run a write; return its completion, to be called after the commit. A refused write leaves nothing to commit."""
+    """Run a write and return its completion, to be called after the commit; a refused write is rolled back."""
     own = tx.beside(one.principal)
     run_text(tx.connection, "SAVEPOINT this_write")
     try:

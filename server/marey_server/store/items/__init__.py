@@ -1,4 +1,4 @@
-"""Items: named things with revisions. This package is the only one that writes them."""
+"""Items: named things with revisions. Only this package writes their rows."""
 
 from marey_server.store.items.annotating import (
     find_annotated_clip,

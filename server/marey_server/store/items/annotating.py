@@ -1,4 +1,4 @@
-"""Reads the annotations and clips that commands apply to, and writes the annotations that were changed."""
+"""Reads annotations and their clips for editing commands, and writes the changed annotations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class FoundAnnotation:
-    """Annotation that the caller may change: its document, its item's rev, and the number of frames of its clip."""
+    """Annotation that the caller may change: its document, its item's `rev`, and the number of frames of its clip."""
 
     tree: dict[str, Any]
     rev: int
@@ -27,14 +27,14 @@ class FoundAnnotation:
 
 @dataclass(frozen=True, slots=True)
 class ChangedAnnotation:
-    """Result of commands on an annotation that was at `rev`: the new document, or the error that refused them."""
+    """Result of commands on an annotation that was at `rev`: its new document, or the error of the command."""
 
     rev: int
     made: PreparedDocument | ApiProblem
 
 
 def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotation:
-    """Read the annotation to change. Raises `NotFoundProblem`, and `InvalidProblem` if its clip is gone."""
+    """Read the annotation to change. Raises `NotFoundProblem`, and `InvalidProblem` if its clip does not exist."""
     projects.require(tx, project)
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
     return FoundAnnotation(found.tree, found.rev, _frame_count(tx, project, found.tree["clip"]))
@@ -43,7 +43,7 @@ def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotat
 def put_changed(tx: Transaction, project: str, item_id: str, changed: ChangedAnnotation, message: str) -> Item:
     """Store the new revision of the annotation.
 
-    Raises the error that refused the commands, and `PreconditionFailedProblem` if the annotation was changed meanwhile.
+    Raises the error of the commands, if any, and `PreconditionFailedProblem` if the annotation was changed meanwhile.
     """
     if isinstance(changed.made, ApiProblem):
         raise changed.made
@@ -54,7 +54,7 @@ def put_changed(tx: Transaction, project: str, item_id: str, changed: ChangedAnn
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedClip:
-    """Clip at its newest revision, with the number of its frames."""
+    """Newest revision of a clip that is annotated, with its number of frames."""
 
     item: Item
     frame_count: int
@@ -67,9 +67,9 @@ def find_annotated_clip(tx: Transaction, project: str, item_id: str) -> Annotate
 
 
 def _frame_count(tx: Transaction, project: str, annotated: dict[str, Any]) -> int:
-    """Count the frames of the clip's revision that an annotation belongs to.
+    """Return the number of frames of the clip revision that an annotation belongs to.
 
-    Raises `InvalidProblem` if the clip is gone.
+    Raises `InvalidProblem` if the clip does not exist.
     """
     clip = RevisionRef.model_validate(annotated)
     try:

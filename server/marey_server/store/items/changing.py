@@ -1,4 +1,4 @@
-"""Changes of items: a new one, a new revision of a part, another name or place, deletion."""
+"""Changes of items: creation, new revisions of parts, renaming, moving, deletion."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from marey_server.store.transaction import Transaction
 
 
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
-    """Check and encode the documents of a request; give them to `create_item` or `put_part` in place of the trees.
+    """Check and encode the documents of a request; `create_item` and `put_part` take the result instead of trees.
 
-    Needs no database and much of the time. Raises `InvalidProblem` with pointers that start with the part.
+    This is the slow part of a write and needs no database. Raises `InvalidProblem` with pointers that start with the
+    part.
     """
     return {part: prepare_part(kind, part, tree) for part, tree in parts.items()}
 
@@ -48,7 +49,7 @@ def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
 
 
 def create_item(tx: Transaction, project: str, kind: Kind, request: ItemCreate) -> Item:
-    """Create an item. Raises `ConflictProblem` if the name is used in its collection."""
+    """Create an item. Raises `ConflictProblem` if the name is taken in its collection."""
     project_row = projects.require(tx, project)
     draft = Draft(
         name_in_batch="", kind=kind, item_name=request.name, parts=request.parts, collection=request.collection,
@@ -69,9 +70,9 @@ def put_part(
     expected_rev: ExpectedRev,
     message: str = "",
 ) -> Item:
-    """Create a revision in which one part is replaced; the same content makes none.
+    """Create a revision in which one part is replaced; if the content is unchanged, no revision is created.
 
-    Raises `PreconditionFailedProblem` where the item is not at `expected_rev` any more.
+    Raises `PreconditionFailedProblem` if the item is no longer at `expected_rev`.
     """
     project_row = projects.require(tx, project)
     found = find_item(tx, project_row, kind, item_id)
@@ -95,7 +96,7 @@ def put_part(
 def change_item(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemChange, *, expected_rev: ExpectedRev
 ) -> Item:
-    """Rename, move or tag an item. Raises `ConflictProblem` where the name is taken at its new place."""
+    """Rename, move or tag an item. Raises `ConflictProblem` if the name is taken at its new place."""
     project_row = projects.require(tx, project)
     values: dict[str, Any] = {"updated_us": tx.now_us}
     if request.name is not None:
@@ -115,7 +116,7 @@ def change_item(
 
 
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide an item; it can be restored. What refers to its revisions stays right."""
+    """Hide an item; it can be restored. References to its revisions stay valid."""
     project_row = projects.require(tx, project)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
     gone = _shown(tx, project_row, kind, item_id)
@@ -125,9 +126,9 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 
 
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
-    """Bring back a deleted item, and its collection if that is gone.
+    """Restore a deleted item, and its collection if that was deleted.
 
-    Raises `ConflictProblem` where its name is taken.
+    Raises `ConflictProblem` if another item has its name now.
     """
     project_row = projects.require(tx, project)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)

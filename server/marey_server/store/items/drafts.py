@@ -1,4 +1,4 @@
-"""Drafts of revisions, and the revisions published from them."""
+"""Drafts of items and revisions, and the revisions published from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from marey_server.store.documents import PreparedDocument
 
 @dataclass(frozen=True, slots=True)
 class StoredDocument:
-    """A document that is stored already. Only for digests that the server itself gave out: nobody checks possession."""
+    """Digest of a stored document. Only for digests from the server itself: possession is not checked."""
 
     digest: str
 
@@ -22,10 +22,10 @@ PartContent = PreparedDocument | StoredDocument | dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """An item or revision to be.
+    """Content of an item or revision that is to be published.
 
-    `reuse`: `new` makes an item and refuses a name that is taken; `by_name` adds a revision to the item of that name,
-    if there is one; `by_content` takes any item of the project whose required parts are equal, and otherwise makes one.
+    `reuse`: `new` creates an item and refuses a name that is taken; `by_name` adds a revision to the item of that name,
+    or creates it; `by_content` uses any item of the project whose required parts are equal, or else creates one.
     """
 
     name_in_batch: str
@@ -41,7 +41,7 @@ class Draft:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Revision published from a draft. `created`: this revision was made now, by this draft."""
+    """Revision published from a draft. `created`: whether this draft created it, or it existed before."""
 
     name: str
     item: str

@@ -1,4 +1,4 @@
-"""The past of an item: its revisions, what they were made from, and whether that is still current."""
+"""History of an item: its revisions, their lineage, and whether their inputs have newer revisions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def list_revisions(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """Revisions of an item, newest first."""
+    """List the revisions of an item, newest first."""
     find_item(tx, projects.require(tx, project_name), kind, item_id)
     order = listing.parse_order("-number", {"number": revision.c.number}, unique="number")
     statement = _revision_rows().where(revision.c.item_id == item_id)
@@ -37,7 +37,7 @@ def list_revisions(
 
 
 def read_revision(tx: Transaction, project_name: str, kind: Kind, item_id: str, number: int) -> Revision:
-    """One revision of an item."""
+    """Return one revision of an item."""
     find_item(tx, projects.require(tx, project_name), kind, item_id)
     return _shown(tx, [_find_revision(tx, item_id, number)])[0]
 
@@ -67,7 +67,7 @@ def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:
 def read_lineage(
     tx: Transaction, project_name: str, kind: Kind, item_id: str, *, revision_number: int | None = None
 ) -> Lineage:
-    """Return the inputs, job and uses of a revision, the newest by default, as far as the caller may see them."""
+    """Return the inputs, job and uses of a revision (default: the newest), as far as the caller may see them."""
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head
     made = _find_revision(tx, item_id, number)
@@ -84,7 +84,7 @@ def read_lineage(
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the other ends of the lineage rows that meet `condition`."""
+    """Return the items and revisions at the other end of the lineage rows that meet `condition`."""
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
         .add_columns(lineage.c.job_id.label("job"), lineage.c.role)
@@ -98,10 +98,10 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
-    """Return whether anything the newest revision was made from, directly or through others, has a newer revision.
+    """Return whether an input of the newest revision, direct or indirect, has a newer revision.
 
-    What an item was made from of itself, such as the model that its tree was made for, is no older state of an input:
-    it is looked through.
+    An input from the item itself, such as the model that its tree was computed from, does not count as outdated; the
+    search continues with the inputs of that revision.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     ancestry = (

@@ -1,4 +1,4 @@
-"""Lists of items: filters, order, pages, choice of fields."""
+"""Lists of items: filters, order, pages, and choice of fields."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class ItemFilters:
     """Filters of a list of items; None matches every item."""
 
     collection: str | None = None
-    """A folder, with those below it."""
+    """Path of a folder; items in folders below it match, too."""
     directly_in: str | None = None
-    """A folder without those below it; the empty path is the root."""
+    """Path of a folder; items in folders below it do not match. The empty path is the root."""
     path: str | None = None
-    """Folder and name."""
+    """Path of an item: folder and name."""
     name: str | None = None
-    """Exact, or the start of the name before a final `*`."""
+    """Exact name, or its beginning followed by `*`."""
     exact_name: str | None = None
-    """Exact, whatever it ends in."""
+    """Exact name; a final `*` is an ordinary character."""
     tags: tuple[str, ...] = ()
-    """Any of these."""
+    """Items that match any of these."""
     skeleton: str | None = None
     clip: str | None = None
-    """Annotations of this clip."""
+    """Id of a clip; its annotations match."""
     frames_gte: int | None = None
     frames_lte: int | None = None
     q: str | None = None
-    """Part of the name, whatever its case."""
+    """Part of the name, without regard to case."""
     deleted: bool = False
 
 
@@ -64,7 +64,7 @@ def list_items(
     fields: Collection[str] | None = None,
     count: bool = False,
 ) -> Page:
-    """One page of a project's items of a kind. With `fields`, each is an object of these members only."""
+    """Return one page of a project's items of a kind; with `fields`, only these members of each item."""
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]

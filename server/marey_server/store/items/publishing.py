@@ -1,4 +1,4 @@
-"""The one place where revisions are born."""
+"""Publication of drafts: the only code that creates revisions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from marey_server.store.transaction import Transaction
 Tree = dict[str, Any]
 
 _RACES = 20
-"""How often somebody else may be faster before we give up."""
+"""Number of attempts to publish while concurrent writes are faster."""
 
 
 def publish(
@@ -37,11 +37,11 @@ def publish(
     author_id: str | None,
     job_id: str | None = None,
 ) -> list[Published]:
-    """Turn drafts into items and revisions; all of them or none. Answers in the order of the drafts.
+    """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
-    `{"output": name}` in a document refers to another draft and becomes its item and revision; the `model_digest` of a
-    tree may name the model of its own draft. Content that is stored already makes no new revision. The caller has
-    authorised the write.
+    `{"output": name}` in a document refers to another draft and is replaced by its item and revision; the
+    `model_digest` of a tree may name the model of its own draft. Content that is stored already creates no new
+    revision. The caller has authorised the write.
 
     Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
     """
@@ -63,7 +63,7 @@ def publish(
 
 @dataclass(frozen=True)
 class _Part:
-    """A part of a draft: its body, and where the document comes from."""
+    """Part of a draft: its body, and the source of its document."""
 
     body: Tree
     content: PreparedDocument | StoredDocument
@@ -85,7 +85,7 @@ def _load_parts(tx: Transaction, draft: Draft) -> dict[str, _Part]:
 
 @dataclass(frozen=True)
 class _Head:
-    """An item with the documents of its newest revision."""
+    """Item with the documents of its newest revision."""
 
     id: str
     number: int
@@ -94,7 +94,7 @@ class _Head:
 
 @dataclass
 class _Publication:
-    """Publishes drafts one after another."""
+    """Publication of several drafts in one transaction, one after another."""
 
     tx: Transaction
     project: ProjectRow
@@ -224,7 +224,7 @@ class _Publication:
 
 
 def _names(draft: Draft) -> Iterator[str]:
-    """Names to try for a new item: its own, and where it stands for content, numbered ones too."""
+    """Yield names to try for a new item: its own, and numbered ones if the draft is identified by its content."""
     yield draft.item_name
     if draft.reuse == "by_content":
         for number in itertools.count(2):

@@ -1,4 +1,4 @@
-"""Items and their parts as they are read."""
+"""Reading of items, their parts and the documents of these."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 
 def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
-    """Find those of the digests that are the part of an item of the project as it is now."""
+    """Return those of the digests that are the current content of a part of some item of the project."""
     row = projects.require(tx, project)
     statement = (
         select(revision_part.c.document_digest)
@@ -103,12 +103,12 @@ def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str
 
 
 def no_item(kind: Kind, item_id: str) -> NotFoundProblem:
-    """There is no such item."""
+    """Return the error for an item that does not exist."""
     return NotFoundProblem(f"There is no {kind} {item_id!r} here.", code="no-item")
 
 
 def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:
-    """Items as they travel: tags and parts of all of them in one query each."""
+    """Return items as documents; tags and parts of all of them are read in one query each."""
     tags_of = read_tags(tx, [row.id for row in rows]) if tags and rows else {}
     parts_of = read_parts(tx, [(row.id, row.head) for row in rows]) if parts and rows else {}
     return [
@@ -123,7 +123,7 @@ def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True,
 
 
 def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str, ...]]:
-    """Tags by item, sorted."""
+    """Return the sorted tags of each item."""
     found: dict[str, list[str]] = {}
     for row in tx.run(_TAGS, {"items": list(item_ids)}):
         found.setdefault(row.item_id, []).append(row.tag)
@@ -133,7 +133,7 @@ def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str
 def read_parts(
     tx: Transaction, revisions: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, PartSummary]]:
-    """Parts by item and revision number."""
+    """Return the parts by item and revision number."""
     keys = {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
     for row in tx.run(_PARTS, keys):
@@ -144,18 +144,18 @@ def read_parts(
 
 @dataclass(frozen=True, slots=True)
 class FoundPart:
-    """A part of a revision that the caller may read."""
+    """Part of a revision that the caller may read."""
 
     digest: str
     revision: int
     rev: int
-    """The item's `rev`: what a change of its newest revision expects."""
+    """The item's `rev`, which a change of its newest revision must name."""
 
 
 def find_part(
     tx: Transaction, project: str, kind: Kind, item_id: str, part: str, *, revision: int | None = None
 ) -> FoundPart:
-    """Return the part of the newest revision, or of `revision`. Raises `NotFoundProblem` where there is none."""
+    """Return a part of the newest revision, or of `revision`. Raises `NotFoundProblem` if it does not exist."""
     project_row = projects.require(tx, project)
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value, "part": part}
     if revision is None:
@@ -175,10 +175,10 @@ def load_part(
     joints: Sequence[str] | None = None,
     arrays: Literal["encoded", "decoded", "none"] = "encoded",
 ) -> dict[str, Any]:
-    """Return the document of a part, its arrays as `arrays` says.
+    """Load the document of a part, with its arrays in the form `arrays`.
 
-    `frames` (half-open, clipped to what is there) and `joints` (names, in the order wanted) cut a motion. Raises
-    `InvalidProblem` where they do not fit it.
+    `frames` (half-open, clipped to the motion) and `joints` (names, in the order of the result) cut a motion. Raises
+    `InvalidProblem` if they do not fit it.
     """
     if frames is None and joints is None:
         return documents.load_document(tx, found.digest, arrays=arrays)
@@ -192,7 +192,7 @@ def load_part(
 
 @dataclass(frozen=True, slots=True)
 class Part(FoundPart):
-    """A part with its document."""
+    """Part of a revision with its document."""
 
     tree: dict[str, Any]
 
@@ -207,7 +207,7 @@ def read_part(
     revision: int | None = None,
     arrays: Literal["encoded", "decoded", "none"] = "encoded",
 ) -> Part:
-    """Find a part and load all of it."""
+    """Find a part of an item and load its whole document."""
     found = find_part(tx, project, kind, item_id, part, revision=revision)
     tree = load_part(tx, found, arrays=arrays)
     return Part(found.digest, found.revision, found.rev, tree)
@@ -219,9 +219,9 @@ MOST_BYTES_AT_ONCE = 32 << 20
 def load_parts(
     tx: Transaction, project: str, wanted: Sequence[PartPlace], *, arrays: Literal["encoded", "decoded"] = "encoded"
 ) -> list[dict[str, Any] | None]:
-    """Load the documents of parts, in the order wanted; None for one that is not there.
+    """Load the documents of parts, in the order of the request; None for a part that does not exist.
 
-    Documents are left out at the end where all of them would be large; the first one never is.
+    If the documents together are too large, those at the end are left out; the first one is always loaded.
     """
     project_row = projects.require(tx, project)
     keys = {

@@ -1,4 +1,4 @@
-"""References from documents to items: to other drafts of the same write, and to revisions that must exist."""
+"""References from documents to items: to other drafts of the same write, or to existing revisions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Tree = dict[str, Any]
 
 
 def outputs_in(tree: Any) -> Iterator[str]:
-    """Names of the drafts that a document refers to as `{"output": name}`."""
+    """Return the names of the drafts that a document refers to as `{"output": name}`."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and isinstance(tree["output"], str):
             yield tree["output"]
@@ -33,16 +33,16 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """Return a part `tree` with the digest of the model of its own write, where it names that as `PartDigestRef`."""
+    """Return `tree` with the digest of the model of the same draft, if it refers to that as `PartDigestRef`."""
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
 
 
 def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
-    """Names, each after those it refers to; names that stand for nothing here are left out.
+    """Sort names so that each comes after the names it refers to; references to unknown names are ignored.
 
-    Raises `InvalidProblem` where some refer to each other.
+    Raises `InvalidProblem` for circular references.
     """
     ordered: dict[str, None] = {}
     for start in names:
@@ -61,7 +61,7 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
-    """Return the tree with each reference to a draft replaced by the revision it became."""
+    """Return the tree with each reference to a draft replaced by the revision published from it."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"output"} and tree["output"] in done:
             published = done[tree["output"]]
@@ -73,7 +73,7 @@ def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
 
 
 class ReferenceCheck:
-    """Checks what the parts of items refer to; looks each revision up once."""
+    """Check of the references in parts of items; looks up each revision once."""
 
     def __init__(self, tx: Transaction, project_row: ProjectRow) -> None:
         self._tx = tx
@@ -81,7 +81,7 @@ class ReferenceCheck:
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
-        """Raise `InvalidProblem` where something the new parts of an item refer to is not there or does not fit."""
+        """Raise `InvalidProblem` if a reference in the new parts of an item has no target or does not fit it."""
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
             self._require_joints(bodies["motion"], "/motion")
         elif kind is Kind.MODEL:
@@ -122,7 +122,7 @@ class ReferenceCheck:
                 self._referred(node["model"], Kind.MODEL, "model", pointer)
 
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
-        """Body of a part of the revision that `ref` names."""
+        """Return the body of a part of the revision that `ref` names."""
         if "output" in ref:
             raise _invalid(pointer, f"no-{kind.value}", f"There is no result {ref['output']!r} in this request.")
         key = (ref["item"], ref["revision"], kind, part)
@@ -153,7 +153,7 @@ class ReferenceCheck:
 
 
 def _escaped(name: str) -> str:
-    """Return a name as a part of a JSON Pointer."""
+    """Return a name escaped as a part of a JSON Pointer."""
     return name.replace("~", "~0").replace("/", "~1")
 
 

@@ -1,4 +1,4 @@
-"""The rows of a revision, and the head that an item keeps of its newest one."""
+"""Rows of revisions, and the reference of an item to its newest revision."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_server.store.transaction import Transaction
 
 
 def read_part_digests(tx: Transaction, item_id: str, number: int) -> dict[str, str]:
-    """Documents of a revision by part."""
+    """Return the digest of the document of each part of a revision."""
     statement = select(revision_part.c.part, revision_part.c.document_digest).where(
         revision_part.c.item_id == item_id, revision_part.c.number == number
     )
@@ -32,9 +32,9 @@ def write_head(
     bodies: Mapping[str, dict[str, Any]],
     *conditions: ColumnElement[bool],
 ) -> bool:
-    """Make the item point at its next revision, if it still meets `conditions`; false if it does not.
+    """Set the item's newest revision to the next one; return false if the item does not meet `conditions`.
 
-    `bodies` of parts that stay as they are may be left out.
+    `bodies` may omit parts that do not change.
     """
     known = dict(bodies)
     for part, digest in parts.items():
@@ -74,7 +74,7 @@ def write_revision(
 
 
 def emit_item(tx: Transaction, event: str, project_row: ProjectRow, subject: Item, **body: Any) -> None:
-    """Record what happened to an item."""
+    """Record an event about an item."""
     tx.emit(
         event, subject.id, project_id=project_row.id, item_kind=subject.kind.value, name=subject.name,
         collection=subject.collection, **body,

@@ -1,4 +1,4 @@
-"""Reads frames and joints of a stored motion, and decodes only the blocks that contain them."""
+"""Slices of a stored motion: decodes only the blocks that contain the selected frames and joints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Tree = dict[str, Any]
 
 
 def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | None, *, encoded: bool = False) -> Tree:
-    """Cut a motion to these frames and joints; the root's translation stays.
+    """Cut a motion to a range of frames and a list of joints; the translation of the root is always kept.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _translation_columns(names: Sequence[str], wanted: Sequence[str]) -> NDArray
 def _cut(
     stored: EncodedArray, frames: range, columns: NDArray[np.intp] | None, *, encoded: bool
 ) -> NDArray[Any] | EncodedArray:
-    """Return frames and columns of an array; `columns` are indices into all axes but the first, flattened."""
+    """Return frames and columns of an array; `columns` are indices into the flattened axes after the first."""
     if encoded and columns is None:
         return stored.cut_frames(frames.start, frames.stop)
     array = blocks.decode(stored.data, frames=slice(frames.start, frames.stop), columns=columns)

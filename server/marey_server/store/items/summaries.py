@@ -1,4 +1,4 @@
-"""Summaries of revisions, which lists show and filter by."""
+"""Summaries of revisions, shown in lists and used by their filters."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 from marey_schemas.kinds import Kind
 
 LABELS_SHOWN = 32
-"""Greatest number of labels in the summary of an annotation, those with the most segments."""
+"""Greatest number of labels in the summary of an annotation; those with the most segments are kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The summary of an item, and those of its facts that are columns."""
+    """Summary of an item, and the facts in it that have columns of their own."""
 
     shown: dict[str, Any]
     frames: int = 0
@@ -23,7 +23,7 @@ class Summary:
 
 
 def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
-    """Summary of a revision from its parts' bodies (arrays as references)."""
+    """Return the summary of a revision from the bodies of its parts (arrays as references)."""
     if kind is Kind.SKELETON:
         return Summary({"joints": len(bodies["hierarchy"]["joints"])})
     if kind is Kind.EVALUATION:

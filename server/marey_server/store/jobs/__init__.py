@@ -1,1 +1,1 @@
-"""The job queue: submission, claims, fences, results, and what the end of a job causes. All of its SQL."""
+"""Job queue: submission, claims, fences, results, and propagation of ends, with all SQL for them."""

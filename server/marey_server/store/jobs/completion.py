@@ -38,11 +38,11 @@ from marey_server.store.tables import attempt, job, staged_output
 from marey_server.store.transaction import Transaction
 
 _Place = tuple[str, int]
-"""Job id and fence of an attempt."""
+"""Id of a job and fence of its attempt."""
 
 
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
-    """End the job with success and publish what the attempt staged. A repeated `write_id` gets the same answer.
+    """End the job with success and publish its staged outputs; repeating a `write_id` repeats the answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended it with another `write_id`.
     """
@@ -57,7 +57,7 @@ def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest)
 
 
 def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> list[BatchCompletionResult]:
-    """Complete many jobs of one worker in one transaction; a refusal concerns one job alone."""
+    """Complete many jobs of one worker in one transaction; each is accepted or refused separately."""
     requests = {(one.job, one.fence): one for one in reversed(completions)}
     own = _claimed_by_caller(tx, requests)
     publishing = {place for place in own if any(staging.named_blobs(requests[place].result))} | _staged(tx, own)
@@ -215,7 +215,7 @@ def _result(
 def fail(
     tx: Transaction, job_id: str, fence: int, request: FailRequest, policy: QueuePolicy = DEFAULT_POLICY
 ) -> FailAnswer:
-    """End the attempt without success. A repeated `write_id` gets the same answer.
+    """End the attempt without success; repeating a `write_id` repeats the answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """
@@ -247,7 +247,7 @@ def fail(
 
 
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
-    """Return whether an earlier attempt ended in the same way, so that another try would only stop another worker."""
+    """Return whether an earlier attempt ended in the same way, so that a retry would only stop another worker."""
     if signature is None:
         return False
     seen = exists().where(attempt.c.job_id == job_id, attempt.c.signature == signature)

@@ -1,4 +1,4 @@
-"""Documents of jobs, made from rows."""
+"""Documents of jobs, built from rows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _JOBS_BY_ID = Prepared(select_jobs().where(job.c.id.in_(bindparam("ids", expandi
 
 
 def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
-    """Return the documents of these jobs, in this order."""
+    """Return the documents of the given jobs, in the same order."""
     found: dict[str, Job] = {}
     for start in range(0, len(ids), IN_LIST):
         rows = tx.run(_JOBS_BY_ID, {"ids": list(ids[start : start + IN_LIST])})
@@ -39,19 +39,20 @@ def job_documents(tx: Transaction, ids: Sequence[str]) -> list[Job]:
 
 
 _UNSAID = {column.key: None if column.default is None else column.default.arg for column in job.c}  # type: ignore[attr-defined]
-"""Values of columns that a new row does not name."""
+"""Initial values of the columns that `new_row` omits."""
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
-    """Return the document of a job of the caller's, other than a gathering one, whose row is as it was inserted by this
-    transaction: what `job_documents` would read.
+    """Return the document of a job that this transaction inserted for the caller, without reading its row.
+
+    The result equals that of `job_documents`. The row must be unchanged, and not that of a gathering job.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}
     return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
-    """Make documents of rows of `select_jobs`; those of gathering jobs hold the states of their tasks."""
+    """Return documents for rows of `select_jobs`; a gathering job's contains the states of its tasks."""
     gathering = [row for row in rows if row.size is not None]
     children = _children(tx, [row.id for row in gathering])
     at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
@@ -68,7 +69,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return the jobs that each of these depends on, without those whose result it waits to share."""
+    """Return the dependencies of each job, without the job whose result it waits to share."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):
@@ -94,7 +95,7 @@ def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, in
 def _progress_of_tasks(
     tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
 ) -> dict[str, Progress]:
-    """Return the progress of gathering jobs in tasks: those that ended, plus the done part of those that run."""
+    """Return the progress of gathering jobs in tasks: the ended ones plus the finished part of the running ones."""
     if not heads:
         return {}
     running: dict[str, list[Progress]] = {}

@@ -18,7 +18,7 @@ LONGEST_DETAIL = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """A job that has just ended in this transaction."""
+    """Job that has ended in this transaction."""
 
     id: str
     project_id: str
@@ -28,7 +28,7 @@ class Ended:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the job succeeded, so that its results exist."""
+        """Whether the job succeeded, so that it has results."""
         return self.state == "succeeded"
 
 
@@ -36,7 +36,7 @@ ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c
 
 
 def as_ended(row: Row[Any]) -> Ended:
-    """Read a row that has `ENDED_COLUMNS`."""
+    """Return the ended job in a row that has `ENDED_COLUMNS`."""
     return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure)
 
 
@@ -52,7 +52,7 @@ def dependency_failure(cause: str, state: str) -> dict[str, Any]:
 
 
 def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
-    """Move the jobs that meet `condition` to a final `state`. The condition names the fences, too."""
+    """Set the final `state` of the jobs that meet `condition`, which includes their fences."""
     statement = (
         update(job)
         .where(condition)
@@ -64,7 +64,7 @@ def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **valu
 
 @dataclass(frozen=True, slots=True)
 class AttemptEnd:
-    """The end of one attempt."""
+    """End of one attempt."""
 
     job_id: str
     fence: int
@@ -94,7 +94,7 @@ _END_ATTEMPT = Prepared(
 
 
 def end_attempts(tx: Transaction, ends: Sequence[AttemptEnd]) -> None:
-    """Record the ends of attempts; an attempt that has ended already keeps its first end."""
+    """Record the ends of attempts; an attempt that has already ended is unchanged."""
     if not ends:
         return
     tx.run_each(

@@ -1,4 +1,4 @@
-"""Decides whether a job whose attempt did not succeed is retried, failed or cancelled, and applies that."""
+"""Decision whether a job is retried, failed or cancelled after an attempt without success, and its application."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marey_server.store.tables import job
 from marey_server.store.transaction import Transaction
 
 TIME_LIMIT = "time-limit"
-"""Code that a worker reports when it stopped a job at its time limit."""
+"""Code that a worker reports after it stopped a job at its time limit."""
 
 ENDING_COLUMNS = (
     job.c.id,
@@ -48,7 +48,7 @@ class AttemptOutcome:
 
 
 def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:
-    """Return the outcome of an attempt whose worker reports a failure. `row` holds `ENDING_COLUMNS`."""
+    """Return the outcome of an attempt that the worker reports as failed. `row` holds `ENDING_COLUMNS`."""
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
     if request.interrupted:
@@ -106,9 +106,9 @@ def apply_outcome(
     end: AttemptEnd,
     **values: Any,
 ) -> None:
-    """Move the job to its next state if `condition` still holds, end the attempt, and propagate the end of the job.
+    """Set the next state of the job if `condition` still holds, end the attempt, and propagate the end of the job.
 
-    Raises `LeaseLostProblem` if it does not.
+    Raises `LeaseLostProblem` if the condition does not hold.
     """
     if outcome.rest_us is None:
         failure = {} if outcome.failure is None else {"failure": outcome.failure}

@@ -1,4 +1,4 @@
-"""Ends fan-outs: combines the results of tasks, or queues the gathering job so that a worker does."""
+"""End of fan-outs: combines the results of tasks, or queues the gathering job so that a worker combines them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from marey_server.store.tables import job, job_blob, staged_output
 from marey_server.store.transaction import Transaction
 
 MOST_GATHERED = 1000
-"""Largest number of entries of a list, such as refusals, in a combined result."""
+"""Greatest number of entries in a list of a combined result, such as its refusals."""
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
-    """End the gathering job, all of whose tasks have ended, or queue it where a worker is to gather what they brought.
+    """End a gathering job whose tasks have all ended, or queue it if its kind combines the results in a worker.
 
-    It goes on or has succeeded if they all have; else it is cancelled if that was asked for, and failed if a task
-    failed.
+    It succeeds or is queued if all tasks succeeded; otherwise it is cancelled if cancellation was requested, and failed
+    if a task failed.
     """
     head = tx.execute(select(job.c.kind, job.c.gathers, job.c.cancel_requested_us).where(job.c.id == parent_id)).one()
     rows = tx.execute(
@@ -51,9 +51,9 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
-    """Delete the results of the tasks of these jobs, which have been gathered.
+    """Delete the results of the tasks of these jobs, which the gathered results replace.
 
-    The blobs they named may be collected, and the tasks answer no later job: the gathered result does.
+    Blobs named by the tasks may then be collected as garbage, and the tasks no longer serve as cached results.
     """
     tasks = select(job.c.id).where(job.c.parent_id.in_(gathered))
     tx.execute(delete(job_blob).where(job_blob.c.job_id.in_(tasks)))
@@ -62,8 +62,9 @@ def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
 
 
 def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
-    """Numbers are added up, lists put together (the first thousand entries), tables combined; other facts stay with the
-    tasks.
+    """Combine results of tasks: numbers are added, lists concatenated (first thousand entries), tables merged.
+
+    Other facts are not combined; they are in the results of the tasks.
     """
     combined: dict[str, Any] = {}
     for result in results:
@@ -73,7 +74,7 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _combine(known: Any, value: Any) -> Any:
-    """Combine a value with one more; values of different types are omitted."""
+    """Combine two values; values of different types are omitted."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value + (known if isinstance(known, int | float) else 0)
     if isinstance(value, list):

@@ -1,7 +1,8 @@
-"""Fencing: the condition under which a write of an attempt counts.
+"""Fencing: the condition for writes of an attempt to be accepted.
 
-A claim raises the job's fence; whoever worked under an older one has lost the job without knowing it. Every write of an
-attempt repeats this predicate in the transaction of the write, since a check of its own would be outrun.
+A claim increases the fence of the job. A worker with an older fence has lost the job, perhaps without having noticed.
+Every write of an attempt includes this condition in its own transaction: after a separate check, another worker could
+claim the job before the write.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ WAITING: ColumnElement[str] = literal_column("'waiting'")
 
 
 def same_fence(fence: int) -> ColumnElement[bool]:
-    """Condition that nobody has claimed the job since this attempt did."""
+    """Return the condition that nobody has claimed the job since this attempt did."""
     return job.c.fence == fence
 
 
 def held(job_id: str, fence: int) -> ColumnElement[bool]:
-    """Condition that the attempt still holds its job, for every write of a worker."""
+    """Return the condition that the attempt still holds its job; every write of a worker includes it."""
     return and_(job.c.id == job_id, job.c.state == RUNNING, same_fence(fence))
 
 
@@ -46,10 +47,10 @@ def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
-    """Check that the credential is that of this attempt.
+    """Check that the caller's credential belongs to this attempt.
 
-    Raises `NotFoundProblem` for a credential that is no attempt's of this job, `LeaseLostProblem` for another attempt
-    of it.
+    Raises `NotFoundProblem` for a credential of no attempt of this job, and `LeaseLostProblem` for one of another
+    attempt of it.
     """
     if principal.kind == "system":
         return
@@ -60,9 +61,9 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
 
 
 def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Lock the job for this transaction and read `columns` of it.
+    """Lock the job for this transaction and return `columns` of it.
 
-    Raises `LeaseLostProblem` if the attempt does not hold it any more.
+    Raises `LeaseLostProblem` if the attempt no longer holds the job.
     """
     statement = select(job.c.project_id, *columns).where(held(job_id, fence)).with_for_update()
     row = tx.execute(statement).one_or_none()
@@ -72,7 +73,7 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
 
 
 def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
-    """Return the error on which a worker stops."""
+    """Return the error that makes a worker stop its attempt."""
     return LeaseLostProblem(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
 
 
@@ -86,5 +87,5 @@ def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> di
 
 
 def earlier(first: Any, second: Any) -> ColumnElement[int]:
-    """Return the smaller of two times in SQL; the databases name their functions for it differently."""
+    """Return the SQL expression for the smaller of two times, whose function differs between the databases."""
     return case((first < second, first), else_=second)

@@ -1,4 +1,4 @@
-"""Resolves the inputs that a submission names to the exact revisions that the job reads."""
+"""Resolution of inputs that a submission names to the exact revisions that the job reads."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ MOST_INPUTS = 100_000
 IN_LIST = 1000
 
 Pin = dict[str, Any]
-"""A stored input: the fields of `PinnedInput`, or `{job}` until that job has made it."""
+"""Stored input: the fields of `PinnedInput`, or `{job}` until that job has produced it."""
 
 PinnedInputs = dict[str, list[Pin]]
 
 
 class FoundItem(NamedTuple):
-    """An item at its newest revision."""
+    """Item at its newest revision."""
 
     id: str
     kind: str
@@ -44,7 +44,7 @@ _ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=Tr
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
-    """Return the items that the requests name one by one, by id."""
+    """Return the items that the requests name individually, by id."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
     return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
 
@@ -68,13 +68,13 @@ def pin_inputs(
     known: dict[str, FoundItem],
     at: str = "",
 ) -> PinnedInputs:
-    """Every input with the revision it has now, or had when it was named; collections become their items. What other
-    jobs make stays to be bound.
+    """Pin every input to the revision named or the newest; collections are replaced by their items.
 
-    `known` holds what `find_items` found of the request's items.
-    Raises `InvalidProblem`, with a pointer below `at` for each thing that is wrong: an input the kind does not have or
-    lacks, nothing for one that is required, an item or revision that is not in the project, an item of another kind, a
-    collection that holds none.
+    Outputs of other jobs are pinned later (`late_inputs`). `known` holds the items that `find_items` returned for the
+    request.
+
+    Raises `InvalidProblem` with a pointer below `at` for each fault: an input that the kind does not have, a required
+    input without a value, an item or revision that is not in the project, an item of another kind, an empty collection.
     """
     errors = _misnamed(kind, request, at)
     pins: PinnedInputs = {}
@@ -153,7 +153,7 @@ def _pin_input(
 
 
 def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, str]]:
-    """Return the inputs that other jobs make: their place in the request, the input's name, and the job's id."""
+    """Return the inputs that other jobs produce: position in the request, name of the input, and id of the job."""
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):
             if isinstance(choice, JobOutputsInput):
@@ -162,7 +162,7 @@ def late_inputs(request: JobCreate, at: str = "") -> Iterator[tuple[str, str, st
 
 
 def pin(found: FoundItem, number: int) -> Pin:
-    """Return an item at a revision as the job stores it."""
+    """Return an item and its revision in the form that the job stores."""
     return {"item": found.id, "revision": number, "kind": found.kind, "name": found.name, "collection": found.path}
 
 
@@ -170,7 +170,7 @@ def pin(found: FoundItem, number: int) -> Pin:
 
 
 def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: str) -> list[FoundItem]:
-    """Return the items of the input's kind in and below a collection, ordered by place and name."""
+    """Return the items of the input's kind in a collection and below it, ordered by path and name."""
     statement = _ITEMS.where(item.c.kind == spec.kind.value).limit(MOST_INPUTS + 1)
     if path:
         statement = statement.where(_within(path))
@@ -179,13 +179,13 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 
 
 def _within(path: str) -> ColumnElement[bool]:
-    """Compare as text, not with LIKE, which ignores case on SQLite."""
+    """Return the condition that a path is below another, compared as text; LIKE would ignore case on SQLite."""
     below = f"{path}/"
     return or_(collection.c.path == path, func.substr(collection.c.path, 1, len(below)) == below)
 
 
 def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:
-    """Return the revisions that were named by number and do not exist."""
+    """Return the revisions that are named by number and do not exist."""
     asked: list[tuple[str, ItemInput]] = []
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):

@@ -1,4 +1,4 @@
-"""Labels of jobs and workers as one indexed text."""
+"""Labels of jobs and workers, stored as one indexed text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
 
 MOST_LABELS = 6
-"""A worker matches 2 to the power of its labels many sets of labels, so there is a limit."""
+"""Greatest number of labels; a worker with n labels matches 2 to the power n sets of labels."""
 
 LONGEST_KEY = 512
 

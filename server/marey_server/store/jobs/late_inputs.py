@@ -1,7 +1,7 @@
-"""Late inputs: inputs that other jobs make. Once those have succeeded, the job gets the revisions they made.
+"""Late inputs: inputs of a job that are outputs of other jobs, pinned when those have succeeded.
 
-It happens in the transaction that makes the job ready, with its row locked, and does what a submission does for a job
-whose inputs are there: the job is spread over tasks, gets its cache key, and is queued or shares a result.
+They are pinned in the transaction that makes the job ready, with its row locked. The job is then processed like a
+submission with existing inputs: it is split into tasks, gets its cache key, and is queued or shares a result.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ IN_LIST = 1000
 
 
 class LateInputError(Exception):
-    """A late input that cannot be pinned; holds the code and detail of the job's failure."""
+    """Late input that cannot be pinned, with the code and detail of the job's failure."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -37,9 +37,9 @@ class LateInputError(Exception):
 
 
 def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
-    """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these.
+    """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these jobs.
 
-    Returns the jobs that ended by it: those for which nothing was made, and those whose result is there.
+    Returns the jobs that end here: those without outputs to read, and those with an existing result to share.
     """
     if not ids:
         return []
@@ -68,7 +68,7 @@ def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]
 
 
 def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
-    """Return the job with its inputs, by the present declaration of its kind; it may have changed since."""
+    """Return the job with its inputs pinned, by the current declaration of its kind, which may have changed since."""
     try:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)
@@ -115,7 +115,7 @@ class _Made(NamedTuple):
     pins: list[Pin]
 
     def below(self, one: Pin) -> str:
-        """Return the place of an output below that collection, or its whole place if it was moved elsewhere."""
+        """Return the path of an output relative to that collection, or its whole path if it was moved elsewhere."""
         path: str = one["collection"]
         return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
 
@@ -149,9 +149,9 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 def _resolved(
     tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
 ) -> list[Pin]:
-    """Return the pins of one entry of an input: itself, or the outputs of the job it names.
+    """Return the pins of one entry of an input: the entry itself, or the outputs of the job it names.
 
-    The outputs may be none only if the input is not required.
+    Raises `LateInputError` if a required input has no outputs.
     """
     if "job" not in entry:
         return [entry]
@@ -166,7 +166,7 @@ def _resolved(
 
 
 def _outputs(tx: Transaction, project_id: str, job_id: str) -> _Made:
-    """Return the outputs of a job or of its tasks, each item at its last revision; deleted items are omitted."""
+    """Return the outputs of a job or of its tasks, each item at its newest revision; deleted items are omitted."""
     columns = (job.c.size, job.c.gathers, job.c.outputs, job.c.into_path)
     row = tx.execute(select(*columns).where(job.c.id == job_id)).one()
     published = [row.outputs]

@@ -1,4 +1,4 @@
-"""Makes rows from checked submissions: one job, or a gathering job and its tasks."""
+"""Rows for checked submissions: one job, or a gathering job with its tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True)
 class Submission:
-    """A checked submission of one job."""
+    """Checked submission of one job."""
 
     kind: KindDeclaration
     request: JobCreate
@@ -29,16 +29,16 @@ class Submission:
     labels_key: str
     author_id: str | None
     after: tuple[str, ...] = ()
-    """Jobs that must succeed first; those that make its inputs are among them."""
+    """Ids of the jobs that must succeed first, including those that produce its inputs."""
     unbound: bool = False
-    """Whether other jobs have yet to make some of the inputs."""
+    """Whether some inputs are outputs of jobs that have not succeeded yet."""
     id: str = field(default_factory=lambda: new_id("job"))
     retry_of: str | None = None
 
 
 @dataclass
 class NewJob:
-    """A job that is about to be inserted."""
+    """Job that is about to be inserted."""
 
     id: str
     project_id: str
@@ -60,7 +60,7 @@ class NewJob:
 
     @property
     def unbound(self) -> bool:
-        """Whether other jobs have yet to make some of its inputs."""
+        """Whether some inputs are outputs of jobs that have not succeeded yet."""
         return self.submission.unbound
 
     def end(self) -> Ended:
@@ -69,7 +69,7 @@ class NewJob:
 
 
 def request_of(row: Row[Any]) -> JobCreate:
-    """Return the request that a row was submitted with, without inputs, labels and dependencies."""
+    """Return the request with which a job was submitted, without inputs, labels and dependencies."""
     return JobCreate(
         kind=row.kind,
         params=row.params,
@@ -86,9 +86,9 @@ def request_of(row: Row[Any]) -> JobCreate:
 
 
 def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dict[str, result_cache.SharedResult]]:
-    """Spread jobs whose inputs are known over tasks and give them their cache keys.
+    """Split jobs with known inputs into tasks, and give them their cache keys.
 
-    Returns the tasks, and for each job whose result is there or under way, whose that is; such jobs wait for it.
+    Returns the tasks, and, for each job whose result exists or is being computed, the id of the job with that result.
     """
     gathering = [one for one in heads if one.submission.kind.gathering is not None]
     sources = _find_results(tx, gathering)
@@ -98,7 +98,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Give jobs their cache keys; those whose result exists or is being computed wait for it."""
+    """Give jobs their cache keys; a job whose result exists or is being computed waits for it."""
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
     for one in jobs:
@@ -108,7 +108,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """Return the tasks of a job that has several, and make it a gathering job; tasks start when it does."""
+    """Return the tasks of a job that has several, and make it a gathering job; its tasks start when it does."""
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []
@@ -126,7 +126,7 @@ def _spread(head: NewJob) -> list[NewJob]:
 
 
 def _shares(submission: Submission) -> list[PinnedInputs]:
-    """Return the inputs of each task: a share of the spread input, or all inputs if tasks are counted."""
+    """Return the inputs of each task: a share of the input that is split, or all inputs if tasks are only counted."""
     fanned = submission.kind.fan_out
     if fanned is None:
         return [submission.pins] * submission.task_count
@@ -159,7 +159,7 @@ def _has_key(submission: Submission) -> bool:
 
 
 def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
-    """Return the newest revisions of items that parameters name; items that do not exist in the project are omitted."""
+    """Return the newest revisions of items that parameters name; items that are not in the project are omitted."""
     wanted: dict[str, set[str]] = {}
     for one in jobs:
         named = result_cache.named_items(one.submission.kind, one.submission.params)
@@ -169,7 +169,7 @@ def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]
 
 
 def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
-    """Return the row to insert."""
+    """Return the row to insert for a new job."""
     submission, request = one.submission, one.submission.request
     return {
         "id": one.id,

@@ -1,4 +1,4 @@
-"""Logs of attempts: appended by offset while they run, closed when they end, read as one text."""
+"""Logs of attempts: appended by offset during the attempt, closed at its end, and read as one text per job."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_READ_BYTES = 2**20
 
 
 class LogOffset(ConflictProblem):
-    """The log continues at another offset."""
+    """Data was sent for another offset than the end of the log."""
 
     code = "log-offset"
 
@@ -28,9 +28,9 @@ class LogOffset(ConflictProblem):
 def append_log(
     tx: Transaction, job_id: str, fence: int, offset: int, data: bytes, policy: QueuePolicy = DEFAULT_POLICY
 ) -> LogAnswer:
-    """Add `data` to the attempt's log, which must be `offset` bytes long. The same piece again is taken as said.
+    """Append `data` at `offset`, which must be the end of the attempt's log; a repeated append changes nothing.
 
-    Raises `LogOffset` with the true offset, `LeaseLostProblem` if the attempt does not hold the job any more.
+    Raises `LogOffset` with the current end, and `LeaseLostProblem` if the attempt no longer holds the job.
     """
     require_attempt(tx.principal, job_id, fence)
     hold(tx, job_id, fence)
@@ -63,13 +63,13 @@ def _is_said(tx: Transaction, job_id: str, fence: int, offset: int, data: bytes)
 
 @dataclass(frozen=True, slots=True)
 class LogPage:
-    """A piece of a job's log: the output of its attempts, one after another."""
+    """Page of a job's log, which joins the output of all attempts."""
 
     data: bytes
     offset: int
-    """Offset of the next piece."""
+    """Offset of the next page."""
     sealed: bool
-    """Whether the log is complete and this piece reaches its end."""
+    """Whether the log is complete and this page reaches its end."""
 
 
 class _Span(NamedTuple):
@@ -79,9 +79,9 @@ class _Span(NamedTuple):
 
 
 def read_log(tx: Transaction, job_row: Row[tuple[str, str]], offset: int, limit: int = MOST_READ_BYTES) -> LogPage:
-    """Up to `limit` bytes of the log of a job (`id, state`) from `offset` on.
+    """Return up to `limit` bytes of the log of a job (`id, state`) from `offset` on.
 
-    An attempt's log never grows once the next one has begun, so offsets into the whole stay true.
+    The log of an attempt does not grow after the next attempt has begun, so offsets into the joined log stay valid.
     """
     spans = _spans(tx, job_row.id)
     total = spans[-1].stop if spans else 0

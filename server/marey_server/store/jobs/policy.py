@@ -1,4 +1,4 @@
-"""Durations and limits of the queue, which settings of a server and tests may replace."""
+"""Durations and limits of the queue, configurable by server settings and tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SECOND_US = 1_000_000
 class QueuePolicy:
     """Durations of leases and waits, and limits of retries.
 
-    `random_unit` draws from [0, 1); a test that gives its own makes backoff predictable.
+    `random_unit` draws from [0, 1); a test replaces it to make the backoff predictable.
     """
 
     lease_ttl_s: float = 60.0
@@ -38,7 +38,7 @@ class QueuePolicy:
         return round(self.end_grace_s * SECOND_US)
 
     def backoff_us(self, failures: int) -> int:
-        """Return how long a job waits after its `failures`-th failure: four times as long each time."""
+        """Return the wait in microseconds before a retry; each failure makes it four times as long."""
         backoff = Backoff(
             self.first_backoff_s, self.longest_backoff_s, factor=4.0, jitter=0.25, random_unit=self.random_unit
         )
