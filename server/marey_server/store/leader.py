@@ -1,4 +1,4 @@
-"""Leader election among server processes by a row with a lease and a fence."""
+"""Leader election among server processes, by a row with a lease and a fence."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marey_server.store.transaction import Transaction
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
-    """Become or stay the leader in `name` for `ttl_us`; the fence of this leadership, None while another one leads."""
+    """Become or stay the leader for `name` for `ttl_us`; return the fence, or None while another process leads."""
     free = or_(leader.c.holder == holder, leader.c.expires_us <= tx.now_us)
     renewed = tx.execute(
         update(leader)
@@ -29,5 +29,5 @@ def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | Non
 
 
 def give_up_lead(tx: Transaction, name: str, holder: str) -> None:
-    """Give up the lead, so that another process can take it at once."""
+    """End the leadership, so that another process can take it at once."""
     tx.execute(update(leader).where(leader.c.name == name, leader.c.holder == holder).values(expires_us=tx.now_us))

@@ -1,4 +1,4 @@
-"""Pages of lists: sort keys, and signed cursors that stay right while rows are inserted."""
+"""Pages of lists: sort keys, and signed cursors that stay valid while rows are inserted."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ MAX_LIMIT = 1000
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order of a list: columns with their direction, the last one unique."""
+    """Order of a list: columns with their directions; the last column is unique."""
 
     text: str
     columns: tuple[tuple[ColumnElement[Any], bool], ...]
-    """Each with whether it falls."""
+    """Each column with whether its order is descending."""
 
     def clauses(self) -> list[UnaryExpression[Any]]:
         """Return the clauses of ORDER BY."""
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
-        """Condition: behind a row with these values. Its first term alone is a range of an index."""
+        """Return the condition for rows after the one with these values; its first term is a range of an index."""
         (first, falls), *rest = self.columns
         beyond: ColumnElement[bool] = first < values[0] if falls else first > values[0]
         if not rest:
@@ -50,7 +50,7 @@ class Order:
 
 
 def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str = "id") -> Order:
-    """Order from `sort=-created_at,name`. Raises `BadRequestProblem` where a key is unknown or stands twice."""
+    """Return the order for `sort=-created_at,name`. Raises `BadRequestProblem` for an unknown or repeated key."""
     names = [part.strip() for part in text.split(",") if part.strip()]
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:
@@ -67,15 +67,15 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
 
 
 def make_cursor(tx: Transaction, order: Order, identity: Any, values: Sequence[Any]) -> str:
-    """Opaque text for the page behind the row with these values."""
+    """Return the cursor, an opaque text, of the page after the row with these values."""
     payload = json.dumps([order.text, _fingerprint(identity), list(values)], separators=(",", ":")).encode()
     return base64.urlsafe_b64encode(_mac(tx, payload) + payload).decode().rstrip("=")
 
 
 def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> list[Any]:
-    """Values of the row a page ended with.
+    """Return the values of the last row of the page before the cursor.
 
-    Raises `BadRequestProblem` where the cursor is not ours or of another list.
+    Raises `BadRequestProblem` if this server did not sign the cursor, or it is from another list.
     """
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))
@@ -104,7 +104,7 @@ def _mac(tx: Transaction, payload: bytes) -> bytes:
 
 
 def make_cursor_key(tx: Transaction) -> None:
-    """Make the key that signs cursors, unless there is one."""
+    """Create the key that signs cursors if it does not exist."""
     row = {"key": _KEY_NAME, "value": secrets.token_hex(32)}
     tx.execute(tx.insert_or_ignore(server_state, row))
 
@@ -112,9 +112,9 @@ def make_cursor_key(tx: Transaction) -> None:
 def read_page(
     tx: Transaction, statement: Select[Any], order: Order, identity: Any, cursor: str | None, limit: int
 ) -> tuple[Sequence[Row[Any]], str | None]:
-    """At most `limit` rows of `statement` behind the cursor, and the cursor of the next page.
+    """Return at most `limit` rows of `statement` after the cursor, and the cursor of the next page.
 
-    `identity` is JSON that distinguishes this list from every other: what it lists, by which filters.
+    `identity` is JSON that distinguishes this list from every other: its subject and filters.
     """
     if not 1 <= limit <= MAX_LIMIT:
         raise BadRequestProblem(f"limit must lie between 1 and {MAX_LIMIT}.", code="bad-limit")

@@ -1,4 +1,4 @@
-"""Members of projects and their roles. A project always keeps an owner."""
+"""Members of projects and their roles. A project always has at least one owner."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from marey_server.store.transaction import Transaction
 def list_members(
     tx: Transaction, project_name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """Members by name. Guests of a public project may not know them."""
+    """List the members by name. Guests of a public project may not see them."""
     project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     statement = statement.where(member.c.project_id == project_row.id)
@@ -30,7 +30,7 @@ def list_members(
 
 
 def read_member(tx: Transaction, project_name: str, user_name: str) -> Member:
-    """One member."""
+    """Return one member of a project."""
     project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     row = tx.execute(statement.where(member.c.project_id == project_row.id, user.c.name == user_name)).first()
@@ -48,9 +48,9 @@ def put_member(
     expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> Member:
-    """Make somebody a member, or change the role. `absent`: only if he is none yet.
+    """Add a member, or change the member's role. `absent`: refuse if the user is a member already.
 
-    Raises `NotFoundProblem` where there is no such user, `ConflictProblem` where the project would lose its last owner.
+    Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
     """
     project_row = _lock(tx, project_name)
     user_id = tx.execute(select(user.c.id).where(user.c.name == user_name, user.c.disabled.is_(False))).scalar()
@@ -78,7 +78,7 @@ def put_member(
 
 
 def remove_member(tx: Transaction, project_name: str, user_name: str, *, expected_rev: ExpectedRev) -> None:
-    """End a membership. Raises `ConflictProblem` where the project would lose its last owner."""
+    """Remove a member. Raises `ConflictProblem` if the project would lose its last owner."""
     project_row = _lock(tx, project_name)
     which = (
         member.c.project_id == project_row.id,
@@ -92,7 +92,7 @@ def remove_member(tx: Transaction, project_name: str, user_name: str, *, expecte
 
 
 def _lock(tx: Transaction, project_name: str) -> ProjectRow:
-    """Members of a project change one after another, so that two owners cannot remove each other."""
+    """Lock the members of a project, so that two owners cannot remove each other at the same time."""
     project_row = projects.require(tx, project_name)
     tx.execute(select(project.c.id).where(project.c.id == project_row.id).with_for_update(key_share=True))
     return projects.require(tx, project_name)  # the one before may have ended the caller's role

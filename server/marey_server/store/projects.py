@@ -1,4 +1,4 @@
-"""Projects, and the one function that decides who may do what in them."""
+"""Projects, and the function that decides what the caller may do in them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class ProjectRow:
-    """A project, and what the caller is in it."""
+    """Project with the caller's role in it."""
 
     id: str
     name: str
@@ -57,7 +57,7 @@ class ProjectRow:
     rev: int
     role: Role
     guest: bool
-    """The caller is no member and reads because the project is public."""
+    """Whether the caller is not a member and may read because the project is public."""
 
     def shown(self) -> Project:
         """Return the project as a document."""
@@ -105,7 +105,7 @@ def require(
 
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
-    """Return a project, even if deleted, without a check of rights; for the server's own work."""
+    """Return a project, even a deleted one, without a check of rights; for internal work of the server."""
     row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
     return _row(row, Role.READER, guest=False)
 
@@ -124,7 +124,7 @@ _DELETED_BY_NAME = (
 
 
 def _as_seen(principal: Principal, row: Row[Any]) -> ProjectRow | None:
-    """Return the project with the caller's role in it; None where he may not know it."""
+    """Return the project with the caller's role in it; None if the caller may not know that it exists."""
     if principal.kind == "attempt":
         return _row(row, Role.READER, guest=False) if principal.project_id == row.id else None
     if any(scope.partition("!project=")[2] in ("", row.name) for scope in principal.scopes):
@@ -142,7 +142,7 @@ def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
 
 
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Condition on rows of `project`: alive, and readable by the caller."""
+    """Return the condition for rows of `project`: not deleted, and readable by the caller."""
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":
         return and_(alive, project.c.id == (principal.project_id or ""))
@@ -207,7 +207,7 @@ def _name_taken(name: str) -> ConflictProblem:
 
 
 def change_project(tx: Transaction, name: str, request: ProjectChange, *, expected_rev: ExpectedRev) -> Project:
-    """Change title, description or visibility."""
+    """Change the title, description or visibility of a project."""
     seen = require(tx, name)
     values = {field: getattr(request, field) for field in request.model_fields_set}
     if values.get("visibility") is not None:
@@ -226,9 +226,9 @@ def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> 
 
 
 def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
-    """Bring back the project of this name that was deleted last.
+    """Restore the project of this name that was deleted last.
 
-    Raises `ConflictProblem` where the name is taken again.
+    Raises `ConflictProblem` if another project has the name now.
     """
     seen = require(tx, name, deleted=True)
     with taken(_name_taken(name)):

@@ -1,4 +1,4 @@
-"""Changes of rows that carry a `rev`: the precondition is part of the statement, and the row count decides."""
+"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count says if it held."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from marey_server.errors import ApiProblem, PreconditionFailedProblem
 from marey_server.store.transaction import Transaction
 
 ExpectedRev = int | frozenset[int] | None
-"""The `rev` that a writer believes in, or several of which any will do; None for any at all."""
+"""The `rev` that a writer expects, or several, of which one must match; None matches any."""
 
 
 def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
-    """Condition for the statement that writes: the row is at an expected `rev`."""
+    """Return the condition, for the statement that writes, that the row is at an expected `rev`."""
     if expected is None:
         return true()
     return column == expected if isinstance(expected, int) else column.in_(sorted(expected))
 
 
 def is_expected(rev: int, expected: ExpectedRev) -> bool:
-    """Return the same of a `rev` that was read."""
+    """Return whether a `rev` that was read is an expected one."""
     return expected is None or (rev == expected if isinstance(expected, int) else rev in expected)
 
 
@@ -36,7 +36,7 @@ def change_row(
 ) -> Row[Any]:
     """Change the one row that meets `which`, if its `rev` is an expected one.
 
-    Raises `absent` where there is no such row, `PreconditionFailedProblem` with the current `rev` where it has changed.
+    Raises `absent` if there is no such row, and `PreconditionFailedProblem` with the current `rev` if it has changed.
     """
     expected = at_rev(table.c.rev, expected_rev)
     statement = update(table).where(*which, expected).values(**values, rev=table.c.rev + 1).returning(*table.c)
@@ -48,7 +48,7 @@ def change_row(
 
 
 def moved_on(current_rev: int) -> PreconditionFailedProblem:
-    """Somebody else changed it first; `context.rev` is the present state."""
+    """Return the error for a resource that was changed by another request; `context.rev` is its current state."""
     return PreconditionFailedProblem(
         f"This has changed since you read it (it is at rev {current_rev} now). Read it again, then repeat the change.",
         context={"rev": current_rev},

@@ -1,4 +1,4 @@
-"""Every table, once, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
+"""Tables of the database, for SQLite and Postgres. Times are integer microseconds since the epoch, UTC, named `_us`."""
 
 from sqlalchemy import (
     JSON,
@@ -38,7 +38,7 @@ DIGEST = String(71)
 
 
 def _alive(table: str, *columns: str) -> Index:
-    """Unique among what is not deleted, so that a deleted name can be used again."""
+    """Return a unique index over rows that are not deleted, so that a deleted name can be used again."""
     condition = text("deleted_us IS NULL")
     return Index(f"uq_{table}_alive", *columns, unique=True, sqlite_where=condition, postgresql_where=condition)
 
@@ -221,7 +221,7 @@ lineage = Table(
 )
 
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
-"""Two claims may pick jobs of one concurrency key at the same moment: the later one hits this index and looks again."""
+"""Index that refuses a second running job of a concurrency key; a concurrent claim that violates it picks again."""
 
 job = Table(
     "job",

@@ -1,4 +1,4 @@
-"""Bearer tokens: who shows one is who."""
+"""Bearer tokens: creation, revocation, and the principal that each belongs to."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
 NOTE_USE_EVERY_S = 3600
-"""How exactly `last_used_at` is kept: writing it on every request would make every read a write."""
+"""Precision of `last_used_at`; an update on every request would make every read a write."""
 
 _ATTEMPT_SCOPES = ("read",)
 
@@ -70,8 +70,10 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
-    """An attempt lives while its fence is the job's. Once the job has ended, the token only serves to hear again what
-    `complete` or `fail` answered: it reads nothing any more. Raises `LeaseLostProblem` once the fence has moved on.
+    """Return the principal of an attempt's token. Raises `LeaseLostProblem` if a later attempt has the job.
+
+    The token is valid while its fence is the job's. After the end of the job, it only allows a repeated `complete` or
+    `fail`, which gets the stored answer; reads are refused.
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
@@ -94,7 +96,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 
 
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
-    """A new token of the caller, reaching no further than the credential it is made with. The secret is shown once."""
+    """Create a token of the caller with at most the scopes of the current credential; its secret is shown once."""
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
         raise ForbiddenProblem(f"Your own credential does not reach {beyond[0]!r}.", code="insufficient-scope")
@@ -120,9 +122,9 @@ def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = list
 
 
 def revoke_token(tx: Transaction, token_id: str) -> None:
-    """End one of the caller's tokens, or as an administrator anybody's. Raises `NotFoundProblem`.
+    """Revoke a token of the caller, or, for administrators, of anybody. Raises `NotFoundProblem`.
 
-    A token may always end itself.
+    A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
@@ -136,7 +138,7 @@ def revoke_token(tx: Transaction, token_id: str) -> None:
 
 
 def revoke_named(tx: Transaction, name: str) -> None:
-    """End those of the caller's tokens that have this name."""
+    """Revoke the caller's tokens that have this name."""
     user_id = _require_user(tx.principal, "write")
     ended = tx.execute(delete(token).where(token.c.user_id == user_id, token.c.name == name).returning(token.c.id))
     for token_id in ended.scalars().all():
@@ -144,7 +146,7 @@ def revoke_named(tx: Transaction, name: str) -> None:
 
 
 def note_use(tx: Transaction, token_id: str) -> None:
-    """Remember that a token is in use, once an hour."""
+    """Update the time of a token's last use, at most once an hour."""
     before = tx.now_us - NOTE_USE_EVERY_S * 1_000_000
     stale = or_(token.c.last_used_us.is_(None), token.c.last_used_us < before)
     tx.execute(update(token).where(token.c.id == token_id, stale).values(last_used_us=tx.now_us))

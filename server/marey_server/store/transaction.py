@@ -1,4 +1,4 @@
-"""One transaction: on whose behalf it runs, what time it is in it, and what it does in each database's own words."""
+"""Transaction: its principal, its time, and operations that differ between SQLite and Postgres."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from marey_server.store.database.prepared import Prepared
 
 
 class Transaction:
-    """One transaction and the principal on whose behalf it runs."""
+    """Transaction with the principal on whose behalf it runs."""
 
     def __init__(self, connection: Connection, principal: Principal, clock: Clock, blobs: BlobBacking) -> None:
         self.connection = connection
         self.principal = principal
         self.required_role = STRICTEST
-        """What the request's operation declares; `projects.require` enforces it."""
+        """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
         self.shared_outputs = 0
-        """Number of results of earlier jobs that it has published again."""
+        """Number of cached results that this transaction has published."""
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []
 
     @property
     def now_us(self) -> int:
-        """The database's time, microseconds since the epoch; the same throughout the transaction."""
+        """The time of the database in microseconds since the epoch, constant throughout the transaction."""
         if self._now_us is None:
             self._now_us = self._clock.now_us(self.connection)
         return self._now_us
 
     def beside(self, principal: Principal) -> Transaction:
-        """Another one, on behalf of `principal`, that is committed with this one."""
+        """Return a transaction on behalf of `principal` that is committed together with this one."""
         return Transaction(self.connection, principal, self._clock, self.blobs)
 
     @property
     def is_postgres(self) -> bool:
-        """Whether this runs on Postgres."""
+        """Whether the database is Postgres."""
         return self.connection.dialect.name == "postgresql"
 
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
@@ -57,26 +57,26 @@ class Transaction:
         return statement.run(self.connection, parameters)
 
     def first(self, statement: Prepared, parameters: Mapping[str, Any]) -> Any | None:
-        """Return the first row of a prepared statement; None where it gives none."""
+        """Return the first row of a prepared statement, or None."""
         rows = statement.run(self.connection, parameters)
         return rows[0] if rows else None
 
     def run_each(self, statement: Prepared, many: Sequence[Mapping[str, Any]]) -> None:
-        """Run a prepared statement once for each of `many`."""
+        """Run a prepared statement once for each mapping in `many`."""
         statement.run_each(self.connection, many)
 
     def insert_or_ignore(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
-        """Return an INSERT that does nothing where a unique index refuses the row; `returning` then gives nothing.
+        """Return an INSERT that does nothing if a unique index refuses the row; `returning` then gives no row.
 
-        Without `row`, give the rows when executing it.
+        Without `row`, the rows are given at execution.
         """
         added = postgresql.insert(table) if self.is_postgres else sqlite.insert(table)
         return (added if row is None else added.values(**row)).on_conflict_do_nothing()
 
     def lock(self, name: str) -> None:
-        """Wait until nobody else holds the lock `name`, and hold it to the end of a write.
+        """Acquire the lock `name` and hold it until the end of the write.
 
-        SQLite has one writer at a time anyway.
+        On SQLite it does nothing, because there is only one writer at a time.
         """
         if self.is_postgres:
             self.execute(
@@ -84,7 +84,7 @@ class Transaction:
             )
 
     def emit(self, kind: str, subject: str, *, project_id: str | None = None, **body: Any) -> None:
-        """Record an event, visible when the transaction commits."""
+        """Record an event, which becomes visible when the transaction commits."""
         row: dict[str, Any] = {
             "at_us": self.now_us,
             "project_id": project_id,
@@ -100,10 +100,10 @@ class Transaction:
             self.execute(sqlalchemy.insert(tables.event), row)
 
     def after_commit(self, action: Callable[[], None]) -> None:
-        """Run `action` once the transaction has committed; not at all if it rolls back."""
+        """Run `action` after the transaction has committed, but not if it rolls back."""
         self._after_commit.append(action)
 
     def run_after_commit(self) -> None:
-        """Run what waits for the commit."""
+        """Run the actions registered with `after_commit`."""
         for action in self._after_commit:
             action()

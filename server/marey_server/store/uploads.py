@@ -1,6 +1,6 @@
-"""Resumable uploads: bytes that come in pieces, over many connections if need be, and become a blob at the end.
+"""Resumable uploads: bytes sent in pieces, over several connections if necessary, that become a blob at the end.
 
-Pieces are kept in rows until then. The offset moves by compare-and-swap, so that two senders cannot interleave.
+Pieces are stored in rows until then. The offset is updated by compare-and-swap, so that two senders cannot interleave.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
 LIFETIME_US = 7 * 86400 * 1_000_000
-"""An upload that nobody continued for so long is given up."""
+"""Time without a new piece after which an upload is deleted."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredUpload:
-    """State of an upload; `digest` once it is complete."""
+    """State of an upload; `digest` is set once it is complete."""
 
     id: str
     length: int
@@ -42,7 +42,7 @@ class StoredUpload:
 
 
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
-    """Announce `length` bytes; with `digest`, they must turn out to be these."""
+    """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
     user_id = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
         raise TooLargeProblem(f"An upload holds 1 to {MAX_UPLOAD_BYTES} bytes.")
@@ -61,9 +61,9 @@ def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
 
 
 def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredUpload:
-    """Append a piece of at most a few MiB that starts at `offset`.
+    """Append a piece of at most a few MiB at `offset`.
 
-    Raises `ConflictProblem` with the true offset in `context.offset` where the upload is elsewhere.
+    Raises `ConflictProblem` with the current offset in `context.offset` if the upload is at another offset.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None or found.offset != offset:
@@ -88,10 +88,10 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
 
 
 def finish(tx: Transaction, upload_id: str) -> str:
-    """Make a blob of a complete upload and return its digest; the same again once it is finished.
+    """Store a complete upload as a blob and return its digest; a repeated call returns the same.
 
-    Raises `ConflictProblem` where bytes are lacking, and `InvalidProblem` for bytes that are not the announced ones;
-    they stay until the upload is abandoned or given up.
+    Raises `ConflictProblem` if bytes are missing, and `InvalidProblem` if the bytes do not have the announced digest;
+    they are kept until the upload is deleted or expires.
     """
     found = _find(tx, upload_id)
     if found.finished_digest is not None:
@@ -115,7 +115,7 @@ def finish(tx: Transaction, upload_id: str) -> str:
 
 
 def abandon(tx: Transaction, upload_id: str) -> None:
-    """Drop an upload; its blob, if it became one, stays."""
+    """Delete an upload; a blob made from it is kept."""
     found = _find(tx, upload_id)
     drop(tx, [found.id])
 
@@ -138,7 +138,7 @@ def _pieces(tx: Transaction, upload_id: str) -> Iterator[bytes]:
 
 
 def _even(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """The same bytes in pieces of `CHUNK_BYTES`, the last one shorter."""
+    """Yield the same bytes in pieces of `CHUNK_BYTES`; the last one may be shorter."""
     held = bytearray()
     for piece in pieces:
         held += piece

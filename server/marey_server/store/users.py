@@ -1,4 +1,4 @@
-"""Users: people and services that sign in."""
+"""Users: people and services that can sign in."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _ADMINISTRATORS = "administrators"
 
 
 def create_user(tx: Transaction, request: UserCreate, *, password_hash: str | None = None) -> User:
-    """Create a user. `password_hash` comes from `passwords.hash_password`, which takes too long for a transaction.
+    """Create a user. `password_hash` comes from `passwords.hash_password`, which is too slow for a transaction.
 
-    Raises `ConflictProblem` where the name is taken.
+    Raises `ConflictProblem` if the name is taken.
     """
     require_administrator(tx.principal)
     return _insert(tx, request.name, request.display_name, request.administrator, password_hash)
@@ -52,7 +52,7 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user, for administrators and for himself. Raises `NotFoundProblem`."""
+    """Return a user, to administrators and to the user. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -62,7 +62,7 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """Return all users by name, for administrators."""
+    """Return all users by name, to administrators."""
     require_administrator(tx.principal)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
     rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
@@ -78,10 +78,10 @@ def change_user(
     password_hash: str | None = None,
     verified_hash: str | None = None,
 ) -> User:
-    """Change a user: administrators anything, users their own display name and password.
+    """Change a user: administrators may change all fields, users their own display name and password.
 
-    `password_hash`: of `request.password`. `verified_hash`: what `request.current_password` was checked against (see
-    `verify_password`); it must still be the user's when the change is written.
+    `password_hash` is the hash of `request.password`. `verified_hash` is the hash that `request.current_password` was
+    checked against (see `verify_password`); it must still be the user's when the change is written.
     """
     itself = tx.principal.kind == "user" and tx.principal.user_name == name
     administrates = is_administrator(tx.principal)
@@ -124,7 +124,7 @@ def _values(request: UserChange, password_hash: str | None) -> dict[str, Any]:
 
 
 def delete_user(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> None:
-    """Disable a user: the name stays with what he did, his tokens and password stop working."""
+    """Disable a user: the name remains on the user's work; tokens and password no longer work."""
     require_administrator(tx.principal)
     change_user(tx, name, UserChange(disabled=True), expected_rev=expected_rev)
 
@@ -139,16 +139,16 @@ def _require_some_administrator(tx: Transaction) -> None:
 
 
 def stored_hash(tx: Transaction, name: str) -> str | None:
-    """Return the hash a password is checked against, None where nobody of this name can sign in with one."""
+    """Return the hash that a password is checked against, or None if no active user with a password has this name."""
     statement = select(user.c.password_hash).where(user.c.name == name, user.c.disabled.is_(False))
     found: str | None = tx.execute(statement).scalar()
     return found
 
 
 def verify_password(tx: Transaction, name: str, password: str) -> Principal:
-    """Who signs in with this name and password; run it as a read, it takes 0.1 s whether the user exists or not.
+    """Return the user who signs in with this name and password. Takes 0.1 s whether or not the user exists.
 
-    Raises `UnauthenticatedProblem`.
+    It only reads. Raises `UnauthenticatedProblem`.
     """
     row = tx.execute(select(user).where(user.c.name == name, user.c.disabled.is_(False))).first()
     if not passwords.password_matches(password, None if row is None else row.password_hash) or row is None:
@@ -162,7 +162,7 @@ def _principal(row: Row[Any]) -> Principal:
 
 
 def ensure_first_administrator(tx: Transaction) -> User | None:
-    """Create the user `admin` in a database without users; return None if there are users."""
+    """Create the user `admin` if the database has no users; otherwise return None."""
     tx.lock(_ADMINISTRATORS)
     if tx.execute(select(user.c.id).limit(1)).first() is not None:
         return None
@@ -170,9 +170,9 @@ def ensure_first_administrator(tx: Transaction) -> User | None:
 
 
 def administrator_principal(tx: Transaction, name: str | None = None) -> Principal:
-    """Return an administrator by name, or the first one; for callers with direct access to the database.
+    """Return an administrator by name, or the first one, for callers with direct access to the database.
 
-    Raises `NotFoundProblem` where no such administrator is active; one always is.
+    Raises `NotFoundProblem` if no active administrator has that name; without a name, one always exists.
     """
     administrators = select(user).where(user.c.administrator.is_(True), user.c.disabled.is_(False))
     if name is not None:
@@ -187,12 +187,12 @@ def administrator_principal(tx: Transaction, name: str | None = None) -> Princip
 
 
 def is_administrator(principal: Principal) -> bool:
-    """Return whether the caller administrates the server, with a credential that reaches so far."""
+    """Return whether the caller is an administrator and the credential has the scope for it."""
     return principal.administrator and scopes.allows(principal.scopes, "admin")
 
 
 def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
-    """Raise `ForbiddenProblem` (or `hidden`) unless the caller administrates the server."""
+    """Raise `ForbiddenProblem` (or `hidden`) unless the caller is an administrator with the scope for it."""
     if is_administrator(principal):
         return
     if principal.kind == "anonymous":

@@ -1,7 +1,6 @@
-"""Wakes request handlers of this process that wait for an event, such as the end of a job.
+"""Wake-ups for request handlers of this process that wait for an event, such as the end of a job.
 
-A wake-up is a hint: the handler reads the database again. Changes by other processes are found by polling from time
-to time.
+A wake-up is only a hint: the handler then reads the database. Changes by other processes are found by polling.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from contextlib import contextmanager
 
 
 class Wakeups:
-    """Topics that threads announce and coroutines await."""
+    """Topics announced by threads and awaited by coroutines."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -21,7 +20,7 @@ class Wakeups:
 
     @contextmanager
     def listen(self, topics: Iterable[str]) -> Iterator[Listener]:
-        """Hear of `topics` from now on. Listen first and look second, so that nothing falls between."""
+        """Listen to `topics` from now on. Call it before reading the database, so that no change is missed."""
         listener = Listener(asyncio.get_running_loop())
         topics = frozenset(topics)
         with self._lock:
@@ -38,35 +37,35 @@ class Wakeups:
                         del self._listeners[topic]
 
     def announce(self, topics: Iterable[str]) -> None:
-        """Wake everybody who listens to any of `topics`. May be called from any thread."""
+        """Wake every listener to any of `topics`; may be called from any thread."""
         with self._lock:
             woken = {listener for topic in topics for listener in self._listeners.get(topic, ())}
         for listener in woken:
             listener.wake()
 
     def wake_everybody(self) -> None:
-        """Wake every listener: the server is about to stop."""
+        """Wake every listener because the server is about to stop."""
         with self._lock:
             topics = list(self._listeners)
         self.announce(topics)
 
 
 class Listener:
-    """A waiting coroutine and the topics that wake it."""
+    """Waiting coroutine and the topics that wake it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._event = asyncio.Event()
 
     def wake(self) -> None:
-        """Let `wait` return; from any thread."""
+        """Make `wait` return; may be called from any thread."""
         try:
             self._loop.call_soon_threadsafe(self._event.set)
         except RuntimeError:  # the loop has ended, and with it whoever waited
             return
 
     async def wait(self, timeout_s: float) -> bool:
-        """Wait for a wake-up, at most `timeout_s`; whether there was one."""
+        """Wait for a wake-up for at most `timeout_s`; return whether there was one."""
         try:
             await asyncio.wait_for(self._event.wait(), timeout_s)
         except TimeoutError:
@@ -76,4 +75,4 @@ class Listener:
 
 
 wakeups = Wakeups()
-"""Of this process. Topics: `work:<kind>` when a job of the kind can be claimed, `job:<id>` when a job has ended."""
+"""Wake-ups of this process. `work:<kind>`: a job of the kind can be claimed; `job:<id>`: a job has ended."""

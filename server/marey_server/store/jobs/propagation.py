@@ -23,7 +23,7 @@ from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import Transaction
 
 PAGE = 1000
-"""Ended jobs per statement."""
+"""Greatest number of ended jobs in one statement."""
 
 
 def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
@@ -39,8 +39,7 @@ def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
     """Queue waiting jobs whose dependencies have succeeded, start their tasks, or give them a cached result.
 
-    Jobs with late inputs get these first.
-    The rows hold `READY_COLUMNS`. Returns the jobs that ended by it.
+    Late inputs of the jobs are pinned first. The rows hold `READY_COLUMNS`. Returns the jobs that end here.
     """
     ended = late_inputs.pin_late_inputs(tx, [row.id for row in rows if row.unbound])
     for row in rows:
@@ -95,7 +94,7 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Count ended dependencies at waiting jobs; make jobs ready, or end those that can no longer run."""
+    """Count ended dependencies of waiting jobs; make jobs ready, or end those that can no longer run."""
     following: list[Ended] = []
     left: dict[str, int] = {}
     shared: list[Row[Any]] = []
@@ -122,7 +121,9 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 
 
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job and its tasks because `cause` did not succeed: failed, or cancelled if it is to be skipped."""
+    """End a waiting job and its tasks because `cause` did not succeed: as failed, or as cancelled if it is to be
+    skipped.
+    """
     waits = and_(job.c.id == row.id, job.c.state == WAITING)
     tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
     if row.on_failure == "skip":
@@ -164,7 +165,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel tasks that have not started, if a worker was to gather: after one failure there is nothing to gather."""
+    """Cancel tasks that have not started, if a worker would gather them: after a failure nothing is gathered."""
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)

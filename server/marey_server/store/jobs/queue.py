@@ -48,9 +48,9 @@ from marey_server.store.transaction import Transaction
 
 
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
-    """Give the caller up to `request.max` queued jobs, best first, each under a new fence.
+    """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
-    Raises `ForbiddenProblem` for a caller that may not work, `InvalidProblem` for another version of the protocol.
+    Raises `ForbiddenProblem` if the caller may not work, and `InvalidProblem` for another version of the protocol.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
@@ -87,9 +87,10 @@ _INSERT_ATTEMPT = Prepared(insert(attempt))
 def heartbeat(
     tx: Transaction, job_id: str, fence: int, request: Heartbeat, policy: QueuePolicy = DEFAULT_POLICY
 ) -> HeartbeatAnswer:
-    """Extend the lease, even an expired one that was not reclaimed, up to the grace period of a cancel or time limit.
+    """Extend a lease, up to the end of the grace period of a cancellation or time limit.
 
-    Raises `LeaseLostProblem` if the attempt does not hold the job any more.
+    An expired lease is extended, too, unless the job was reclaimed. Raises `LeaseLostProblem` if the attempt no longer
+    holds the job.
     """
     require_attempt(tx.principal, job_id, fence)
     values: dict[str, Any] = {
@@ -112,7 +113,7 @@ def heartbeat(
 
 
 def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
-    """Pick jobs and claim them."""
+    """Return the statement that picks jobs and claims them."""
     pick = _pick(restriction)
     now_us = bindparam("now_us", type_=BigInteger)
     deadline_us = now_us + cast(job.c.time_limit_s, BigInteger) * SECOND_US
@@ -152,7 +153,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
 
 
 def _pick(restriction: _Restriction) -> CTE:
-    """Return the ids to claim; of jobs with one concurrency key only the first, and none while one runs."""
+    """Return the query for ids to claim: of jobs with one concurrency key the first, and none while one is running."""
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
         conditions = [
@@ -193,7 +194,7 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
     """Return the condition that the caller may work for the job's project, whose data a worker reads and writes.
 
-    Asked row by row, so that no plan begins with the projects instead of the pick order.
+    It is evaluated for each row, so that no query plan starts with the projects instead of the order of the queue.
     """
     conditions = [project.c.id == candidate.c.project_id, project.c.deleted_us.is_(None)]
     if restriction.named_projects:
@@ -206,7 +207,7 @@ def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElem
 
 
 class _Restriction(NamedTuple):
-    """Limits of a claim besides kinds and labels."""
+    """Limits of a claim, apart from kinds and labels."""
 
     one_job: bool
     named_projects: bool
@@ -246,7 +247,7 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:
-    """Return the number of tasks of the gathering jobs that these belong to."""
+    """Return the number of tasks of each job to which the given tasks belong."""
     parents = {row.parent_id for row in rows if row.parent_id is not None}
     if not parents:
         return {}

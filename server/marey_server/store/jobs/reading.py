@@ -1,4 +1,4 @@
-"""Reads, lists and cancels jobs for their users."""
+"""Reading, listing and cancelling of jobs by users."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
 
 @dataclass(frozen=True, slots=True)
 class JobFilters:
-    """Filters of a list of jobs; an empty one matches every job."""
+    """Filters of a list of jobs; empty filters match every job."""
 
     states: tuple[JobState, ...] = ()
     kinds: tuple[str, ...] = ()
     parent: str | None = None
-    """Lists the tasks of this gathering job; without it, tasks are omitted."""
+    """Id of the gathering job whose tasks are listed; without it, tasks are omitted."""
     author: str | None = None
 
 
@@ -79,7 +79,7 @@ def list_jobs(
 
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:
-    """Return the attempts of a job, the first one first."""
+    """Return the attempts of a job in the order of their start."""
     find_job(tx, job_id)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
     return Page(items=tuple(_attempt_document(row) for row in rows))
@@ -98,7 +98,7 @@ def _attempt_document(row: Row[Any]) -> Attempt:
 
 
 def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """Return the outputs of a job, or of its tasks in their order."""
+    """Return the outputs of a job, or of its tasks in the order of the tasks."""
     row, _ = find_job(tx, job_id)
     if row.size is None or row.gathers:
         return Page(items=tuple(JobOutput(**output) for output in row.outputs or ()))
@@ -110,7 +110,7 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 
 def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """Return the results of the tasks of a gathering job, in their order; empty for other jobs."""
+    """Return the results of the tasks of a gathering job in the order of the tasks; empty for other jobs."""
     find_job(tx, job_id)
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
@@ -126,7 +126,7 @@ def list_job_events(tx: Transaction, job_id: str, after: int = 0, limit: int = 1
 
 
 def read_job_log(tx: Transaction, job_id: str, offset: int = 0, limit: int = MOST_READ_BYTES) -> LogPage:
-    """Return a piece of a job's log, for members of its project."""
+    """Return a page of a job's log, for members of its project."""
     row, _ = find_job(tx, job_id)
     return read_log(tx, row, offset, limit)
 
@@ -150,10 +150,10 @@ def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool
 
 
 def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
-    """Cancel a job: at once if it does not run, else when its worker stops or the grace period ends.
+    """Cancel a job: at once if it is not running, else when its worker stops or the grace period ends.
 
-    A gathering job is cancelled with its tasks. Cancelling twice is cancelling once.
-    Raises `ConflictProblem` for a job that has succeeded or failed, `ForbiddenProblem` for somebody else's job.
+    A gathering job is cancelled with its tasks. A repeated cancellation has no effect. Raises `ConflictProblem` for a
+    job that has succeeded or failed, and `ForbiddenProblem` for a job of another user.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "cancel")
@@ -172,8 +172,8 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
 def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) -> Sequence[Row[Any]]:
     """Cancel the jobs that have not ended, in one statement, and return them in their new states.
 
-    A running job's time is over with the cancellation, so that its lease cannot outlive the grace. A gathering job has
-    no lease while its tasks are at work, and ends with them.
+    The time limit of a running job is set to now, so that its lease cannot be extended beyond the grace period. A
+    gathering job has no lease while its tasks are running, and ends when they have ended.
     """
     running = job.c.state == RUNNING
     leased = and_(running, job.c.lease_expires_us.is_not(None))

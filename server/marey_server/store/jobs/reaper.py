@@ -1,4 +1,4 @@
-"""Reclaims jobs whose lease expired: from dead workers, and from workers that did not stop in time."""
+"""Reclaims jobs with an expired lease, from dead workers and from workers that did not stop in time."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ PAGE = 256
 class StartGrace:
     """Delay of the reaper by one lease after this process started or the database was unreachable.
 
-    Leases run out while nobody can renew them; those who live renew them in this time. A jump of the clock counts as an
-    absence too, and so does a long write that all others waited for: a lease has what a heartbeat leaves of it.
+    Leases expire while nobody can renew them; during the delay, live workers renew theirs. A jump of the clock has the
+    same effect as an interruption, and so has a long write that blocked all others and thus heartbeats.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
@@ -66,10 +66,10 @@ def reap_page(
     after: tuple[int, str] | None = None,
     limit: int = PAGE,
 ) -> ReapedPage:
-    """Reclaim up to `limit` jobs from `after` on, the longest overdue first.
+    """Reclaim up to `limit` jobs after the position `after`, the longest overdue first.
 
-    Each is moved by an update of its own that repeats fence and overdue lease, so that a heartbeat or a result which
-    comes at the same moment either wins or finds the lease gone. One that cannot be moved keeps no other from it.
+    Each job has its own UPDATE, conditional on fence and expired lease, so that a concurrent heartbeat or result either
+    is accepted or finds the lease lost. A job that cannot be reclaimed does not keep others from it.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = (
@@ -114,7 +114,7 @@ def claim_after_reaping(
 
 
 def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
-    """Shorten leases and waits that end too late because the clock of the database was set back."""
+    """Shorten leases and waits that end too late after the clock of the database was set back."""
     latest_us = tx.now_us + policy.lease_ttl_us
     leases = tx.execute(
         update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)
@@ -127,7 +127,7 @@ def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
 
 
 def share_waiting(tx: Transaction) -> int:
-    """Give waiting jobs the shared results that exist by now; return their number."""
+    """Give waiting jobs the shared results that now exist; return the number of these jobs."""
     ended = result_cache.share_waiting(tx)
     propagate_ends(tx, ended)
     return len(ended)

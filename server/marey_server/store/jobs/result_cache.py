@@ -1,10 +1,10 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
-Jobs are identical when kind, version of the kind, parameters, seed and inputs are; an input counts with its item, its
-name, its place and the content of those of its documents that the kind reads, since results are named after inputs and
-refer to them. A kind declares what counts besides: the place of the results, the newest revision of an item that the
-parameters name. Jobs that go by how things are while they run have no key. Results are published again for each job,
-into the collection it names. Caching stays within a project.
+Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. An input counts with its item,
+its name, its path and the content of the documents that the kind reads, because results are named after inputs and
+refer to them. A kind declares further conditions: the place of the results, or the newest revision of an item that the
+parameters name. Jobs whose result depends on data read while they run have no key. Results are published again for each
+job, into its own collection. The cache is limited to one project.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from marey_server.store.tables import job, job_dependency, revision_part
 from marey_server.store.transaction import Transaction
 
 SHARED_AT_ONCE = 64
-"""Largest number of jobs that get a cached result within their submission; the leader serves the others."""
+"""Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
 
 MOST_SHARED_OUTPUTS = 256
-"""Largest number of outputs published for them in one transaction; a job with more is published whole."""
+"""Greatest number of outputs published from the cache in one transaction; a single job may exceed it."""
 
 IN_LIST = 1000
 
 
 class SharedResult(NamedTuple):
-    """A job whose result another job shares."""
+    """Job whose result another job shares."""
 
     id: str
     finished: bool
@@ -57,8 +57,10 @@ def cache_key(
     into: str = "",
     newest: Mapping[str, int] = MappingProxyType({}),
 ) -> str:
-    """The name of a computation. `inputs` as `input_contents` has them; `task` is which of how many has them; `into`
-    is where the results go; `newest` holds the newest revisions of `named_items`.
+    """Return the digest that identifies a computation.
+
+    `inputs` is the result of `input_contents`; `task` is the index of a task and the number of tasks; `into` is the
+    collection of the results; `newest` holds the newest revisions of `named_items`.
     """
     tree = {"kind": kind.code_version, "params": params, "seed": seed, "inputs": inputs}
     if task is not None:
@@ -80,7 +82,7 @@ def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection
 
 
 def named_items(kind: KindDeclaration, params: Mapping[str, Any]) -> list[str]:
-    """Return the ids of items that the parameters name and whose newest revisions are read."""
+    """Return the ids of items that the parameters name and whose newest revisions the job reads."""
     return [params[name] for name in kind.newest_of if params.get(name)]
 
 
@@ -114,10 +116,11 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 
 
 def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
-    """For each of `candidates` (`id, project_id, cache_key, cache_mode`) whose result is there or under way: whose.
+    """Return the job whose result each of `candidates` (`id, project_id, cache_key, cache_mode`) can share.
 
-    Of several identical candidates the first computes and the others share. Submissions to one project that use the
-    cache decide one after another; sources are locked, so that none ends unnoticed.
+    Candidates without such a job are omitted. Of several identical candidates, the first computes the result and the
+    others share it. Submissions to one project that use the cache decide one after another; the jobs with the results
+    are locked, so that their end is not missed.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -137,7 +140,7 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
 
 
 def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """Return the newest finished job of each key, else the oldest unfinished one."""
+    """Return the newest finished job of each key, or else the oldest unfinished one."""
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
@@ -168,7 +171,7 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 
 
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
-    """Let waiting jobs (`id`) share the results of their sources, now or when these finish."""
+    """Let waiting jobs (`id`) share the results of their sources, now or when the sources finish."""
     if not joining:
         return []
     for row, source in joining:
@@ -184,8 +187,10 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[E
 
 
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
-    """Give waiting jobs (`id`) the results of the finished jobs in their `cached_from`; what is too much at once waits
-    for the leader. A job whose result is no longer stored, or cannot be published for it, is queued instead.
+    """Give waiting jobs (`id`) the results of the finished jobs in their `cached_from`, up to a limit of outputs.
+
+    The leading process serves the remaining jobs later. A job whose result is no longer stored, or cannot be published
+    for it, is queued instead.
     """
     ended: list[Ended] = []
     for row in rows[:SHARED_AT_ONCE]:
@@ -196,7 +201,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give up to `SHARED_AT_ONCE` waiting jobs the results that exist by now."""
+    """Give up to `SHARED_AT_ONCE` waiting jobs the results that now exist."""
     source = job.alias("source")
     rows = tx.execute(
         select(job.c.id)
@@ -210,8 +215,9 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for. Where that cannot be its own, it is computed after all: what only this job
-    is refused must stop neither the one that brings the result nor others that wait for it.
+    """Give one job the result it waits for, or queue it if the result cannot be published for it.
+
+    A refusal that concerns this job must not affect the job that computed the result, or others that wait for it.
     """
     try:
         with tx.connection.begin_nested():
@@ -224,8 +230,9 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the result that a job waits for as its own; nothing if it is no longer stored. Raises what `publish`
-    raises.
+    """Publish the shared result of a waiting job as its own; return no end if the result is no longer stored.
+
+    Raises the errors of `publish`.
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
@@ -263,7 +270,7 @@ def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _compute_again(tx: Transaction, job_id: str) -> None:
-    """Queue a job that waited to share a result, and drop its dependency on the job that was to bring it."""
+    """Queue a job that waited to share a result, and remove its dependency on the job with that result."""
     row = tx.execute(select(job.c.kind, job.c.cached_from).where(job.c.id == job_id)).one()
     waited = and_(job_dependency.c.job_id == job_id, job_dependency.c.on_job_id == row.cached_from)
     tx.execute(delete(job_dependency).where(waited))

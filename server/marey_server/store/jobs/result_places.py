@@ -1,6 +1,6 @@
-"""Places of results, checked before a job is queued, as far as nothing has to be computed.
+"""Places of results: checks before a job is queued that do not need its results.
 
-The worker looks again, clip by clip; but each task of a job sees its own share of the inputs only.
+The worker checks again for each clip, but each task of a job knows only its own share of the inputs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from marey_server.store.jobs.inputs import Pin, PinnedInputs
 
 
 class Clash(NamedTuple):
-    """A clash of result places; `place` is the field of the submission that causes it."""
+    """Conflict between the places of results; `place` is the field of the submission that causes it."""
 
     place: str
     code: str
@@ -24,7 +24,7 @@ class Clash(NamedTuple):
 
 
 def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str) -> Clash | None:
-    """Return the clash among the places of a job's results, or None; late inputs are not checked."""
+    """Return a conflict among the places of a job's results, or None; late inputs are not checked."""
     unclear = kind.unclear_place(params, into) if kind.unclear_place is not None else None
     if unclear is not None:
         return Clash("/into", "ambiguous-place", f"It is not clear where results should go: {unclear}.")
@@ -37,7 +37,7 @@ def find_clash(kind: KindDeclaration, params: Any, pins: PinnedInputs, into: str
 
 
 def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str, str] | None:
-    """Check results of many inputs, which lie below `into` as their inputs lie in the project."""
+    """Return the conflict if the path of a result of many inputs, below `into`, would be too long."""
     kept = [pin for name, spec in kind.inputs.items() if spec.many for pin in pins.get(name, ()) if "job" not in pin]
     for folder in sorted({"", *map(_folder, kept)}) if into else ():
         try:
@@ -59,7 +59,7 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
 def _over_another_input(
     kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
 ) -> tuple[str, str] | None:
-    """Return the first result that would become a revision of another input of the same job."""
+    """Return the conflict if a result would become a revision of another input of the same job."""
     named = pins.get(kind.named_after or "", [])
     if kind.in_place is not None and getattr(params, kind.in_place):
         return None
@@ -82,10 +82,10 @@ def _over_another_input(
 
 
 def _folder(pin: Pin) -> str:
-    """Return the place of an input's result below `into`."""
+    """Return the folder of an input's result below `into`."""
     return str(pin.get("below", pin["collection"]))
 
 
 def _path(*names: str) -> str:
-    """Join the names that are not empty."""
+    """Join the names that are not empty to a path."""
     return "/".join(filter(None, names))

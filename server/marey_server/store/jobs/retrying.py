@@ -1,4 +1,4 @@
-"""Retries of jobs that did not succeed, with their unsuccessful dependencies and the jobs that failed with them."""
+"""Retries of jobs without success, of their unsuccessful dependencies, and of dependants that ended with them."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ UNSUCCESSFUL = ("failed", "cancelled")
 
 
 def retry_job(tx: Transaction, job_id: str) -> Job:
-    """Submit a failed or cancelled job again, with the inputs it had, or to get them where it never had any; what its
-    tasks brought is not computed twice.
+    """Submit a failed or cancelled job again, and return the new job; results of its tasks are used again.
 
-    Jobs it needs that did not succeed are tried again before it, and those that ended only because it did not succeed
-    after it, as far as the caller may: the rest of a pipeline goes on. The answer is the job that takes its place.
-    Raises `ConflictProblem` for a job that has not ended or has succeeded, and for a task.
+    The new job has the same inputs; inputs that were never available are late inputs again. Unsuccessful dependencies
+    are retried before it, and dependants that ended only because of this job are retried after it, so that the rest of
+    a pipeline continues. Jobs that the caller may not retry are left out. Raises `ConflictProblem` for a task, and for
+    a job that has not ended or has succeeded.
     """
     row, project = find_job(tx, job_id)
     require_own(tx, row, project, "retry")
@@ -50,7 +50,7 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
 
 
 class _Family:
-    """Jobs that are retried together."""
+    """Set of jobs that are retried together."""
 
     def __init__(self, tx: Transaction, project: ProjectRow) -> None:
         self._tx = tx
@@ -71,7 +71,7 @@ class _Family:
             ids = [one for one, state in states.items() if state in UNSUCCESSFUL]
 
     def add_dependants(self) -> None:
-        """Add the jobs that ended because one of these did not succeed and lack nothing else, recursively."""
+        """Add the jobs that ended only because one of these did not succeed, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
             rows = {row.id: row for row in self._doomed_after(behind)}
@@ -151,7 +151,7 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the late inputs of a job that never got them, to be made by the retries."""
+    """Return the late inputs of a job that were never pinned, to be produced by the retries."""
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
         for name, entries in row.inputs.items()
@@ -159,7 +159,7 @@ def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
 
 
 def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
-    """Return the inputs of a job; a gathering job has them in its tasks."""
+    """Return the inputs of a job; for a gathering job, those of its tasks."""
     if row.size is None or fanned is None:
         return dict(row.inputs)
     statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
@@ -168,7 +168,7 @@ def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs
 
 
 def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
-    """Return the labels key of a job, or of a gathering job's tasks."""
+    """Return the concurrency key of a job, or of a gathering job's tasks."""
     key: str | None = row.concurrency_key
     if row.size is not None:
         key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
@@ -189,9 +189,7 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """The jobs that each of these came after, and the latest try of each. Whom a job shared a result with, it did not
-    need.
-    """
+    """Return the dependencies of each job and the newest retry of each; a job with a shared result is no dependency."""
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
     for row in _select_in(tx, statement, job_dependency.c.job_id, rows):
@@ -216,9 +214,9 @@ def _latest_tries(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 def _select_in(
     tx: Transaction, statement: Select[Any], column: ColumnElement[str], values: Iterable[str]
 ) -> Iterator[Row[Any]]:
-    """The rows whose `column` is among `values`, however many those are; in the order of the statement, page by page.
+    """Select the rows whose `column` is among `values`, page by page, in the order of the statement.
 
-    A thousand jobs may come after a thousand others each, and databases take only so many parameters.
+    A thousand jobs may each depend on a thousand others, and databases limit the parameters of a statement.
     """
     wanted = sorted(set(values))
     for start in range(0, len(wanted), IN_LIST):

@@ -1,4 +1,4 @@
-"""Outputs of an attempt: staged while it runs, published when it completes."""
+"""Staging of outputs during an attempt, and their publication when it completes."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ IN_LIST = 1000
 _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 StagedDraft = dict[str, Any]
-"""A stored draft: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
+"""Stored draft: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
 
 
 @dataclass(frozen=True, slots=True)
 class PreparedOutput:
-    """A staged output with checked and encoded documents."""
+    """Staged output with checked and encoded documents."""
 
     output: StagedOutput
     parts: Mapping[str, PreparedDocument]
 
 
 def prepare_output(output: StagedOutput) -> PreparedOutput:
-    """Check and encode the documents of an output; raises `InvalidProblem`."""
+    """Check and encode the documents of an output. Raises `InvalidProblem`."""
     specs = PARTS[output.kind]
     unknown = [part for part in output.parts if part not in specs]
     if unknown:
@@ -58,7 +58,7 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
 def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
     """Store outputs until the attempt completes, replacing those of the same names; return their number.
 
-    Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are no inputs of
+    Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are not inputs of
     the job.
     """
     require_attempt(tx.principal, job_id, fence)
@@ -156,12 +156,12 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
-    """Delete the drafts of attempts (job id and fence) that did not succeed or whose results no other job can share."""
+    """Delete the drafts of attempts (job id and fence) that failed or whose results no other job can share."""
     tx.run(_DROP_STAGED, {"attempts": list(attempts)})
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
-    """Return the drafts of an identical job with our inputs as sources: equal content of the same items."""
+    """Return the drafts of an identical job with this job's inputs as sources: equal content of the same items."""
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
         for role, many in theirs.items()
@@ -233,9 +233,9 @@ def named_blobs(tree: Any) -> Iterator[str]:
 
 
 def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
-    """Protect the blobs that a job names from garbage collection; the caller must be allowed to read them.
+    """Protect the blobs that a job names from garbage collection.
 
-    Raises `ConflictProblem` (`missing-blobs`) for those he has not sent and may not read.
+    Raises `ConflictProblem` (`missing-blobs`) for blobs that the caller has not sent and may not read.
     """
     if not digests:
         return

@@ -38,7 +38,7 @@ _INSERT_JOB = Prepared(insert(job))
 
 
 class Upstream(NamedTuple):
-    """A job that others depend on."""
+    """Job that others depend on."""
 
     kind: str
     state: JobState
@@ -47,7 +47,7 @@ class Upstream(NamedTuple):
 def submit(tx: Transaction, project: str, requests: Sequence[JobCreate]) -> list[Job]:
     """Submit jobs to a project, all or none; return them in the order of the requests.
 
-    Raises `InvalidProblem` with a pointer to each fault, and what `require` raises.
+    Raises `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
     """
     row = require(tx, project)
     many = len(requests) > 1
@@ -62,7 +62,8 @@ def submit_at(
 ) -> list[Job]:
     """Submit the jobs of a request, as `submit` does.
 
-    `ids` are the ids of jobs to be, by the place that asks for them, where others of the jobs wait for those.
+    `ids` holds ids that are reserved for jobs of the request, by their position, because other jobs of it depend on
+    them.
     """
     known = find_items(tx, project, requests.values())
     made = {ids[at]: Upstream(one.kind, JobState.WAITING) for at, one in requests.items() if at in ids}
@@ -78,9 +79,9 @@ def submit_at(
 def submit_checked(
     tx: Transaction, project: ProjectRow, submissions: Sequence[Submission], upstream: Mapping[str, JobState]
 ) -> list[Job]:
-    """Insert the rows of checked jobs and queue those that wait for nothing.
+    """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
-    `upstream` holds the states of the jobs they come after, which must be locked; one that is among the submissions
+    `upstream` holds the states of the jobs they depend on, which must be locked; one that is among the submissions
     counts as waiting.
     """
     heads = [_head(project, one, upstream) for one in submissions]
@@ -155,9 +156,9 @@ def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
 def _lock_upstream(
     tx: Transaction, project: ProjectRow, requests: Mapping[str, JobCreate], to_be: Collection[str]
 ) -> dict[str, Upstream]:
-    """Return the dependencies that exist, locked so that none ends before the waiting jobs are inserted.
+    """Return the dependencies that exist, locked so that none ends before the dependent jobs are inserted.
 
-    Only jobs that exist, or come before in the same request, can be waited for, so that none can wait for itself.
+    A job can depend only on existing jobs and on earlier ones of the same request, so no circle is possible.
     """
     places = {
         place: one
@@ -176,7 +177,7 @@ def _lock_upstream(
 
 
 def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, Upstream]:
-    """Return the jobs that exist in the project, locked so that none ends before this transaction does."""
+    """Return the given jobs that exist in the project, locked so that none ends before this transaction does."""
     wanted = sorted(set(ids))
     found: dict[str, Upstream] = {}
     for start in range(0, len(wanted), IN_LIST):
@@ -191,7 +192,7 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
 
 
 def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
-    """Check that jobs which are to make an input are of a kind that can; jobs to be submitted are named as steps."""
+    """Check that jobs named as sources of an input have a kind that produces it; those of the request are steps."""
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind
         try:
@@ -232,9 +233,9 @@ def _insert_dependencies(tx: Transaction, submissions: Sequence[Submission], ups
 
 
 def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> Pipeline:
-    """Submit a job for each step. Those that work on what others make get their inputs when these have succeeded.
+    """Submit a job for each step; a step that reads outputs of others gets them when these have succeeded.
 
-    Raises `InvalidProblem` with a pointer to each fault, and what `require` raises.
+    Raises `InvalidProblem` with a pointer to each fault, and the errors of `projects.require`.
     """
     row = require(tx, project)
     try:
@@ -252,9 +253,7 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 
 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
-    """The job of a step whose results have one place to go to, as a tree's, without the collection that the pipeline
-    has for all.
-    """
+    """Return the job of a step, without the pipeline's collection if its results have a fixed place, as trees have."""
     if step.into is not None:
         return request
     try:
