@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import degrees
 from typing import Any
 
 import numpy as np
@@ -12,35 +13,57 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Row, time_in_turn
 from marey_motion.clip import Clip
-from marey_motion.editing.registry import NamedCommand, edit_clip
+from marey_motion.editing.registry import edit_clip
 from marey_motion.gait import generate_gait
+from marey_schemas.editing.commands import (
+    CloseLoop,
+    Concatenate,
+    Face,
+    FindContacts,
+    FixDrift,
+    FlipAxes,
+    Mirror,
+    MoveToGround,
+    MoveToOrigin,
+    Paste,
+    Resample,
+    Retime,
+    Rotate,
+    RotateJoint,
+    Scale,
+    Smooth,
+    Split,
+    Translate,
+    Trim,
+)
+from marey_schemas.editing.edits import AnyCommand
 
 FRAMES, RATE_HZ = 10_000, 60.0
 MOST_MS = 500
 """Longest response to a moved slider that feels immediate, for nearly three minutes of motion."""
 
 ARM = ("LeftArm", "LeftForeArm", "LeftHand")
-COMMANDS: tuple[NamedCommand, ...] = (
-    ("trim", {"start": 100}),
-    ("split", {"at": [2500, 5000, 7500]}),
-    ("concatenate", {"source": "run"}),
-    ("resample", {"frame_rate_hz": 45.0}),
-    ("retime", {"speed": 0.9}),
-    ("close_loop", {}),
-    ("translate", {"shift_m": (1.0, 0.0, 0.0)}),
-    ("rotate", {"angle_rad": 0.5}),
-    ("face", {}),
-    ("move_to_origin", {}),
-    ("scale", {"factor": 1.1}),
-    ("flip_axes", {"up": "+z", "forward": "-y"}),
-    ("fix_drift", {"shift_m": (0.3, 0.0, 0.1), "turn_rad": 0.2}),
-    ("move_to_ground", {}),
-    ("find_contacts", {}),
-    ("mirror", {}),
-    ("smooth", {}),
-    ("smooth", {"method": "gaussian"}),
-    ("rotate_joint", {"joint": "LeftArm", "axis": (0.0, 1.0, 0.0), "angle_rad": 0.3, "space": "world"}),
-    ("paste", {"source": "run", "joints": ARM}),
+COMMANDS: tuple[AnyCommand, ...] = (
+    Trim(start=100),
+    Split(at=[2500, 5000, 7500]),
+    Concatenate(source="run"),
+    Resample(frame_rate_hz=45.0),
+    Retime(speed=0.9),
+    CloseLoop(),
+    Translate(shift_m=(1.0, 0.0, 0.0)),
+    Rotate(angle_deg=degrees(0.5)),
+    Face(),
+    MoveToOrigin(),
+    Scale(factor=1.1),
+    FlipAxes(up="+z", forward="-y"),
+    FixDrift(shift_m=(0.3, 0.0, 0.1), turn_deg=degrees(0.2)),
+    MoveToGround(),
+    FindContacts(),
+    Mirror(),
+    Smooth(),
+    Smooth(method="gaussian"),
+    RotateJoint(joint="LeftArm", axis=(0.0, 1.0, 0.0), angle_deg=degrees(0.3), space="world"),
+    Paste(source="run", joints=ARM),
 )
 
 
@@ -52,14 +75,14 @@ def run() -> list[Row]:
     return [*rows, *(_beside(walk, *peer) for peer in _peers(walk))]
 
 
-def _edit(walk: Clip, *commands: NamedCommand, **sources: Clip) -> Clip:
+def _edit(walk: Clip, *commands: AnyCommand, **sources: Clip) -> Clip:
     return edit_clip(walk, commands, sources=sources)[0].clip
 
 
-def _alone(walk: Clip, run_clip: Clip, command: NamedCommand) -> Row:
+def _alone(walk: Clip, run_clip: Clip, command: AnyCommand) -> Row:
     (ours,) = time_in_turn(lambda: _edit(walk, command, run=run_clip), repeats=5)
-    name, given = command
-    told = f"{name} ({given['method']})" if "method" in given else name
+    given = isinstance(command, Smooth) and "method" in command.model_fields_set
+    told = f"{command.command} ({command.method})" if given else command.command
     return Row(
         f"edit: {told}",
         f"{walk.frame_count:,} frames x {walk.skeleton.joint_count} joints",
@@ -69,7 +92,7 @@ def _alone(walk: Clip, run_clip: Clip, command: NamedCommand) -> Row:
     )
 
 
-def _beside(walk: Clip, name: str, peer: str, command: NamedCommand, theirs: Callable[[], Any]) -> Row:
+def _beside(walk: Clip, name: str, peer: str, command: AnyCommand, theirs: Callable[[], Any]) -> Row:
     ours, other = time_in_turn(lambda: _edit(walk, command), theirs, repeats=5)
     ratio = other.median_s / ours.median_s
     return Row(
@@ -81,7 +104,7 @@ def _beside(walk: Clip, name: str, peer: str, command: NamedCommand, theirs: Cal
     )
 
 
-def _peers(walk: Clip) -> list[tuple[str, str, NamedCommand, Callable[[], Any]]]:
+def _peers(walk: Clip) -> list[tuple[str, str, AnyCommand, Callable[[], Any]]]:
     """Time the same with scipy, from and to single precision; edits that scipy does not have are left out.
 
     Its filter smooths components: it ignores sign changes of quaternions and does not keep the ends.
@@ -101,6 +124,6 @@ def _peers(walk: Clip) -> list[tuple[str, str, NamedCommand, Callable[[], Any]]]
         return means.astype(np.float32)
 
     return [
-        ("resample, cubic beside slerp", "scipy Slerp", ("resample", {"frame_rate_hz": 45.0}), slerped),
-        ("smooth", "scipy savgol_filter, normalised", ("smooth", {}), filtered),
+        ("resample, cubic beside slerp", "scipy Slerp", Resample(frame_rate_hz=45.0), slerped),
+        ("smooth", "scipy savgol_filter, normalised", Smooth(), filtered),
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -17,7 +16,6 @@ from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.documents import annotations as annotation_documents
 from marey_schemas.documents import clips, skeletons
 from marey_schemas.documents.references import OutputRef, RevisionRef
-from marey_schemas.editing.edits import EditDocument
 
 
 def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
@@ -270,36 +268,6 @@ def mapping_from_document(
         document.rig, dict(document.joints), document.confidence, document.method, tuple(document.notes)
     )
     return mapping, axes
-
-
-def commands_of_edit(edit: EditDocument) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Convert an edit to the names and parameters that `editing.registry` takes.
-
-    Parameters
-    ----------
-    edit : EditDocument    the document; its angles are in degrees
-
-    Returns
-    -------
-    tuple of (str, dict)    name and parameters of each command; angles in radians, `_rad` in place of `_deg`
-    """
-    trees = (command.model_dump() for command in edit.commands)
-    return tuple((str(tree.pop("command")), _in_radians(tree)) for tree in trees)
-
-
-def _in_radians(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return dict(_angle_in_radians(name, value) for name, value in tree.items())
-    if isinstance(tree, tuple | list):
-        return tuple(map(_in_radians, tree))
-    return tree
-
-
-def _angle_in_radians(name: str, value: Any) -> tuple[str, Any]:
-    if not name.endswith("_deg"):
-        return name, _in_radians(value)
-    angles = tuple(map(math.radians, value)) if isinstance(value, tuple | list) else value
-    return f"{name.removesuffix('_deg')}_rad", math.radians(angles) if isinstance(angles, float | int) else angles
 
 
 def _orthonormal(joint: str, axes: skeletons.JointAxesDocument) -> JointAxes:

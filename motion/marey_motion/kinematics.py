@@ -17,8 +17,8 @@ from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.contacts import TOE_SPEED_M_S
 
-CONTACT_SPEED_M_S = 0.15
 CONTACT_WINDOW_S = 0.1
 # A sideways axis shorter than this on the ground belongs to a body lying on its side and says nothing of its heading.
 SHORTEST_LATERAL_M = 1e-3
@@ -342,7 +342,7 @@ def foot_contacts(
     toes: AnyFloats,
     frame_rate_hz: float,
     *,
-    speed_limit_m_s: float = CONTACT_SPEED_M_S,
+    speed_limit_m_s: float = TOE_SPEED_M_S,
     window_s: float = CONTACT_WINDOW_S,
 ) -> NDArray[np.bool_]:
     """Detect which feet touch the ground.

@@ -15,6 +15,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,11 +154,11 @@ def _read(clip: Clip) -> None:
 def _edit(clip: Clip) -> None:
     """Constrain a wrist by every solver and plant the feet."""
     from marey_motion.editing.registry import edit_clip
+    from marey_schemas.editing.constraints import Constrain, PlantFeet, PositionConstraint, Solver
 
-    wrist = {"kind": "position", "joint": "left_wrist", "frames": (10, 12), "shift_m": (0.0, 0.05, 0.0)}
-    solvers = ("ccd", "two_bone", "least_squares")
-    constraining = [("constrain", {"constraints": (wrist,), "solver": solver}) for solver in solvers]
-    edit_clip(clip, [*constraining, ("plant_feet", {})])
+    wrist = PositionConstraint(joint="left_wrist", frames=(10, 12), shift_m=(0.0, 0.05, 0.0))
+    constraining = [Constrain(constraints=(wrist,), solver=solver) for solver in get_args(Solver)]
+    edit_clip(clip, [*constraining, PlantFeet()])
 
 
 def _match(clip: Clip) -> None:

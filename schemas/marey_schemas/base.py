@@ -1,6 +1,6 @@
 """Base classes of requests, answers and options."""
 
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict
 
@@ -36,3 +36,21 @@ class Options(Request):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other values, which are validated."""
         return type(self)(**{**dict(self), **changes})
+
+
+def _require_tag(schema: dict[str, Any], model: type[Any]) -> None:
+    schema["required"] = list(dict.fromkeys((model.tag, *schema.get("required", ()))))
+
+
+class Tagged(Options):
+    """Options of one of several classes that the value of a field, their tag, distinguishes.
+
+    Documents must contain the tag. In Python it is the default of its class.
+    """
+
+    model_config = ConfigDict(json_schema_extra=_require_tag)
+    tag: ClassVar[str]
+
+    def model_post_init(self, _context: Any) -> None:
+        """Count the tag as given, so that documents without defaults contain it."""
+        self.model_fields_set.add(self.tag)

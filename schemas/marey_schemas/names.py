@@ -31,7 +31,9 @@ Message = Annotated[str, StringConstraints(max_length=2000)]
 
 JointName = Annotated[str, StringConstraints(min_length=1, max_length=1024)]
 
-Label = Annotated[str, StringConstraints(min_length=1, max_length=255)]
+MAX_LABEL_LENGTH = 255
+
+Label = Annotated[str, StringConstraints(min_length=1, max_length=MAX_LABEL_LENGTH)]
 
 LayerName = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^/\x00-\x1f\x7f]+$")]
 

@@ -12,5 +12,6 @@ def test_each_command_that_travels_says_what_the_function_of_its_name_takes():
     travelling = {get_args(model.model_fields["command"].annotation)[0]: model for model in models}
     assert travelling.keys() == COMMANDS.keys()
     for name, model in travelling.items():
-        wanted = set(inspect.signature(COMMANDS[name]).parameters) - {"layer"}
-        assert set(model.model_fields) - {"command"} == wanted
+        _layer, *parameters = inspect.signature(COMMANDS[name]).parameters.values()
+        assert set(model.model_fields) - {"command"} == {one.name for one in parameters}
+        assert all(one.default is inspect.Parameter.empty for one in parameters)

@@ -1,5 +1,6 @@
 """Previews of edits over HTTP: what a job would make, and a precise answer where it could make nothing."""
 
+from math import degrees
 from typing import Any
 
 import httpx
@@ -16,6 +17,7 @@ from marey_motion.kinematics import global_positions
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.access import ProjectChange, Role, Visibility
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.editing.commands import Face, Smooth
 from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
 from marey_server.motions import previewing
 
@@ -74,7 +76,7 @@ def test_frames_of_the_edited_motion_come_in_any_media_type(
     )
     assert answer.status_code == 200, answer.text
     shown = decode_tree(answer.content, media_type)
-    edited = apply_edit(walk, [("smooth", {}), ("face", {"heading_rad": np.pi / 2})])
+    edited = apply_edit(walk, [Smooth(), Face(heading_deg=degrees(np.pi / 2))])
     assert (shown["frame_count"], list(shown["frames"]), shown["pieces"]) == (walk.frame_count, [30, 50], 1)
     assert np.array_equal(shown["motion"]["poses"], edited.poses[30:50])
     assert np.array_equal(shown["positions"], global_positions(edited.sliced(30, 50)))

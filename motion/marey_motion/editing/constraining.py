@@ -15,7 +15,7 @@ from marey_motion import kinematics, quaternions
 from marey_motion.arrays import Floats, Ints
 from marey_motion.editing.compute_budget import PER_MEETING, PER_MET_NUMBER, ComputeBudget
 from marey_motion.editing.displacement import displace, windows_around
-from marey_motion.editing.inverse_kinematics.solving import Solver, TwoBoneLimb, limb_targets, measure_residuals, solve
+from marey_motion.editing.inverse_kinematics.solving import TwoBoneLimb, limb_targets, measure_residuals, solve
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     LookAtTarget,
@@ -27,6 +27,7 @@ from marey_motion.editing.inverse_kinematics.targets import (
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import Solver
 
 # Rounds in which constraints of different ranges are met in turn, and the metres or radians that they may still be
 # missed by to end them.

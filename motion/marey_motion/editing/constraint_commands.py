@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
+from math import radians
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,9 @@ from numpy.typing import NDArray
 
 from marey_motion.editing.compute_budget import PER_NUMBER, PER_PLANTED_NUMBER, PER_RIG
 from marey_motion.editing.constraining import Constraint, constrain_motion, current_values
-from marey_motion.editing.foot_plants import Foot, FootContacts, PlantOptions, find_contacts
+from marey_motion.editing.foot_plants import Foot, FootContacts, find_contacts
 from marey_motion.editing.foot_plants import plant_feet as plant
-from marey_motion.editing.inverse_kinematics.solving import Solver, limb_ending_at
+from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import (
     Freedom,
     JointLimit,
@@ -24,37 +26,30 @@ from marey_motion.editing.inverse_kinematics.targets import (
     chain_of,
 )
 from marey_motion.editing.take import EditFinding, Take
-from marey_motion.errors import EditError, MappingError, MotionError
+from marey_motion.errors import MappingError, MotionError
 from marey_motion.rigs import JointAxes, guess_axes
-
-Tree = Mapping[str, Any]
+from marey_schemas.editing.constraints import (
+    AnyConstraint,
+    AnyLimit,
+    Constrain,
+    HingeLimit,
+    LookAtConstraint,
+    OrientationConstraint,
+    PlantFeet,
+)
 
 _OPTIONS = SolverOptions()
 # Joints that look with their front; others point along their bone.
 _LOOKING = ("pelvis", "spine", "spine_1", "spine_2", "neck", "head")
 
 
-def constrain(
-    take: Take,
-    *,
-    constraints: Sequence[Tree],
-    solver: Solver = "auto",
-    blend_s: float = 0.3,
-    root_moves: bool = False,
-    limits: Sequence[Tree] = (),
-    stiffness: Mapping[str, float] | None = None,
-) -> Take:
+def constrain(take: Take, command: Constrain) -> Take:
     """Meet constraints in ranges of frames, and record their errors before and after.
 
     Parameters
     ----------
     take : Take    F frames
-    constraints : sequence of trees    as in `marey_schemas.editing.constraints`, with radians
-    solver : str    "auto", "ccd", "two_bone" or "least_squares"
-    blend_s : float    seconds before and after the constrained frames that may change
-    root_moves : bool    whether the root may move
-    limits : sequence of trees    limits of joints, with radians
-    stiffness : mapping of str to float, optional    by joint name, 0 (free) to below 1
+    command : Constrain    constraints, solver, blend, limits and stiffness of joints
 
     Returns
     -------
@@ -68,43 +63,32 @@ def constrain(
     """
     take.budget.spend(PER_RIG)
     rig = _Rig(take)
-    wanted = [_named(number, _constraint, rig, tree) for number, tree in enumerate(constraints)]
+    wanted = [_named(number, _constraint, rig, one) for number, one in enumerate(command.constraints)]
     freedom = Freedom(
-        root_moves=root_moves,
-        limits={rig.joint(tree["joint"]): _limit(rig, tree) for tree in limits},
-        stiffness={rig.joint(name): value for name, value in (stiffness or {}).items()},
+        root_moves=command.root_moves,
+        limits={rig.joint(one.joint): _limit(rig, one) for one in command.limits},
+        stiffness={rig.joint(name): value for name, value in command.stiffness.items()},
     )
     made = constrain_motion(
-        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(blend_s), freedom=freedom, solver=solver,
-        budget=take.budget,
+        take.skeleton, take.motion, wanted, blend_frames=take.count_frames(command.blend_s), freedom=freedom,
+        solver=command.solver, budget=take.budget,
     )  # fmt: skip
     found = [
-        _finding(tree, constraint, before, after)
-        for tree, constraint, before, after in zip(
-            constraints, wanted, made.residuals_before, made.residuals_after, strict=True
+        _finding(asked, constraint, before, after)
+        for asked, constraint, before, after in zip(
+            command.constraints, wanted, made.residuals_before, made.residuals_after, strict=True
         )
     ]
     return take.moved(made.motion).with_finding(EditFinding("constrain", {"constraints": found}))
 
 
-def plant_feet(
-    take: Take,
-    *,
-    contacts: Sequence[Tree] | None = None,
-    speed_m_s: float = PlantOptions.speed_m_s,
-    blend_s: float = PlantOptions.blend_s,
-    knee_damping_rad: float = PlantOptions.knee_damping_rad,
-) -> Take:
+def plant_feet(take: Take, command: PlantFeet) -> Take:
     """Fix planted feet to the ground, and record how far they slid before and after.
 
     Parameters
     ----------
     take : Take    F frames
-    contacts : sequence of trees, optional    {"foot": "left" or "right", "frames": (start, stop)}; detected by speed
-        when None
-    speed_m_s : float    joints slower than this touch the ground
-    blend_s : float    seconds before and after a contact
-    knee_damping_rad : float    radians before straight in which a stretching knee is damped
+    command : PlantFeet    contacts, which are detected by speed where they are None, and the blending around them
 
     Returns
     -------
@@ -118,9 +102,8 @@ def plant_feet(
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
     feet = [_foot(rig, side) for side in ("left", "right")]
-    options = PlantOptions(blend_s=blend_s, speed_m_s=speed_m_s, knee_damping_rad=knee_damping_rad)
-    given = None if contacts is None else _given_contacts(take, feet, contacts, options)
-    made = plant(take.skeleton, take.motion, take.frame_rate_hz, feet, contacts=given, options=options)
+    given = None if command.contacts is None else _given_contacts(take, feet, command)
+    made = plant(take.skeleton, take.motion, take.frame_rate_hz, feet, contacts=given, options=command)
     values = {
         "slide_before_m": made.slide_before_m,
         "slide_after_m": made.slide_after_m,
@@ -176,12 +159,12 @@ def _named(number: int, make: Any, *arguments: Any) -> Any:
         raise
 
 
-def _constraint(rig: _Rig, tree: Tree) -> Constraint:
-    start, stop = rig.take.frames(tree.get("frames"))
+def _constraint(rig: _Rig, asked: AnyConstraint) -> Constraint:
+    start, stop = rig.take.frames(asked.frames)
     rig.take.budget.spend(PER_NUMBER * (stop - start) * rig.take.size / rig.take.frame_count)
-    joint, top = rig.joint(tree["joint"]), tree.get("top")
+    joint, top = rig.joint(asked.joint), asked.top
     skeleton = rig.take.skeleton
-    target = _target(rig, joint, tree, start, stop)
+    target = _target(rig, joint, asked, start, stop)
     limb = limb_ending_at(skeleton, rig.take.body.mapping, joint, rig.axes_if_known())
     if top is not None:
         joints = chain_of(skeleton, joint, rig.joint(top))
@@ -192,23 +175,21 @@ def _constraint(rig: _Rig, tree: Tree) -> Constraint:
     return Constraint(target, start, stop, path[:-1] or path)
 
 
-def _target(rig: _Rig, joint: int, tree: Tree, start: int, stop: int) -> Target:
+def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) -> Target:
     part, skeleton = rig.take.motion.at_frames(np.arange(start, stop)), rig.take.skeleton
-    weight = tree.get("weight", 1.0)
-    offset = tree.get("offset_m", (0.0, 0.0, 0.0))
-    if tree["kind"] == "look_at":
-        return LookAtTarget(joint, tree["point_m"], tree.get("axis") or _looking_axis(rig, joint), offset, weight)
-    if tree["kind"] == "orientation":
-        asked = OrientationTarget(joint, tree.get("rotation") or (1.0, 0.0, 0.0, 0.0), weight)
-        if tree.get("rotation") is not None:
-            return asked
-        return OrientationTarget(joint, current_values(skeleton, part.at_frames(np.arange(1)), asked)[0], weight)
-    point, axes = tree.get("point_m"), tree.get("axes", "xyz")
-    if point is not None:
-        return PositionTarget(joint, point, axes, offset, weight)
-    now = current_values(skeleton, part, PositionTarget(joint, (0.0, 0.0, 0.0), axes, offset))
-    shift = tree.get("shift_m")
-    return PositionTarget(joint, now[0] if shift is None else now + np.array(shift), axes, offset, weight)
+    if isinstance(asked, LookAtConstraint):
+        axis = asked.axis or _looking_axis(rig, joint)
+        return LookAtTarget(joint, asked.point_m, axis, asked.offset_m, asked.weight)
+    if isinstance(asked, OrientationConstraint):
+        target = OrientationTarget(joint, asked.rotation or (1.0, 0.0, 0.0, 0.0), asked.weight)
+        if asked.rotation is not None:
+            return target
+        return replace(target, rotation=current_values(skeleton, part.at_frames(np.arange(1)), target)[0])
+    place = PositionTarget(joint, asked.point_m or (0.0, 0.0, 0.0), asked.axes, asked.offset_m, asked.weight)
+    if asked.point_m is not None:
+        return place
+    now = current_values(skeleton, part, place)
+    return replace(place, position=now[0] if asked.shift_m is None else now + np.array(asked.shift_m))
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
@@ -223,23 +204,24 @@ def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
     return np.cross(axes.swing, axes.twist) if looks else np.array(axes.twist)
 
 
-def _limit(rig: _Rig, tree: Tree) -> JointLimit:
-    joint = rig.joint(tree["joint"])
+def _limit(rig: _Rig, asked: AnyLimit) -> JointLimit:
+    joint = rig.joint(asked.joint)
     axes, rest = rig.axes_of(joint), rig.take.skeleton.rest_rotations[joint]
-    if tree["kind"] == "hinge":
-        low, high = tree["angle_rad"]
-        return JointLimit.hinge(axes, low, high, rest)
-    return JointLimit.cone(axes, tuple(tree["swing_rad"]), tuple(tree.get("twist_rad", (-np.pi, np.pi))), rest)
+    if isinstance(asked, HingeLimit):
+        least, greatest = asked.angle_deg
+        return JointLimit.hinge(axes, radians(least), radians(greatest), rest)
+    (about, across), (least, greatest) = asked.swing_deg, asked.twist_deg
+    return JointLimit.cone(axes, (radians(about), radians(across)), (radians(least), radians(greatest)), rest)
 
 
-def _finding(tree: Tree, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
+def _finding(asked: AnyConstraint, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
     """Describe the largest errors of a constraint, in metres or radians, and count the frames that reach it."""
     is_position = isinstance(constraint.target, PositionTarget)
     unit = "m" if is_position else "rad"
     tolerance = _OPTIONS.tolerance_m if is_position else _OPTIONS.tolerance_rad
     return {
-        "joint": tree["joint"],
-        "kind": tree["kind"],
+        "joint": asked.joint,
+        "kind": asked.kind,
         f"residual_before_{unit}": float(before.max()),
         f"residual_after_{unit}": float(after.max()),
         "frames": len(after),
@@ -257,20 +239,16 @@ def _foot(rig: _Rig, side: str) -> Foot:
     return Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle)
 
 
-def _given_contacts(
-    take: Take, feet: Sequence[Foot], given: Sequence[Tree], options: PlantOptions
-) -> tuple[FootContacts, ...]:
+def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
     """Toes as given; heels where they are slow meanwhile."""
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):
         toe = np.zeros(take.frame_count, dtype=np.bool_)
-        for one in given:
-            if one["foot"] not in ("left", "right"):
-                raise EditError(f"{one['foot']!r} is not a foot; choose left or right", where="contacts")
-            if one["foot"] == side:
-                start, stop = take.frames(one["frames"])
+        for one in command.contacts or ():
+            if one.foot == side:
+                start, stop = take.frames(one.frames)
                 toe[start:stop] = True
-        slow = find_contacts(positions, foot, take.frame_rate_hz, options)
+        slow = find_contacts(positions, foot, take.frame_rate_hz, command)
         contacts.append(FootContacts(toe, slow.heel & toe))
     return tuple(contacts)

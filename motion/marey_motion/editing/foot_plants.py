@@ -26,8 +26,11 @@ from marey_motion.editing.inverse_kinematics.targets import OrientationTarget, P
 from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import PlantOptions
 
 MOST_LOWERING_M = 0.1
+SHORTEST_CONTACT_S = 0.06
+"""Shorter contacts are noise."""
 # Less than this is rounding.
 SHORTEST_LOWERING_M = 1e-9
 
@@ -38,30 +41,6 @@ class Foot:
 
     leg: TwoBoneLimb
     toe: int
-
-
-@dataclass(frozen=True)
-class PlantOptions:
-    """Options of foot plants.
-
-    Parameters
-    ----------
-    blend_s : seconds before and after a contact in which the foot goes over into its own motion; a root that has to
-        come down, and the legs with it, goes over within three times as long
-    speed_m_s : joints slower than this touch the ground, where contacts are not given
-    shortest_s : shorter contacts are noise
-    knee_damping_rad : how long before straight a stretching knee is damped
-    """
-
-    blend_s: float = 0.15
-    speed_m_s: float = kinematics.CONTACT_SPEED_M_S
-    shortest_s: float = 0.06
-    knee_damping_rad: float = math.radians(10.0)
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0):
-                raise EditError(f"{value} must be a number of at least 0", code="option-invalid", where=name)
 
 
 class FootContacts(NamedTuple):
@@ -137,10 +116,11 @@ def plant_feet(
     blend = max(1, round(options.blend_s * frame_rate_hz))
     spins = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
     plans = [_plan(positions, spins, foot, touching, blend) for foot, touching in zip(feet, contacts, strict=True)]
-    lowering = _lowering(positions, feet, plans, options.knee_damping_rad, blend)
+    zone = math.radians(options.knee_damping_deg)
+    lowering = _lowering(positions, feet, plans, zone, blend)
     planted = motion._replace(root_translations=motion.root_translations - lowering[:, None] * (0.0, 1.0, 0.0))
     for foot, plan in zip(feet, plans, strict=True):
-        planted = _with_leg(skeleton, planted, motion, foot, plan, lowering, options.knee_damping_rad)
+        planted = _with_leg(skeleton, planted, motion, foot, plan, lowering, zone)
     before, after = (_slide(points, feet, contacts) for points in (positions, planted.positions(skeleton)))
     return PlantedMotion(planted, tuple(contacts), before, after, float(lowering.max(initial=0.0)))
 
@@ -148,7 +128,7 @@ def plant_feet(
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
     """Find the frames in which toe and ankle of a foot are slow.
 
-    Contacts shorter than `shortest_s` are noise, and so are gaps between the remaining contacts.
+    Contacts shorter than `SHORTEST_CONTACT_S` are noise, and so are gaps between the remaining contacts.
 
     Parameters
     ----------
@@ -163,7 +143,7 @@ def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: 
     """
     points = positions[:, (foot.toe, foot.leg.end)]
     touching = kinematics.foot_contacts(points, frame_rate_hz, speed_limit_m_s=options.speed_m_s)
-    shortest = options.shortest_s * frame_rate_hz
+    shortest = SHORTEST_CONTACT_S * frame_rate_hz
     for side in touching.T:
         for start, stop in runs(side):
             if stop - start < shortest:

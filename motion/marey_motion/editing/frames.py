@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -20,16 +18,16 @@ from marey_motion.motion import Motion
 from marey_motion.resampling import count_samples, resample_motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
 from marey_motion.skeleton import same_hierarchy
+from marey_schemas.editing.commands import Concatenate, Resample, Retime, Split, Trim
 
 
-def trim(take: Take, *, start: int = 0, stop: int | None = None) -> Take:
+def trim(take: Take, command: Trim) -> Take:
     """Keep a range of frames.
 
     Parameters
     ----------
     take : Take    F frames
-    start : int    first frame
-    stop : int, optional    one after the last frame; the end when None
+    command : Trim    the range
 
     Returns
     -------
@@ -39,17 +37,17 @@ def trim(take: Take, *, start: int = 0, stop: int | None = None) -> Take:
     ------
     EditError    where they do not exist
     """
-    first, last = take.frames((start, stop))
+    first, last = take.frames((command.start, command.stop))
     return take.moved(take.motion.sliced(first, last))
 
 
-def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
+def split(take: Take, command: Split) -> tuple[Take, ...]:
     """Cut a take into pieces.
 
     Parameters
     ----------
     take : Take    F frames
-    at : sequence of int    increasing; first frame of each piece but the first
+    command : Split    the cuts
 
     Returns
     -------
@@ -59,11 +57,11 @@ def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
     ------
     EditError    where a cut lies outside the motion or would leave a piece without frames
     """
-    bounds = [0, *at, take.frame_count]
+    bounds = [0, *command.at, take.frame_count]
     for before, after in pairwise(bounds):
         if after <= before:
             raise EditError(
-                f"cuts at {', '.join(map(str, at))} leave a piece without frames; cuts increase, from 1 to "
+                f"cuts at {', '.join(map(str, command.at))} leave a piece without frames; cuts increase, from 1 to "
                 f"{take.frame_count - 1}",
                 code="frames-missing",
                 where="at",
@@ -77,14 +75,7 @@ def split(take: Take, *, at: Sequence[int]) -> tuple[Take, ...]:
 SAME_SKELETON_M = 1e-5
 
 
-def concatenate(
-    take: Take,
-    *,
-    source: str,
-    place: Literal["seam", "keep"] = "seam",
-    blend: Literal["inertialise", "slerp"] = "inertialise",
-    blend_s: float = 0.3,
-) -> Take:
+def concatenate(take: Take, command: Concatenate) -> Take:
     """Append a clip of the same skeleton, at this motion's frame rate.
 
     Where hips are translated under a root that is a static reference, their travel is merged into that of the root.
@@ -92,12 +83,7 @@ def concatenate(
     Parameters
     ----------
     take : Take    F frames
-    source : str    name of the clip
-    place : str    "seam": rotated about the vertical and shifted on the ground so that the body continues its position
-        and heading; "keep": unchanged
-    blend : str    "inertialise": all frames of both, and the difference at the seam decays in the second; "slerp": so
-        many frames of both overlap and are cross-faded
-    blend_s : float    seconds of the blend; 0 for a hard cut
+    command : Concatenate    name of the clip, its place, and the blend
 
     Returns
     -------
@@ -108,14 +94,14 @@ def concatenate(
     EditError    for an unknown source, another skeleton, and a result that is too long
     MotionError    where the body has no facing direction at the seam
     """
-    added = _same_rate(take, source)
+    added = _same_rate(take, command.source)
     first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
     before, after = take.moved(first), added.moved(second)
-    count = take.count_frames(blend_s)
-    overlap = min(count, before.frame_count, after.frame_count) if blend == "slerp" else 0
-    if place == "keep" and count == 0:
+    count = take.count_frames(command.blend_s)
+    overlap = min(count, before.frame_count, after.frame_count) if command.blend == "slerp" else 0
+    if command.place == "keep" and count == 0:
         return take.moved(_in_a_row(first, second))
-    seam = _seam(before, after, overlap) if place == "seam" else LoopSeam(0.0, np.zeros(2))
+    seam = _seam(before, after, overlap) if command.place == "seam" else LoopSeam(0.0, np.zeros(2))
     body, carrier = take.skeleton, take.body.carrier
     stays = all(root_stands(motion, body, carrier) for motion in (first, second))
     first, second = (body_first(motion, body, carrier, root_stays=stays) for motion in (first, second))
@@ -189,13 +175,13 @@ def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
     return _in_a_row(_in_a_row(kept, middle), second.sliced(overlap, second.frame_count))
 
 
-def resample(take: Take, *, frame_rate_hz: float) -> Take:
+def resample(take: Take, command: Resample) -> Take:
     """Sample the motion at another rate, first frames coinciding.
 
     Parameters
     ----------
     take : Take    F frames
-    frame_rate_hz : float    frames per second
+    command : Resample    the frame rate
 
     Returns
     -------
@@ -205,18 +191,19 @@ def resample(take: Take, *, frame_rate_hz: float) -> Take:
     ------
     EditError    where it becomes too long
     """
-    take.require_room(count_samples(take.frame_count, take.frame_rate_hz, frame_rate_hz))
-    motion = resample_motion(take.motion, take.frame_rate_hz, frame_rate_hz)
-    return replace(take, motion=motion, frame_rate_hz=frame_rate_hz)
+    rate_hz = command.frame_rate_hz
+    take.require_room(count_samples(take.frame_count, take.frame_rate_hz, rate_hz))
+    motion = resample_motion(take.motion, take.frame_rate_hz, rate_hz)
+    return replace(take, motion=motion, frame_rate_hz=rate_hz)
 
 
-def retime(take: Take, *, speed: float) -> Take:
+def retime(take: Take, command: Retime) -> Take:
     """Play the motion faster or slower, at the same frame rate.
 
     Parameters
     ----------
     take : Take    F frames
-    speed : float    factor; 2 is twice as fast
+    command : Retime    the factor of the speed
 
     Returns
     -------
@@ -226,6 +213,6 @@ def retime(take: Take, *, speed: float) -> Take:
     ------
     EditError    where it becomes too long
     """
-    slowed_hz = take.frame_rate_hz / speed
+    slowed_hz = take.frame_rate_hz / command.speed
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))
     return take.moved(resample_motion(take.motion, take.frame_rate_hz, slowed_hz))

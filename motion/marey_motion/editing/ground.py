@@ -8,10 +8,11 @@ import numpy as np
 
 from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.contacts import Stance, find_stances
-from marey_motion.editing.placement import translate
+from marey_motion.editing.placement import shifted
 from marey_motion.editing.take import EditFinding, Take
 from marey_motion.importing.checks import sole_points
 from marey_motion.kinematics import forward_kinematics
+from marey_schemas.editing.commands import FindContacts, FindGround, MoveToGround
 from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
@@ -33,13 +34,13 @@ class Ground(NamedTuple):
     standing_frames: int
 
 
-def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
+def move_to_ground(take: Take, command: MoveToGround) -> Take:
     """Shift the motion vertically so that the ground is at height zero.
 
     Parameters
     ----------
     take : Take    F frames
-    height_m : float, optional    height of the ground, metres; estimated and recorded when None
+    command : MoveToGround    height of the ground, which is estimated and recorded where it is None
 
     Returns
     -------
@@ -49,17 +50,20 @@ def move_to_ground(take: Take, *, height_m: float | None = None) -> Take:
     ------
     MappingError    where the feet are not known
     """
-    ground = estimate_ground(take) if height_m is None else Ground(height_m, 0)
-    moved = translate(take, shift_m=(0.0, -ground.height_m, 0.0))
-    return moved if height_m is not None else moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
+    ground = estimate_ground(take) if command.height_m is None else Ground(command.height_m, 0)
+    moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
+    if command.height_m is not None:
+        return moved
+    return moved.with_finding(EditFinding("move_to_ground", ground._asdict()))
 
 
-def find_ground(take: Take) -> Take:
+def find_ground(take: Take, _command: FindGround) -> Take:
     """Record the height of the ground.
 
     Parameters
     ----------
     take : Take    F frames
+    _command : FindGround    has no parameters
 
     Returns
     -------
@@ -72,22 +76,13 @@ def find_ground(take: Take) -> Take:
     return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
 
 
-def find_contacts(
-    take: Take,
-    *,
-    speed_m_s: float = 0.5,
-    shortest_swing_s: float = 0.1,
-    shortest_stance_s: float = 0.06,
-    height_limit_m: float | None = 0.1,
-) -> Take:
+def find_contacts(take: Take, command: FindContacts) -> Take:
     """Record the frames in which each foot is planted, as the segments of an annotation.
 
     Parameters
     ----------
     take : Take    F frames
-    speed_m_s, shortest_swing_s, shortest_stance_s : float    see `ContactOptions`
-    height_limit_m : float, optional    a slow foot higher than this above the ground is not planted, metres; None to
-        check only its speed
+    command : FindContacts    limits of speed, durations and height
 
     Returns
     -------
@@ -97,13 +92,10 @@ def find_contacts(
     ------
     MappingError    where the feet are not known
     """
-    options = ContactOptions(
-        speed_m_s=speed_m_s, shortest_swing_s=shortest_swing_s, shortest_stance_s=shortest_stance_s
-    )
-    stances = _stances(take, options)
-    if height_limit_m is not None:
+    stances = _stances(take, command)
+    if command.height_limit_m is not None:
         heights = sole_heights(take)
-        limit = _ground_of(heights, stances).height_m + height_limit_m
+        limit = _ground_of(heights, stances).height_m + command.height_limit_m
         stances = tuple(
             [one for one in foot if np.median(heights[one.start : one.end, side]) <= limit]
             for side, foot in enumerate(stances)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from math import radians
 
 import numpy as np
 
@@ -17,20 +17,13 @@ from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.resampling import sample_motion
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.commands import Paste, RotateJoint
 
 SAME_AXES_RAD = 0.02
 """Largest angle between rest rotations that count as equal: subjects of one rig differ a little."""
 
 
-def paste(
-    take: Take,
-    *,
-    source: str,
-    joints: Sequence[str],
-    source_frames: tuple[int, int | None] | None = None,
-    frames: tuple[int, int | None] | None = None,
-    border_s: float = 0.2,
-) -> Take:
+def paste(take: Take, command: Paste) -> Take:
     """Replace the motion of joints by a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
     The range is resampled with cubic splines to the frames it fills; equal lengths are copied exactly. Within the
@@ -39,11 +32,7 @@ def paste(
     Parameters
     ----------
     take : Take    F frames
-    source : str    name of the other clip
-    joints : sequence of str    names of the joints
-    source_frames : (int, int or None), optional    range of the other clip, all when None
-    frames : (int, int or None), optional    range to fill, all when None
-    border_s : float    seconds of each border
+    command : Paste    name and range of the other clip, joints, range to fill and borders
 
     Returns
     -------
@@ -54,11 +43,11 @@ def paste(
     UnknownJoint    naming a joint that does not exist
     EditError    for an unknown source, frames that do not exist, and joints whose axes differ in the two skeletons
     """
-    clip = take.source(source)
-    targets = sorted({take.joint(name) for name in joints})
+    clip = take.source(command.source)
+    targets = sorted({take.joint(name) for name in command.joints})
     origins = _same_joints(take.skeleton, clip.skeleton, targets)
-    span, shares = range_weights(take, frames, border_s)
-    copied = _stretched(take, clip, source_frames, len(shares))
+    span, shares = range_weights(take, command.frames, command.border_s)
+    copied = _stretched(take, clip, command.source_frames, len(shares))
     own = _with_more_translations(take, targets, origins, copied)
     rotations, translations = own.rotations.copy(), own.translations.copy()
     rotations[span, targets] = blended(rotations[span, targets], copied.rotations[:, origins], shares)
@@ -109,27 +98,13 @@ def _translations_of(motion: Motion, joint: int, offset: Floats) -> Floats:
     return motion.translations[:, motion.translated_joints.index(joint)]
 
 
-def rotate_joint(
-    take: Take,
-    *,
-    joint: str,
-    angle_rad: float,
-    axis: Sequence[float],
-    space: Literal["joint", "parent", "world"] = "joint",
-    frames: tuple[int, int | None] | None = None,
-    border_s: float = 0.2,
-) -> Take:
+def rotate_joint(take: Take, command: RotateJoint) -> Take:
     """Rotate a joint by an angle, growing over the borders.
 
     Parameters
     ----------
     take : Take    F frames
-    joint : str    name of the joint
-    angle_rad : float    radians
-    axis : (3,)    direction of the axis, of any length but zero
-    space : str    "joint", "parent" or "world": the frame of the axis
-    frames : (int, int or None), optional    range, all when None
-    border_s : float    seconds of each border
+    command : RotateJoint    joint, angle, axis, range and borders
 
     Returns
     -------
@@ -140,15 +115,15 @@ def rotate_joint(
     UnknownJoint    naming a joint that does not exist
     EditError    where the frames do not exist
     """
-    index = take.joint(joint)
-    span, shares = range_weights(take, frames, border_s)
-    turns = quaternions.from_axis_angle(axis, angle_rad * shares)
+    index = take.joint(command.joint)
+    span, shares = range_weights(take, command.frames, command.border_s)
+    turns = quaternions.from_axis_angle(command.axis, radians(command.angle_deg) * shares)
     rotations = take.motion.rotations.copy()
-    if space == "joint":
+    if command.space == "joint":
         rotations[span, index] = quaternions.multiply(rotations[span, index], turns)
         return take.moved(take.motion._replace(rotations=rotations))
     parent = int(take.skeleton.parents[index])
-    if space == "world" and parent >= 0:
+    if command.space == "world" and parent >= 0:
         frame = kinematics.as_global_rotations(take.skeleton, rotations[span])[:, parent]
         turns = quaternions.multiply(quaternions.conjugate(frame), quaternions.multiply(turns, frame))
     rotations[span, index] = quaternions.multiply(turns, rotations[span, index])

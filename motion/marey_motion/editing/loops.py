@@ -12,11 +12,12 @@ from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical, loop_seam, rotated
 from marey_motion.motion import Motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
+from marey_schemas.editing.commands import CloseLoop
 
 FEWEST_FRAMES = 4
 
 
-def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = None) -> Take:
+def close_loop(take: Take, command: CloseLoop) -> Take:
     """Make the last frame lead into the first one, elsewhere on the ground where the clip travels.
 
     Where hips are translated under a root that is a static reference, their travel is merged into that of the root. The
@@ -26,8 +27,8 @@ def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = No
     Parameters
     ----------
     take : Take    F frames
-    in_place : bool    remove travel and turn of the round first, the same share per frame
-    blend_s : float, optional    seconds from the seam in which poses may change; up to the middle when None
+    command : CloseLoop    whether to remove travel and turn of the round first, the same share per frame, and the
+        duration of the blend
 
     Returns
     -------
@@ -46,10 +47,12 @@ def close_loop(take: Take, *, in_place: bool = False, blend_s: float | None = No
     body, carrier = take.skeleton, take.body.carrier
     stays = root_stands(take.motion, body, carrier)
     motion = body_first(take.motion, body, carrier, root_stays=stays)
-    if in_place:
+    if command.in_place:
         motion = _in_place(motion, places, seam)
         seam = LoopSeam(0.0, np.zeros(2))
-    life = 0.5 * frames if blend_s is None else min(0.5 * frames, max(1.0, blend_s * take.frame_rate_hz))
+    life = 0.5 * frames
+    if command.blend_s is not None:
+        life = min(life, max(1.0, command.blend_s * take.frame_rate_hz))
     closed = _closed(motion, seam, life, min(life, max(1.0, VELOCITY_S * take.frame_rate_hz)))
     return take.moved(root_first(closed, body, carrier, root_stays=stays))
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from math import radians
 
 import numpy as np
 
@@ -15,59 +14,60 @@ from marey_motion.errors import EditError
 from marey_motion.looping import LoopSeam, about_vertical
 from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
+from marey_schemas.editing.commands import (
+    Face,
+    FixDrift,
+    FlipAxes,
+    Mirror,
+    MoveToOrigin,
+    Rotate,
+    Scale,
+    SignedAxis,
+    Translate,
+)
 
 GROUND = np.array([1.0, 0.0, 1.0])
 
 
-def translate(take: Take, *, shift_m: Sequence[float]) -> Take:
+def translate(take: Take, command: Translate) -> Take:
     """Shift the motion.
 
     Parameters
     ----------
     take : Take    F frames
-    shift_m : (3,)    metres
+    command : Translate    the shift
 
     Returns
     -------
     Take    F frames
     """
-    motion = take.motion
-    return take.moved(motion._replace(root_translations=motion.root_translations + np.asarray(shift_m)))
+    return take.moved(shifted(take.motion, np.asarray(command.shift_m)))
 
 
-def rotate(
-    take: Take,
-    *,
-    angle_rad: float,
-    axis: Sequence[float] = (0.0, 1.0, 0.0),
-    pivot: Literal["origin", "body"] = "origin",
-) -> Take:
+def rotate(take: Take, command: Rotate) -> Take:
     """Rotate the motion about an axis of the world.
 
     Parameters
     ----------
     take : Take    F frames
-    angle_rad : float    radians
-    axis : (3,)    direction of the axis, of any length but zero
-    pivot : str    "origin", or "body": the ground under the first frame
+    command : Rotate    angle, axis and pivot
 
     Returns
     -------
     Take    F frames
     """
-    turn = np.asarray(quaternions.from_axis_angle(axis, angle_rad), dtype=np.float64)
-    place = np.zeros(3) if pivot == "origin" else body_at(take, 0)[0] * GROUND
+    turn = np.asarray(quaternions.from_axis_angle(command.axis, radians(command.angle_deg)), dtype=np.float64)
+    place = np.zeros(3) if command.pivot == "origin" else body_at(take, 0)[0] * GROUND
     return take.moved(carried(take.motion, turn, place))
 
 
-def face(take: Take, *, heading_rad: float = 0.0, frame: int = 0) -> Take:
+def face(take: Take, command: Face) -> Take:
     """Rotate the motion about the vertical through the body at a frame, so that it has a given heading there.
 
     Parameters
     ----------
     take : Take    F frames
-    heading_rad : float    radians, 0 along +z, positive to the left
-    frame : int    the frame
+    command : Face    the heading and the frame
 
     Returns
     -------
@@ -77,26 +77,28 @@ def face(take: Take, *, heading_rad: float = 0.0, frame: int = 0) -> Take:
     ------
     MotionError    where the body has no facing direction in that frame, as when it lies on its side
     """
-    place, heading = body_at(take, frame)
-    return take.moved(carried(take.motion, about_vertical(np.asarray(heading_rad - heading)), place))
+    place, heading = body_at(take, command.frame)
+    turn = about_vertical(np.asarray(radians(command.heading_deg) - heading))
+    return take.moved(carried(take.motion, turn, place))
 
 
-def move_to_origin(take: Take, *, frame: int = 0) -> Take:
+def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
     """Shift the motion on the ground, so that the pelvis is above the origin at a frame; heights stay.
 
     Parameters
     ----------
     take : Take    F frames
-    frame : int    the frame
+    command : MoveToOrigin    the frame
 
     Returns
     -------
     Take    F frames
     """
-    return translate(take, shift_m=-pelvis_track(take, frame, frame + 1)[0] * GROUND)
+    frame = command.frame
+    return take.moved(shifted(take.motion, -pelvis_track(take, frame, frame + 1)[0] * GROUND))
 
 
-def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
+def scale(take: Take, command: Scale) -> Take:
     """Scale the path of the body about the origin, heights too.
 
     The skeleton is another item and does not change, so that the strides of a scaled path fit another body's legs.
@@ -104,8 +106,7 @@ def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    factor : float    factor
-    translations : bool    scale the translations of other joints, too
+    command : Scale    the factor, and whether it scales the translations of other joints, too
 
     Returns
     -------
@@ -114,12 +115,13 @@ def scale(take: Take, *, factor: float, translations: bool = False) -> Take:
     motion = take.motion
     scaled = motion.translations.copy()
     carriers = take.skeleton.path_to_root(take.body.pelvis)
-    chosen = [translations or joint in carriers for joint in motion.translated_joints]
-    scaled[:, chosen] *= factor
-    return take.moved(motion._replace(root_translations=motion.root_translations * factor, translations=scaled))
+    chosen = [command.translations or joint in carriers for joint in motion.translated_joints]
+    scaled[:, chosen] *= command.factor
+    roots = motion.root_translations * command.factor
+    return take.moved(motion._replace(root_translations=roots, translations=scaled))
 
 
-def flip_axes(take: Take, *, up: str = "+z", forward: str = "-y") -> Take:
+def flip_axes(take: Take, command: FlipAxes) -> Take:
     """Rotate the world so that one axis becomes +y and another +z.
 
     Only rotations: a world of the other hand is a mirror image, which `mirror` makes.
@@ -127,20 +129,13 @@ def flip_axes(take: Take, *, up: str = "+z", forward: str = "-y") -> Take:
     Parameters
     ----------
     take : Take    F frames
-    up : str    axis that becomes +y, one of +x to -z
-    forward : str    axis that becomes +z
+    command : FlipAxes    the axes that become +y and +z
 
     Returns
     -------
     Take    F frames
-
-    Raises
-    ------
-    EditError    where both lie on one axis
     """
-    y, z = _direction(up), _direction(forward)
-    if np.any(np.abs(y + z) != np.abs(y) + np.abs(z)) or up[1] == forward[1]:
-        raise EditError(f"up {up} and forward {forward} lie on one axis", where="forward")
+    y, z = _direction(command.up), _direction(command.forward)
     turn = quaternions.from_matrix(np.stack((np.cross(y, z), y, z)))
     return take.moved(carried(take.motion, np.asarray(turn, dtype=np.float64), np.zeros(3)))
 
@@ -164,6 +159,21 @@ def carried(motion: Motion, turns: Floats, pivots: Floats, shifts: Floats | None
     rotations = motion.rotations.copy()
     rotations[:, 0] = quaternions.multiply(turns, rotations[:, 0])
     return motion._replace(root_translations=places if shifts is None else places + shifts, rotations=rotations)
+
+
+def shifted(motion: Motion, shift: Floats) -> Motion:
+    """Shift a motion.
+
+    Parameters
+    ----------
+    motion : Motion    F frames
+    shift : (3,) float64    metres
+
+    Returns
+    -------
+    Motion    F frames
+    """
+    return motion._replace(root_translations=motion.root_translations + shift)
 
 
 def moved_over(motion: Motion, seam: LoopSeam) -> Motion:
@@ -249,19 +259,18 @@ def _positions(take: Take, start: int, stop: int) -> Floats:
     return take.motion.sliced(first, last).positions(take.skeleton)
 
 
-def _direction(axis: str) -> Floats:
+def _direction(axis: SignedAxis) -> Floats:
     """Make the unit vector of an axis such as -y."""
-    if len(axis) != 2 or axis[0] not in "+-" or axis[1] not in "xyz":
-        raise EditError(f"{axis!r} is not an axis; write it as in +z or -y", code="command-invalid")
     return np.asarray((-1.0 if axis[0] == "-" else 1.0) * np.eye(3)["xyz".index(axis[1])], dtype=np.float64)
 
 
-def mirror(take: Take) -> Take:
+def mirror(take: Take, _command: Mirror) -> Take:
     """Reflect the motion in x, by the skeleton's own pairs of joints, whatever their names and axes.
 
     Parameters
     ----------
     take : Take    F frames
+    _command : Mirror    has no parameters
 
     Returns
     -------
@@ -270,14 +279,7 @@ def mirror(take: Take) -> Take:
     return take.moved(mirror_motion(take.skeleton, take.body.partners, take.motion))
 
 
-def fix_drift(
-    take: Take,
-    *,
-    shift_m: Sequence[float] = (0.0, 0.0, 0.0),
-    turn_rad: float = 0.0,
-    frames: tuple[int, int | None] | None = None,
-    profile: Literal["linear", "smooth"] = "linear",
-) -> Take:
+def fix_drift(take: Take, command: FixDrift) -> Take:
     """Spread a shift and a turn about the vertical over a range: none of it in its first frame, all in its last.
 
     Within the range each frame turns about its own pelvis; the frames after it follow the last one rigidly.
@@ -285,10 +287,7 @@ def fix_drift(
     Parameters
     ----------
     take : Take    F frames
-    shift_m : (3,)    metres
-    turn_rad : float    radians, positive to the left
-    frames : (int, int or None), optional    range, all when None
-    profile : str    "linear" or "smooth"
+    command : FixDrift    shift, turn, range and profile
 
     Returns
     -------
@@ -298,7 +297,7 @@ def fix_drift(
     ------
     EditError    where the frames do not exist or are only one
     """
-    start, stop = take.frames(frames)
+    start, stop = take.frames(command.frames)
     if stop - start < 2:
         raise EditError(
             f"drift is spread over at least 2 frames; {start}:{stop} is one",
@@ -306,8 +305,8 @@ def fix_drift(
             where="frames",
         )
     places = np.clip((np.arange(take.frame_count) - start) / (stop - 1 - start), 0.0, 1.0)
-    shares = places if profile == "linear" else smooth_step(places)
+    shares = places if command.profile == "linear" else smooth_step(places)
     pivots = pelvis_track(take, 0, take.frame_count)
     pivots[stop:] = pivots[stop - 1]
-    turns = about_vertical(shares * turn_rad)
-    return take.moved(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(shift_m)))
+    turns = about_vertical(shares * radians(command.turn_deg))
+    return take.moved(carried(take.motion, turns, pivots, shares[:, None] * np.asarray(command.shift_m)))

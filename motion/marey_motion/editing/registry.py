@@ -1,13 +1,11 @@
 """Every command by its name, and lists of commands applied to clips.
 
-A command is a function of a take and named parameters, and returns one take or several. It is pure: the same take and
-parameters give the same bytes. Its parameters are plain trees in SI units, as `documents.commands_of_edit` makes them
-from a document's; the schemas have the same names and defaults, with degrees (`_deg`) for radians (`_rad`).
+A command is a model of `marey_schemas.editing`, which declares its parameters. The function of its name takes a take
+and the command, and returns one take or several. It is pure: the same take and command give the same bytes.
 """
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -27,11 +25,10 @@ from marey_motion.editing.smoothing import smooth
 from marey_motion.editing.take import MOST_NUMBERS, EditedBody, EditFinding, Take, motion_of, require_finite, settled
 from marey_motion.errors import EditError, MotionError
 from marey_motion.motion import Motion
+from marey_schemas.editing.commands import Concatenate, Paste
+from marey_schemas.editing.edits import AnyCommand
 
-Command = Callable[..., Take | tuple[Take, ...]]
-NamedCommand = tuple[str, Mapping[str, Any]]
-
-COMMANDS: Mapping[str, Command] = {
+COMMANDS: Mapping[str, Callable[..., Take | tuple[Take, ...]]] = {
     command.__name__: command
     for command in (
         trim,
@@ -58,7 +55,7 @@ COMMANDS: Mapping[str, Command] = {
         plant_feet,
     )
 }
-"""Commands by name. A new one gets its line here and its schema in `marey_schemas.editing.edits`."""
+"""Functions by the name of their command. A new one gets its line here and its model in `marey_schemas.editing`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +76,7 @@ class EditedClip:
 
 def edit_clip(
     clip: Clip,
-    commands: Sequence[NamedCommand],
+    commands: Sequence[AnyCommand],
     *,
     body: EditedBody | None = None,
     sources: Mapping[str, Clip] | None = None,
@@ -93,8 +90,7 @@ def edit_clip(
     Parameters
     ----------
     clip : Clip    F frames; stays unchanged
-    commands : sequence of (str, mapping)    names and parameters, in order; after a split, the rest applies to each
-        piece
+    commands : sequence of commands    in order; after a split, the rest applies to each piece
     body : EditedBody, optional    joints of the skeleton; by default inferred from names and build
     sources : mapping of str to Clip, optional    other clips by the names that the commands use
     most_numbers : int    largest size of the motion
@@ -114,11 +110,11 @@ def edit_clip(
         budget=ComputeBudget(most_work),
     )  # fmt: skip
     takes: tuple[Take, ...] = (first,)
-    for number, (name, parameters) in enumerate(commands):
+    for number, command in enumerate(commands):
         try:
-            takes = tuple(one for take in takes for one in apply_command(take, name, parameters))
+            takes = tuple(one for take in takes for one in apply_command(take, command))
         except MotionError as error:
-            place = f"commands[{number}] ({name})"
+            place = f"commands[{number}] ({command.command})"
             error.where = place if error.where is None else f"{place}, {error.where}"
             raise
     with np.errstate(over="ignore"):  # what is too large in single precision is refused as not finite
@@ -126,13 +122,13 @@ def edit_clip(
     return tuple(EditedClip(clip, take.pieces, take.findings) for clip, take in zip(clips, takes, strict=True))
 
 
-def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Clip:
+def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip:
     """Apply commands that return a single clip, as `edit_clip`.
 
     Parameters
     ----------
     clip : Clip    F frames
-    commands : sequence of (str, mapping)    names and parameters
+    commands : sequence of commands    in order
     given    further arguments of `edit_clip`
 
     Returns
@@ -149,14 +145,13 @@ def apply_edit(clip: Clip, commands: Sequence[NamedCommand], **given: Any) -> Cl
     return edited[0].clip
 
 
-def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple[Take, ...]:
+def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
     """Apply one command to a take.
 
     Parameters
     ----------
     take : Take    F frames
-    name : str    name of the command
-    parameters : mapping    its parameters
+    command : command    with its parameters
 
     Returns
     -------
@@ -166,21 +161,14 @@ def apply_command(take: Take, name: str, parameters: Mapping[str, Any]) -> tuple
     ------
     MotionError    where it cannot be applied
     """
-    command = COMMANDS.get(name)
-    if command is None:
-        raise EditError(f"no command is called {name!r}; there are {', '.join(COMMANDS)}", code="command-unknown")
-    try:
-        inspect.signature(command).bind(take, **parameters)
-    except TypeError as error:
-        raise EditError(f"{error}", code="command-invalid") from None
-    take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, parameters))
-    made = command(take, **parameters)
+    take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, command))
+    made = COMMANDS[command.command](take, command)
     return tuple(_settled(one, take.motion) for one in (made if isinstance(made, tuple) else (made,)))
 
 
-def _size_for(take: Take, parameters: Mapping[str, Any]) -> int:
+def _size_for(take: Take, command: AnyCommand) -> int:
     """Count the numbers that a command works on: of the take, and of the clip that it names."""
-    other = take.sources.get(parameters.get("source", ""))
+    other = take.sources.get(command.source) if isinstance(command, Concatenate | Paste) else None
     return take.size + (0 if other is None else other.poses.size)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from marey_motion.editing.borders import blended, range_weights
 from marey_motion.editing.compute_budget import MOST_OF_TAPS, PER_TAP
 from marey_motion.editing.take import Take
 from marey_motion.errors import EditError
+from marey_schemas.editing.commands import Smooth
 
 LONG_WINDOW = 512
 """Means over more frames are computed by Fourier transforms, in which the length of the window costs little."""
@@ -23,17 +23,7 @@ LEAST_LENGTH = 0.1
 """Least length of a mean of unit quaternions; a shorter one is of rotations in all directions, which have no mean."""
 
 
-def smooth(
-    take: Take,
-    *,
-    method: Literal["savitzky_golay", "gaussian"] = "savitzky_golay",
-    window_s: float = 0.25,
-    order: int = 3,
-    joints: Sequence[str] | None = None,
-    root_translation: bool = True,
-    frames: tuple[int, int | None] | None = None,
-    border_s: float = 0.2,
-) -> Take:
+def smooth(take: Take, command: Smooth) -> Take:
     """Average the joints' rotations and translations and the root's path over time, with weights.
 
     No frame is lost: beyond its ends a motion continues as its own reflection through its end poses, which leaves the
@@ -43,13 +33,8 @@ def smooth(
     Parameters
     ----------
     take : Take    F frames
-    method : str    "savitzky_golay" or "gaussian"
-    window_s : float    full width of the mean; for a gaussian, six standard deviations
-    order : int    degree of the polynomials of savitzky_golay
-    joints : sequence of str, optional    names of the joints; None for all
-    root_translation : bool    smooth the path of the root, and of the joints between root and pelvis where those move
-    frames : (int, int or None), optional    range, all when None
-    border_s : float    seconds of each border
+    command : Smooth    the filter, its width (for a gaussian, six standard deviations), joints, range and borders; with
+        the path of the root, joints between root and pelvis are smoothed where those move
 
     Returns
     -------
@@ -62,33 +47,34 @@ def smooth(
         spins so fast that its rotations have no mean
     """
     motion = take.motion
-    span, shares = range_weights(take, frames, border_s)
+    span, shares = range_weights(take, command.frames, command.border_s)
     every = range(take.skeleton.joint_count)
-    chosen = list(every) if joints is None else sorted({take.joint(one) for one in joints})
-    columns = slice(None) if joints is None else chosen
-    weights = _weights(take, method, window_s, order)
+    chosen = list(every) if command.joints is None else sorted({take.joint(one) for one in command.joints})
+    columns = slice(None) if command.joints is None else chosen
+    weights = _weights(take, command)
     take.budget.spend(take.size * min(PER_TAP * len(weights), MOST_OF_TAPS))
     root, rotations, translations = motion.root_translations.copy(), motion.rotations.copy(), motion.translations.copy()
-    if root_translation:
+    if command.root_translation:
         root[span] += shares[:, None] * (_smooth_positions(root, weights) - root)[span]
     smoothed = _smooth_rotations(take, rotations[:, columns], weights, chosen)[span]
     rotations[span, columns] = blended(rotations[span, columns], smoothed, shares)
     carriers = take.skeleton.path_to_root(take.body.pelvis) if motion.translated_joints else ()
-    moved = [root_translation if joint in carriers else joint in chosen for joint in motion.translated_joints]
+    moved = [command.root_translation if joint in carriers else joint in chosen for joint in motion.translated_joints]
     steps = _smooth_positions(translations[:, moved], weights) - translations[:, moved]
     translations[span, moved] += shares[:, None, None] * steps[span]
     return take.moved(motion._replace(root_translations=root, rotations=rotations, translations=translations))
 
 
-def _weights(take: Take, method: str, window_s: float, order: int) -> Floats:
+def _weights(take: Take, command: Smooth) -> Floats:
     """Symmetric weights (2 n + 1,) that sum to 1; a motion that is shorter than the window gets a shorter one."""
-    asked = max(1, int(0.5 * window_s * take.frame_rate_hz + 1e-9))
+    asked = max(1, int(0.5 * command.window_s * take.frame_rate_hz + 1e-9))
     reach = min(asked, take.frame_count - 1)
-    if method == "gaussian":
+    if command.method == "gaussian":
         bell = np.exp(-0.5 * (3.0 * np.arange(-reach, reach + 1) / asked) ** 2)
         return np.asarray(bell / bell.sum(), dtype=np.float64)
     from scipy.signal import savgol_coeffs
 
+    order = command.order
     if order > 2 * asked:
         raise EditError(
             f"a window of {2 * asked + 1} frames is too short for polynomials of degree {order}; at "

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
-from marey_motion.kinematics import CONTACT_SPEED_M_S
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.contacts import TOE_SPEED_M_S
 
 CM_PER_M = 100.0
 
@@ -67,7 +67,7 @@ def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -
     """
     moved = np.linalg.norm(np.diff(toes, axis=1), axis=-1)
     speeds = moved / np.diff(time_functions, axis=1)[..., None] * frame_rate_hz
-    return np.asarray((speeds < CONTACT_SPEED_M_S).mean(axis=0) > 0.5)
+    return np.asarray((speeds < TOE_SPEED_M_S).mean(axis=0) > 0.5)
 
 
 def foot_quality(

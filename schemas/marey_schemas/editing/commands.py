@@ -7,11 +7,11 @@ degrees where a name ends in `_deg`. Directions and positions are those of the w
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from marey_schemas.base import Request
+from marey_schemas.base import Tagged
 from marey_schemas.names import ItemId, JointName
 from marey_schemas.options.annotations import ContactOptions
 
@@ -46,13 +46,19 @@ Axis = Annotated[tuple[Metres, Metres, Metres], AfterValidator(_require_directio
 WHOLE_OR_RANGE = "Half-open range of frames; absent: all."
 
 
+class NamedCommand(Tagged):
+    """Base of the commands of an edit."""
+
+    tag: ClassVar[str] = "command"
+
+
 # Frames and time
 
 
-class Trim(Request):
+class Trim(NamedCommand):
     """Keep a range of frames."""
 
-    command: Literal["trim"]
+    command: Literal["trim"] = "trim"
     start: Frame = Field(0, description="The first frame to keep.")
     stop: Frame | None = Field(None, description="The frame after the last one to keep; absent: up to the end.")
 
@@ -63,10 +69,10 @@ class Trim(Request):
         return self
 
 
-class Split(Request):
+class Split(NamedCommand):
     """Cut into several clips; the commands that follow apply to each."""
 
-    command: Literal["split"]
+    command: Literal["split"] = "split"
     at: tuple[Annotated[int, Field(ge=1, le=MOST_FRAME)], ...] = Field(
         min_length=1, max_length=1000, description="Cut before each of these frames, in increasing order."
     )
@@ -78,10 +84,10 @@ class Split(Request):
         return self
 
 
-class Concatenate(Request):
+class Concatenate(NamedCommand):
     """Append another clip of the same skeleton."""
 
-    command: Literal["concatenate"]
+    command: Literal["concatenate"] = "concatenate"
     source: ItemId = Field(description="The clip to append.")
     place: Literal["seam", "keep"] = Field(
         "seam",
@@ -97,28 +103,28 @@ class Concatenate(Request):
     blend_s: Seconds = Field(0.3, description="Duration of the blend in seconds; 0: a hard cut.")
 
 
-class Resample(Request):
+class Resample(NamedCommand):
     """The same motion at another frame rate."""
 
-    command: Literal["resample"]
+    command: Literal["resample"] = "resample"
     frame_rate_hz: float = Field(
         ge=0.1, le=100_000, allow_inf_nan=False, description="New frame rate, in frames per second."
     )
 
 
-class Retime(Request):
+class Retime(NamedCommand):
     """Faster or slower at the same frame rate."""
 
-    command: Literal["retime"]
+    command: Literal["retime"] = "retime"
     speed: float = Field(
         ge=0.01, le=100, allow_inf_nan=False, description="Speed factor; 2: twice as fast, in half the time."
     )
 
 
-class CloseLoop(Request):
+class CloseLoop(NamedCommand):
     """Change poses so that the last frame continues seamlessly with the first one."""
 
-    command: Literal["close_loop"]
+    command: Literal["close_loop"] = "close_loop"
     in_place: bool = Field(
         False, description="Remove the travel and turn of one cycle, so that each cycle starts at the same place."
     )
@@ -132,17 +138,17 @@ class CloseLoop(Request):
 # Where the body is
 
 
-class Translate(Request):
+class Translate(NamedCommand):
     """Shift the whole motion."""
 
-    command: Literal["translate"]
+    command: Literal["translate"] = "translate"
     shift_m: Shift = Field(description="Shift in metres along x, y and z.")
 
 
-class Rotate(Request):
+class Rotate(NamedCommand):
     """Turn the whole motion about an axis of the world."""
 
-    command: Literal["rotate"]
+    command: Literal["rotate"] = "rotate"
     angle_deg: Degrees = Field(
         description="Angle about `axis`, in degrees; about the vertical, positive is to the left."
     )
@@ -153,27 +159,27 @@ class Rotate(Request):
     )
 
 
-class Face(Request):
+class Face(NamedCommand):
     """Turn the whole motion about the vertical so that a frame faces a given way."""
 
-    command: Literal["face"]
+    command: Literal["face"] = "face"
     heading_deg: Degrees = Field(0.0, description="Heading in degrees; 0 faces +z, and positive is to the left.")
     frame: Frame = Field(
         0, description="The frame in which the body shall face there; its position in that frame does not change."
     )
 
 
-class MoveToOrigin(Request):
+class MoveToOrigin(NamedCommand):
     """Shift the whole motion on the ground so that the body is above the origin in a frame; heights stay."""
 
-    command: Literal["move_to_origin"]
+    command: Literal["move_to_origin"] = "move_to_origin"
     frame: Frame = Field(0, description="The frame in which the body shall be at the place.")
 
 
-class Scale(Request):
+class Scale(NamedCommand):
     """Scale where the body goes, heights too. The skeleton is an item of its own and keeps its size."""
 
-    command: Literal["scale"]
+    command: Literal["scale"] = "scale"
     factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="Scale factor, about the origin.")
     translations: bool = Field(False, description="Also scale the translations of joints other than the root.")
 
@@ -181,10 +187,10 @@ class Scale(Request):
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
-class FlipAxes(Request):
+class FlipAxes(NamedCommand):
     """Turn a world whose axes stand otherwise, such as Blender's with Z up, to Y up."""
 
-    command: Literal["flip_axes"]
+    command: Literal["flip_axes"] = "flip_axes"
     up: SignedAxis = Field("+z", description="The axis of the clip that points up now.")
     forward: SignedAxis = Field("-y", description="The axis that shall become +z; it is orthogonal to `up`.")
 
@@ -195,10 +201,10 @@ class FlipAxes(Request):
         return self
 
 
-class FixDrift(Request):
+class FixDrift(NamedCommand):
     """Spread a wanted shift and turn of the body over a range of frames; those after it get all of it."""
 
-    command: Literal["fix_drift"]
+    command: Literal["fix_drift"] = "fix_drift"
     shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range.")
     turn_deg: Degrees = Field(
         0.0, description="Turn of the end of the range about the vertical, in degrees, positive to the left."
@@ -212,26 +218,26 @@ class FixDrift(Request):
 # The ground
 
 
-class MoveToGround(Request):
+class MoveToGround(NamedCommand):
     """Bring the ground to height zero."""
 
-    command: Literal["move_to_ground"]
+    command: Literal["move_to_ground"] = "move_to_ground"
     height_m: Metres | None = Field(
         None,
         description="Present height of the ground, in metres; absent: estimated from the feet during their contacts.",
     )
 
 
-class FindGround(Request):
+class FindGround(NamedCommand):
     """Estimate the height of the ground from the feet while they stand; changes nothing."""
 
-    command: Literal["find_ground"]
+    command: Literal["find_ground"] = "find_ground"
 
 
-class FindContacts(ContactOptions):
+class FindContacts(NamedCommand, ContactOptions):
     """Find when the feet stand; changes nothing."""
 
-    command: Literal["find_contacts"]
+    command: Literal["find_contacts"] = "find_contacts"
     height_limit_m: float | None = Field(
         0.1,
         gt=0,
@@ -244,16 +250,16 @@ class FindContacts(ContactOptions):
 # The pose
 
 
-class Mirror(Request):
+class Mirror(NamedCommand):
     """Swap left and right, by the skeleton's own symmetry."""
 
-    command: Literal["mirror"]
+    command: Literal["mirror"] = "mirror"
 
 
-class Smooth(Request):
+class Smooth(NamedCommand):
     """Smooth rotations and translations over time; the first and last frame stay."""
 
-    command: Literal["smooth"]
+    command: Literal["smooth"] = "smooth"
     method: Literal["savitzky_golay", "gaussian"] = Field(
         "savitzky_golay", description="Filter: savitzky_golay keeps peaks, gaussian flattens them."
     )
@@ -273,10 +279,10 @@ class Smooth(Request):
     )
 
 
-class RotateJoint(Request):
+class RotateJoint(NamedCommand):
     """Add a rotation to a joint."""
 
-    command: Literal["rotate_joint"]
+    command: Literal["rotate_joint"] = "rotate_joint"
     joint: JointName = Field(description="Name of the joint.")
     angle_deg: Degrees = Field(description="Angle of the turn, in degrees; less in the frames that are blended.")
     axis: Axis = Field(description="Direction of the rotation axis.")
@@ -289,10 +295,10 @@ class RotateJoint(Request):
     )
 
 
-class Paste(Request):
+class Paste(NamedCommand):
     """Put the motion of joints of another clip in place of their own, stretched in time to fit."""
 
-    command: Literal["paste"]
+    command: Literal["paste"] = "paste"
     source: ItemId = Field(description="The clip to copy from.")
     joints: Joints = Field(description="Joints to copy; both skeletons have them, with the same axes.")
     source_frames: Frames | None = Field(None, description="Half-open range of frames to copy; absent: the whole clip.")

@@ -6,15 +6,19 @@ rotations unit quaternions (w, x, y, z) in the world; offsets and axes are in th
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from marey_schemas.base import Request
-from marey_schemas.editing.commands import WHOLE_OR_RANGE, Axis, Frames, Seconds, Shift
+from marey_schemas.base import Options, Request, Tagged
+from marey_schemas.editing.commands import WHOLE_OR_RANGE, Axis, Frames, NamedCommand, Seconds, Shift
 from marey_schemas.names import JointName
+from marey_schemas.options.contacts import TOE_SPEED_M_S
 
 MOST_CONSTRAINTS = 256
+
+Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
+Solver = Literal["auto", "ccd", "two_bone", "least_squares"]
 
 Quaternion = tuple[float, float, float, float]
 
@@ -47,7 +51,8 @@ def _require_range(angles: tuple[float, float]) -> tuple[float, float]:
 AngleRange = Annotated[tuple[HalfTurn, HalfTurn], AfterValidator(_require_range)]
 
 
-class _Constraint(Request):
+class _Constraint(Tagged):
+    tag: ClassVar[str] = "kind"
     joint: JointName
     frames: Frames | None = Field(None, description=WHOLE_OR_RANGE)
     top: JointName | None = Field(
@@ -67,14 +72,12 @@ class _Constraint(Request):
 class PositionConstraint(_Constraint):
     """A joint, or a point that it carries, is somewhere. Without a place or a shift it stays where it first is."""
 
-    kind: Literal["position"]
+    kind: Literal["position"] = "position"
     point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
     shift_m: Shift | None = Field(
         None, description="Shift of the joint from its position in each frame, in metres; an alternative to `point_m`."
     )
-    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = Field(
-        "xyz", description="Coordinates that are constrained."
-    )
+    axes: Axes = Field("xyz", description="Coordinates that are constrained.")
     offset_m: Shift = Field(
         (0.0, 0.0, 0.0), description="Offset of the constrained point from the joint, in the joint's frame."
     )
@@ -91,7 +94,7 @@ class PositionConstraint(_Constraint):
 class OrientationConstraint(_Constraint):
     """A joint is turned in a certain way. Without a rotation it stays as it first is."""
 
-    kind: Literal["orientation"]
+    kind: Literal["orientation"] = "orientation"
     rotation: Rotation | None = Field(
         None, description="Target rotation in the world, as a unit quaternion (w, x, y, z)."
     )
@@ -100,7 +103,7 @@ class OrientationConstraint(_Constraint):
 class LookAtConstraint(_Constraint):
     """A joint looks, or points, at something."""
 
-    kind: Literal["look_at"]
+    kind: Literal["look_at"] = "look_at"
     point_m: Shift
     axis: Axis | None = Field(
         None,
@@ -113,18 +116,22 @@ class LookAtConstraint(_Constraint):
 AnyConstraint = Annotated[PositionConstraint | OrientationConstraint | LookAtConstraint, Field(discriminator="kind")]
 
 
-class HingeLimit(Request):
+class _Limit(Tagged):
+    tag: ClassVar[str] = "kind"
+
+
+class HingeLimit(_Limit):
     """A joint turns about its swing axis alone, as knees and elbows do."""
 
-    kind: Literal["hinge"]
+    kind: Literal["hinge"] = "hinge"
     joint: JointName
     angle_deg: AngleRange = Field(description="Least and greatest angle from the rest pose, in degrees.")
 
 
-class ConeLimit(Request):
+class ConeLimit(_Limit):
     """A joint's bone stays in an elliptical cone about where it is in the rest pose."""
 
-    kind: Literal["cone"]
+    kind: Literal["cone"] = "cone"
     joint: JointName
     swing_deg: tuple[Opening, Opening] = Field(
         description="Greatest swing about the swing axis and across it, in degrees."
@@ -135,12 +142,12 @@ class ConeLimit(Request):
 AnyLimit = Annotated[HingeLimit | ConeLimit, Field(discriminator="kind")]
 
 
-class Constrain(Request):
+class Constrain(NamedCommand):
     """Meet constraints in ranges of frames by inverse kinematics, blended in and out with B-splines."""
 
-    command: Literal["constrain"]
+    command: Literal["constrain"] = "constrain"
     constraints: tuple[AnyConstraint, ...] = Field(min_length=1, max_length=MOST_CONSTRAINTS)
-    solver: Literal["auto", "ccd", "two_bone", "least_squares"] = Field(
+    solver: Solver = Field(
         "auto", description="Solver; auto: closed form for limbs, damped least squares for everything else."
     )
     blend_s: Seconds = Field(
@@ -162,15 +169,11 @@ class FootContact(Request):
     frames: Frames
 
 
-class PlantFeet(Request):
-    """Keep feet where they stand."""
+class PlantOptions(Options):
+    """Detection of the contacts of feet, and the blending around them."""
 
-    command: Literal["plant_feet"]
-    contacts: tuple[FootContact, ...] | None = Field(
-        None, max_length=100_000, description="Contacts of the feet; absent: detected by the speed of the feet."
-    )
     speed_m_s: float = Field(
-        0.15,
+        TOE_SPEED_M_S,
         gt=0,
         le=100,
         allow_inf_nan=False,
@@ -187,6 +190,15 @@ class PlantFeet(Request):
         le=90,
         allow_inf_nan=False,
         description="Angle before full extension at which a stretching knee is damped.",
+    )
+
+
+class PlantFeet(NamedCommand, PlantOptions):
+    """Keep feet where they stand."""
+
+    command: Literal["plant_feet"] = "plant_feet"
+    contacts: tuple[FootContact, ...] | None = Field(
+        None, max_length=100_000, description="Contacts of the feet; absent: detected by the speed of the feet."
     )
 
 

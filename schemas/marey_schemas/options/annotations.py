@@ -8,12 +8,12 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Options
 from marey_schemas.names import JointName
+from marey_schemas.options.contacts import STANCE_SPEED_M_S
 
 Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
-CONTACT_SPEED_M_S = 0.5
 OUT_OF_REST = 0.25
 """Share of the farthest reach from which on a hand is on its way."""
 
@@ -22,7 +22,7 @@ class ContactOptions(Options):
     """Detection of the contacts of a foot with the ground."""
 
     speed_m_s: float = Field(
-        CONTACT_SPEED_M_S,
+        STANCE_SPEED_M_S,
         gt=0,
         le=100,
         allow_inf_nan=False,
@@ -49,7 +49,7 @@ class StepsProposal(Options):
 
     method: Literal["steps"] = Field("steps", description="Name of the method that proposes segments and keyframes.")
     contact_speed_m_s: float = Field(
-        CONTACT_SPEED_M_S,
+        STANCE_SPEED_M_S,
         gt=0,
         le=10,
         allow_inf_nan=False,

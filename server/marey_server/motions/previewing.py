@@ -75,7 +75,7 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
 
     Raises `InvalidProblem` where the commands cannot be applied or there is no such frame.
     """
-    from marey_motion.documents import clip_to_document, commands_of_edit
+    from marey_motion.documents import clip_to_document
     from marey_motion.editing.registry import edit_clip
     from marey_motion.errors import MotionError
     from marey_motion.kinematics import global_positions
@@ -83,8 +83,9 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
     try:
         clip, body = _clip_of(source, source.motion)
         sources = {name: _clip_of(source, tree)[0] for name, tree in source.sources.items()}
-        commands = commands_of_edit(source.edit)
-        made = edit_clip(clip, commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK)
+        made = edit_clip(
+            clip, source.edit.commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK
+        )
     except MotionError as error:
         if error.code in ("edit-too-large", "edit-too-long"):
             raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error

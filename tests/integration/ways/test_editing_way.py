@@ -17,7 +17,7 @@ from marey_client.errors import Invalid, RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
 from marey_motion.clip import Clip
-from marey_motion.documents import clip_from_document, commands_of_edit, skeleton_from_document
+from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.editing.registry import edit_clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
@@ -67,7 +67,7 @@ def test_an_edit_is_saved_applied_to_a_folder_and_replayed_exactly(marey: Marey,
 
     originals, made = clips_of(lab, "walks"), clips_of(lab, "clean/walks")
     assert made.keys() == originals.keys()
-    commands = commands_of_edit(edit.document())
+    commands = edit.document().commands
     for name, clip in made.items():
         assert clip.item.tags == ("clean",)
         (here,) = edit_clip(as_motion(lab, originals[name]), commands)

@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
-from marey_motion.documents import commands_of_edit
 from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import game_skeleton, generate_gait
@@ -39,7 +38,7 @@ def _edited(clip: Clip, *commands: dict[str, Any]) -> EditedClip:
     document = EditDocument.model_validate({"commands": commands})
     again = EditDocument.model_validate_json(json.dumps(document.model_dump(mode="json", by_alias=True)))
     assert again == document
-    return edit_clip(clip, commands_of_edit(again))[0]
+    return edit_clip(clip, again.commands)[0]
 
 
 def _constrain(*constraints: dict[str, Any], **options: Any) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def labelled(layer):
 
 
 def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too():
-    split = annotations.split_segment(WALK, 14)
+    split = annotations.split_segment(WALK, 14, None)
     assert labelled(split) == labelled(WALK)
     assert split.segments[1:3] == (Segment("right", 10, 14), Segment("right", 14, 18))
     at_the_last = annotations.split_segment(WALK, 17, "end")
@@ -35,13 +35,13 @@ def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too():
 
 def test_a_segment_is_not_split_before_its_first_frame():
     with pytest.raises(AnnotationError, match=r"segment 'right' 10:18: it starts at frame 10") as refused:
-        annotations.split_segment(WALK, 10)
+        annotations.split_segment(WALK, 10, None)
     assert refused.value.code == "empty-segment"
 
 
 def test_a_new_segment_over_others_is_refused_by_the_name_of_the_first_in_the_way():
     with pytest.raises(AnnotationError, match=r"'turn' 16:24: segment 'right' 10:18 has some of its frames"):
-        annotations.create_segment(WALK, "turn", 16, 24)
+        annotations.create_segment(WALK, "turn", 16, 24, overwrite=False)
 
 
 def test_a_new_segment_that_overwrites_cuts_what_is_there():
@@ -60,7 +60,7 @@ def test_what_is_no_segment_of_the_clip_is_refused(start, end, code, overwrite):
 
 
 def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named():
-    assert annotations.merge_segment(WALK, 12).segments[-1] == Segment("right", 10, 30)
+    assert annotations.merge_segment(WALK, 12, "next").segments[-1] == Segment("right", 10, 30)
     assert annotations.merge_segment(WALK, 12, "previous").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 12, "nearest").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 29, "nearest").segments[-1] == Segment("stand", 10, 30)

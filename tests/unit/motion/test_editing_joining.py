@@ -1,6 +1,7 @@
 """Clips put after one another."""
 
 from dataclasses import replace
+from math import degrees
 
 import numpy as np
 import pytest
@@ -21,12 +22,13 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.kinematics import global_positions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
+from marey_schemas.editing.commands import Concatenate, Rotate, Translate
 
 BLENDS = ("inertialise", "slerp")
 
 
 def join(first: Clip, second: Clip, **given: object) -> Clip:
-    return apply_edit(first, [("concatenate", {"source": "second", **given})], sources={"second": second})
+    return apply_edit(first, [Concatenate(source="second", **given)], sources={"second": second})
 
 
 def heading_of(clip: Clip) -> np.ndarray:
@@ -39,7 +41,7 @@ def heading_of(clip: Clip) -> np.ndarray:
 @pytest.mark.parametrize("away", [0.0, 2.5])
 def test_the_second_goes_on_where_the_first_ends(blend: str, away: float) -> None:
     first = make_walk(turn_rate_rad_s=0.6)
-    elsewhere = [("rotate", {"angle_rad": away}), ("translate", {"shift_m": (5.0, 0.0, -3.0)})]
+    elsewhere = [Rotate(angle_deg=degrees(away)), Translate(shift_m=(5.0, 0.0, -3.0))]
     second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
     joined = join(first, second, blend=blend)
     require_sound(joined)
@@ -110,12 +112,12 @@ def test_clips_of_other_skeletons_are_refused() -> None:
 
 def test_unknown_sources_are_told_with_those_that_there_are() -> None:
     with pytest.raises(EditError, match=r"no source is called 'third'; there is second"):
-        apply_edit(make_walk(), [("concatenate", {"source": "third"})], sources={"second": make_walk()})
+        apply_edit(make_walk(), [Concatenate(source="third")], sources={"second": make_walk()})
 
 
 def test_joining_stops_before_memory_does() -> None:
     walk = make_walk()
-    again = [("concatenate", {"source": "walk"})] * 40
+    again = [Concatenate(source="walk")] * 40
     with pytest.raises(EditError, match="the result would have") as refused:
         apply_edit(walk, again, sources={"walk": walk}, most_numbers=20 * walk.poses.size)
     assert refused.value.code == "edit-too-large"
@@ -160,7 +162,7 @@ def test_feet_and_heading_go_on_at_the_seam(blend: str, start: int) -> None:
 @pytest.mark.parametrize("turned_by", [0.0, 1.5, 3.1])
 def test_bodies_under_a_static_root_are_joined_as_bodies_that_are_the_root(blend: str, turned_by: float) -> None:
     first = make_walk(turn_rate_rad_s=0.6)
-    elsewhere = [("rotate", {"angle_rad": turned_by}), ("translate", {"shift_m": (5.0, 0.0, -3.0)})]
+    elsewhere = [Rotate(angle_deg=degrees(turned_by)), Translate(shift_m=(5.0, 0.0, -3.0))]
     second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
     joined = join(under_static_root(first), under_static_root(second), blend=blend)
     require_sound(joined)

@@ -13,6 +13,7 @@ from marey_motion.looping import LoopSeam, continue_motion, loop_seam
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 from marey_motion.rigs import map_joints
+from marey_schemas.editing.commands import CloseLoop
 
 
 def seam_of(clip: Clip) -> LoopSeam:
@@ -33,7 +34,7 @@ def accelerations_around_the_seam(clip: Clip, seam: LoopSeam) -> np.ndarray:
 @pytest.mark.parametrize("turn_rate_rad_s", [0.0, 0.7])
 def test_the_last_frame_leads_into_the_first(in_place: bool, turn_rate_rad_s: float) -> None:
     walk = make_breathing_walk(turn_rate_rad_s=turn_rate_rad_s).sliced(5, 100)
-    closed = apply_edit(walk, [("close_loop", {"in_place": in_place})])
+    closed = apply_edit(walk, [CloseLoop(in_place=in_place)])
     assert closed.frame_count == walk.frame_count
     require_sound(closed)
     seam = LoopSeam(0.0, np.zeros(2)) if in_place else seam_of(closed)
@@ -46,7 +47,7 @@ def test_the_last_frame_leads_into_the_first(in_place: bool, turn_rate_rad_s: fl
 
 def test_a_loop_in_place_ends_where_it_starts() -> None:
     walk = make_walk(turn_rate_rad_s=0.7).sliced(5, 100)
-    closed = apply_edit(walk, [("close_loop", {"in_place": True})])
+    closed = apply_edit(walk, [CloseLoop(in_place=True)])
     seam = seam_of(closed)
     assert abs(seam.turn_rad) < 0.02
     assert np.abs(seam.shift_m).max() < 0.02
@@ -54,15 +55,15 @@ def test_a_loop_in_place_ends_where_it_starts() -> None:
 
 def test_poses_far_from_the_seam_stay_where_the_blend_is_short() -> None:
     walk = make_walk().sliced(5, 125)
-    closed = apply_edit(walk, [("close_loop", {"blend_s": 0.3})])
+    closed = apply_edit(walk, [CloseLoop(blend_s=0.3)])
     assert same_poses(closed.sliced(18, 102), walk.sliced(18, 102))
     assert not same_poses(closed.sliced(0, 10), walk.sliced(0, 10))
 
 
 def test_what_loops_already_hardly_changes() -> None:
     walk = make_walk().sliced(5, 100)
-    once = apply_edit(walk, [("close_loop", {})])
-    twice = apply_edit(once, [("close_loop", {})])
+    once = apply_edit(walk, [CloseLoop()])
+    twice = apply_edit(once, [CloseLoop()])
     first, second = (
         np.abs(global_positions(after) - global_positions(before)).max()
         for before, after in ((walk, once), (once, twice))
@@ -72,15 +73,13 @@ def test_what_loops_already_hardly_changes() -> None:
 
 def test_a_loop_needs_some_frames() -> None:
     with pytest.raises(EditError, match="at least 4 frames, there are 3"):
-        apply_edit(make_walk().sliced(0, 3), [("close_loop", {})])
+        apply_edit(make_walk().sliced(0, 3), [CloseLoop()])
 
 
 @pytest.mark.parametrize("in_place", [False, True])
 def test_a_body_under_a_static_root_is_looped_as_a_body_that_is_the_root(in_place: bool) -> None:
     walk = make_walk(turn_rate_rad_s=0.7).sliced(5, 100)
-    closed, own = (
-        apply_edit(clip, [("close_loop", {"in_place": in_place})]) for clip in (under_static_root(walk), walk)
-    )
+    closed, own = (apply_edit(clip, [CloseLoop(in_place=in_place)]) for clip in (under_static_root(walk), walk))
     require_sound(closed)
     assert np.abs(global_positions(closed)[:, 1:] - global_positions(own)).max() < 1e-4
     assert np.abs(closed.rotations[:, 0] - (1.0, 0.0, 0.0, 0.0)).max() < 1e-5

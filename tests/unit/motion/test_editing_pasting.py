@@ -1,6 +1,7 @@
 """Joints taken from other clips, and rotations added to joints."""
 
 from dataclasses import replace
+from math import degrees
 
 import numpy as np
 import pytest
@@ -10,12 +11,13 @@ from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError, UnknownJoint
+from marey_schemas.editing.commands import Paste, RotateJoint
 
 ARM = ["LeftArm", "LeftForeArm", "LeftHand"]
 
 
 def paste(clip: Clip, source: Clip, **given: object) -> Clip:
-    return apply_edit(clip, [("paste", {"source": "other", "joints": ARM, **given})], sources={"other": source})
+    return apply_edit(clip, [Paste(source="other", joints=ARM, **given)], sources={"other": source})
 
 
 def indices(clip: Clip, names: list[str]) -> list[int]:
@@ -86,7 +88,7 @@ def test_what_is_not_there_cannot_be_copied() -> None:
     with pytest.raises(EditError, match=r"source_frames: the frames 0:9999"):
         paste(walk, walk, source_frames=(0, 9999))
     with pytest.raises(UnknownJoint, match="LeftHand"):
-        apply_edit(walk, [("paste", {"source": "other", "joints": ["LeftHans"]})], sources={"other": walk})
+        apply_edit(walk, [Paste(source="other", joints=["LeftHans"])], sources={"other": walk})
 
 
 @pytest.mark.parametrize("space", ["joint", "parent", "world"])
@@ -95,8 +97,8 @@ def test_a_rotation_is_added_in_the_axes_that_are_asked_for(space: str) -> None:
     joint = walk.skeleton.index_of("LeftArm")
     parent = int(walk.skeleton.parents[joint])
     axis, angle = np.array([0.3, -0.5, 0.8]), 0.7
-    given = {"joint": "LeftArm", "axis": tuple(axis), "angle_rad": angle, "space": space}
-    bent = apply_edit(walk, [("rotate_joint", given)])
+    given = RotateJoint(joint="LeftArm", axis=tuple(axis), angle_deg=degrees(angle), space=space)
+    bent = apply_edit(walk, [given])
     before, after = (
         kinematics.as_global_rotations(walk.skeleton, clip.rotations.astype(np.float64)) for clip in (walk, bent)
     )
@@ -105,14 +107,14 @@ def test_a_rotation_is_added_in_the_axes_that_are_asked_for(space: str) -> None:
     frame = {"world": np.array([1.0, 0.0, 0.0, 0.0]), "parent": before[:, parent], "joint": before[:, joint]}[space]
     wished = quaternions.multiply(frame, quaternions.multiply(turn, quaternions.conjugate(frame)))
     assert turned(np.asarray(change), np.broadcast_to(wished, change.shape)).max() < 1e-5
-    back = apply_edit(bent, [("rotate_joint", {**given, "angle_rad": -angle})])
+    back = apply_edit(bent, [given.replace(angle_deg=degrees(-angle))])
     assert turned(back.rotations, walk.rotations).max() < 1e-5
 
 
 def test_a_rotation_of_a_range_grows_and_shrinks_over_its_borders() -> None:
     walk = make_walk()
-    given = {"joint": "Head", "axis": (0.0, 1.0, 0.0), "angle_rad": 0.8, "frames": (60, 120), "border_s": 0.3}
-    bent = apply_edit(walk, [("rotate_joint", given)])
+    turn = RotateJoint(joint="Head", axis=(0.0, 1.0, 0.0), angle_deg=degrees(0.8), frames=(60, 120), border_s=0.3)
+    bent = apply_edit(walk, [turn])
     head = walk.skeleton.index_of("Head")
     change = turned(bent.rotations[:, head], walk.rotations[:, head])
     assert np.array_equal(bent.poses[:60], walk.poses[:60])
@@ -124,8 +126,8 @@ def test_a_rotation_of_a_range_grows_and_shrinks_over_its_borders() -> None:
 
 def test_the_root_turns_in_the_axes_of_the_world() -> None:
     walk = make_walk()
-    given = {"joint": "Hips", "axis": (0.0, 1.0, 0.0), "angle_rad": 0.4}
-    in_world = apply_edit(walk, [("rotate_joint", {**given, "space": "world"})])
-    in_parent = apply_edit(walk, [("rotate_joint", {**given, "space": "parent"})])
+    given = {"joint": "Hips", "axis": (0.0, 1.0, 0.0), "angle_deg": 20.0}
+    in_world = apply_edit(walk, [RotateJoint(**given, space="world")])
+    in_parent = apply_edit(walk, [RotateJoint(**given, space="parent")])
     assert np.array_equal(in_world.poses, in_parent.poses)
     assert np.array_equal(in_world.root_translations, walk.root_translations)

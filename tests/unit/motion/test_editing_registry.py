@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic_core import PydanticUndefined
+from pydantic import ValidationError
 from tests.support.edit_examples import EXAMPLES, SOURCE, commands_of_all
 from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
 
 from marey_motion.clip import Clip
-from marey_motion.documents import commands_of_edit
 from marey_motion.editing.registry import COMMANDS, EditedClip, apply_edit, edit_clip
 from marey_motion.errors import EditError, MotionError
+from marey_schemas.editing.commands import NamedCommand, Rotate, Scale, Split, Trim
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 
@@ -22,7 +22,7 @@ def edit_of(*commands: dict[str, Any]) -> EditDocument:
 
 
 def applied(clip: Clip, *commands: dict[str, Any]) -> tuple[EditedClip, ...]:
-    return edit_clip(clip, commands_of_edit(edit_of(*commands)), sources={SOURCE: make_walk(speed_m_s=2.5)})
+    return edit_clip(clip, edit_of(*commands).commands, sources={SOURCE: make_walk(speed_m_s=2.5)})
 
 
 def test_every_command_has_a_schema_and_every_schema_a_command() -> None:
@@ -30,24 +30,20 @@ def test_every_command_has_a_schema_and_every_schema_a_command() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_schema_and_function_take_the_same_parameters_with_the_same_defaults(name: str) -> None:
-    _take, *parameters = inspect.signature(COMMANDS[name]).parameters.values()
-    assert all(parameter.kind is parameter.KEYWORD_ONLY for parameter in parameters)
-    functions = {parameter.name: parameter.default for parameter in parameters}
-    schema = {
-        field: info.get_default(call_default_factory=True)
-        for field, info in COMMAND_MODELS[name].model_fields.items()
-        if field != "command"
-    }
-    assert {field.replace("_deg", "_rad") for field in schema} == set(functions)
-    for field, default in schema.items():
-        wanted = functions[field.replace("_deg", "_rad")]
-        if default is PydanticUndefined:
-            assert wanted is inspect.Parameter.empty, field
-        elif field.endswith("_deg"):
-            assert default == pytest.approx(degrees(wanted)), field
-        else:
-            assert (default or None) == (wanted or None), field
+def test_the_function_of_a_command_takes_the_model_that_declares_its_parameters(name: str) -> None:
+    _take, command = inspect.signature(COMMANDS[name], eval_str=True).parameters.values()
+    assert command.annotation is COMMAND_MODELS[name]
+    assert command.default is inspect.Parameter.empty
+
+
+@pytest.mark.parametrize("model", COMMAND_MODELS.values())
+def test_the_name_of_a_command_is_its_default_in_python_and_required_in_documents(model: type[NamedCommand]) -> None:
+    schema = model.model_json_schema()
+    assert "command" in schema["required"]
+    (given, *_) = EXAMPLES[schema["properties"]["command"]["const"]]
+    command = model(**given)
+    assert command.model_dump(exclude_unset=True).keys() == {"command", *given}
+    assert EditDocument(commands=(command,)) == edit_of(command.model_dump(mode="json", exclude_unset=True))
 
 
 @pytest.mark.parametrize("command", commands_of_all(), ids=lambda command: command["command"])
@@ -75,8 +71,8 @@ def test_a_saved_edit_gives_the_same_bytes_every_time() -> None:
     assert again == edit
     walk = make_breathing_walk()
     sources = {SOURCE: make_walk(speed_m_s=2.5)}
-    (first,) = edit_clip(walk, commands_of_edit(edit), sources=sources)
-    (second,) = edit_clip(walk, commands_of_edit(again), sources=sources)
+    (first,) = edit_clip(walk, edit.commands, sources=sources)
+    (second,) = edit_clip(walk, again.commands, sources=sources)
     assert first.clip.poses.tobytes() == second.clip.poses.tobytes()
     assert first.clip.translations is not None
     assert second.clip.translations is not None
@@ -94,7 +90,7 @@ def test_the_clip_that_is_edited_stays_as_it_is() -> None:
 
 def test_several_commands_are_rounded_once() -> None:
     walk = make_walk()
-    there_and_back = [("rotate", {"angle_rad": sign * 0.1}) for sign in (1.0, -1.0) for _ in range(30)]
+    there_and_back = [Rotate(angle_deg=degrees(sign * 0.1)) for sign in (1.0, -1.0) for _ in range(30)]
     assert np.abs(apply_edit(walk, there_and_back).poses - walk.poses).max() < 3e-7
 
 
@@ -109,17 +105,17 @@ def test_what_goes_wrong_is_told_with_the_number_of_the_command() -> None:
 
 
 def test_unknown_commands_and_parameters_are_refused_by_name() -> None:
-    with pytest.raises(EditError, match="no command is called 'wobble'; there are trim, split"):
-        apply_edit(make_walk(), [("wobble", {})])
-    with pytest.raises(EditError, match="unexpected keyword argument 'to'"):
-        apply_edit(make_walk(), [("trim", {"to": 5})])
+    with pytest.raises(ValidationError, match=r"'wobble'.*'trim', 'split'"):
+        edit_of({"command": "wobble"})
+    with pytest.raises(ValidationError, match=r"to\n  Extra inputs are not permitted"):
+        Trim(to=5)
 
 
 def test_one_clip_is_not_asked_of_what_makes_several() -> None:
     with pytest.raises(EditError, match="make 2 clips of one"):
-        apply_edit(make_walk(), [("split", {"at": [50]})])
+        apply_edit(make_walk(), [Split(at=[50])])
 
 
 def test_numbers_that_overflow_are_refused_with_their_frame() -> None:
     with pytest.raises(MotionError, match="not finite"):
-        apply_edit(make_walk(), [("scale", {"factor": 1e30}), ("scale", {"factor": 1e30})])
+        apply_edit(make_walk(), [Scale(factor=1e4)] * 12)

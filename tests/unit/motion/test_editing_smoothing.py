@@ -11,6 +11,7 @@ from marey_motion.clip import Clip
 from marey_motion.editing import smoothing
 from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError, UnknownJoint
+from marey_schemas.editing.commands import Smooth
 
 METHODS = ("savitzky_golay", "gaussian")
 
@@ -34,13 +35,13 @@ def noisy(clip: Clip, size: float, seed: int = 5) -> Clip:
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_that_stay_and_straight_paths_are_kept(method: str) -> None:
     line = still_on_a_line()
-    assert same_poses(apply_edit(line, [("smooth", {"method": method, "window_s": 0.5})]), line, 1e-6)
+    assert same_poses(apply_edit(line, [Smooth(method=method, window_s=0.5)]), line, 1e-6)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_frame_is_lost_and_the_ends_stay(method: str) -> None:
     walk = noisy(make_breathing_walk(), 0.02)
-    smoothed = apply_edit(walk, [("smooth", {"method": method, "window_s": 0.3})])
+    smoothed = apply_edit(walk, [Smooth(method=method, window_s=0.3)])
     assert smoothed.frame_count == walk.frame_count
     assert same_poses(smoothed.sliced(0, 1), walk.sliced(0, 1))
     last = walk.frame_count - 1
@@ -52,7 +53,7 @@ def test_no_frame_is_lost_and_the_ends_stay(method: str) -> None:
 def test_noise_gets_less(method: str) -> None:
     walk = make_walk()
     rough = noisy(walk, 0.03)
-    smoothed = apply_edit(rough, [("smooth", {"method": method, "window_s": 0.25})])
+    smoothed = apply_edit(rough, [Smooth(method=method, window_s=0.25)])
     inner = slice(20, -20)
 
     def error(clip: Clip) -> float:
@@ -65,7 +66,7 @@ def test_noise_gets_less(method: str) -> None:
 def test_joints_that_are_not_named_stay() -> None:
     rough = noisy(make_walk(), 0.03)
     given = {"joints": ["Head", "LeftArm"], "root_translation": False}
-    smoothed = apply_edit(rough, [("smooth", given)])
+    smoothed = apply_edit(rough, [Smooth(**given)])
     chosen = [rough.skeleton.index_of(name) for name in given["joints"]]  # type: ignore[union-attr]
     others = [joint for joint in range(rough.skeleton.joint_count) if joint not in chosen]
     assert np.array_equal(smoothed.rotations[:, others], rough.rotations[:, others])
@@ -75,8 +76,8 @@ def test_joints_that_are_not_named_stay() -> None:
 
 def test_a_range_is_smoothed_and_goes_over_softly() -> None:
     rough = noisy(make_walk(), 0.03)
-    whole = apply_edit(rough, [("smooth", {"window_s": 0.3})])
-    part = apply_edit(rough, [("smooth", {"window_s": 0.3, "frames": (50, 130), "border_s": 0.2})])
+    whole = apply_edit(rough, [Smooth(window_s=0.3)])
+    part = apply_edit(rough, [Smooth(window_s=0.3, frames=(50, 130), border_s=0.2)])
     assert np.array_equal(part.poses[:50], rough.poses[:50])
     assert np.array_equal(part.poses[130:], rough.poses[130:])
     assert same_poses(part.sliced(70, 110), whole.sliced(70, 110))
@@ -91,7 +92,7 @@ def test_signs_that_flip_do_not_disturb_the_means() -> None:
     flipped = replace(
         walk, poses=np.concatenate((walk.root_translations, rotations.reshape(walk.frame_count, -1)), axis=1)
     )
-    smooth = [("smooth", {"window_s": 0.2})]
+    smooth = [Smooth(window_s=0.2)]
     assert same_poses(apply_edit(flipped, smooth), apply_edit(walk, smooth))
 
 
@@ -102,20 +103,20 @@ def test_a_joint_that_spins_within_the_window_is_refused_by_name() -> None:
     rotations[:, head] = quaternions.from_axis_angle([0.0, 1.0, 0.0], np.arange(walk.frame_count) * 1.5)
     poses = np.concatenate((walk.root_translations, rotations.reshape(walk.frame_count, -1)), axis=1)
     with pytest.raises(EditError, match="joint Head") as refused:
-        apply_edit(replace(walk, poses=poses.astype(np.float32)), [("smooth", {"method": "gaussian", "window_s": 1.0})])
+        apply_edit(replace(walk, poses=poses.astype(np.float32)), [Smooth(method="gaussian", window_s=1.0)])
     assert refused.value.code == "window-too-long"
 
 
 def test_a_window_of_fewer_frames_than_the_polynomial_needs_is_refused() -> None:
     with pytest.raises(EditError, match="too short for polynomials of degree 5"):
-        apply_edit(make_walk(), [("smooth", {"window_s": 0.05, "order": 5})])
+        apply_edit(make_walk(), [Smooth(window_s=0.05, order=5)])
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("frames", [1, 2, 3, 5])
 def test_motions_shorter_than_the_window_are_smoothed_too(method: str, frames: int) -> None:
     few = noisy(make_walk(), 0.03).sliced(0, frames)
-    smoothed = apply_edit(few, [("smooth", {"method": method, "window_s": 2.0})])
+    smoothed = apply_edit(few, [Smooth(method=method, window_s=2.0)])
     assert smoothed.frame_count == frames
     assert same_poses(smoothed.sliced(0, 1), few.sliced(0, 1))
     assert same_poses(smoothed.sliced(frames - 1, frames), few.sliced(frames - 1, frames))
@@ -123,13 +124,13 @@ def test_motions_shorter_than_the_window_are_smoothed_too(method: str, frames: i
 
 def test_an_unknown_joint_is_told_with_its_nearest_names() -> None:
     with pytest.raises(UnknownJoint, match="LeftArm"):
-        apply_edit(make_walk(), [("smooth", {"joints": ["LeftArn"]})])
+        apply_edit(make_walk(), [Smooth(joints=["LeftArn"])])
 
 
 @pytest.mark.parametrize("method", ["savitzky_golay", "gaussian"])
 def test_means_over_long_windows_are_those_of_short_ones(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     clip = make_walk(turn_rate_rad_s=0.3, seconds=12.0)
-    commands = [("smooth", {"method": method, "window_s": 10.0})]
+    commands = [Smooth(method=method, window_s=10.0)]
     quick = apply_edit(clip, commands)
     monkeypatch.setattr(smoothing, "LONG_WINDOW", 1_000_000)
     np.testing.assert_allclose(quick.poses, apply_edit(clip, commands).poses, atol=2e-6)

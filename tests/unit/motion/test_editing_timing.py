@@ -1,5 +1,7 @@
 """Rates and speeds, mirrored bodies."""
 
+from math import degrees
+
 import numpy as np
 import pytest
 from tests.support.edited_takes import make_breathing_walk, make_walk, same_poses
@@ -8,11 +10,12 @@ from marey_motion.editing.registry import apply_edit
 from marey_motion.errors import EditError, MappingError
 from marey_motion.kinematics import global_positions
 from marey_motion.resampling import resample_clip
+from marey_schemas.editing.commands import Mirror, Resample, Retime, Rotate, Smooth, Trim
 
 
 def test_resampling_keeps_the_time_and_changes_the_rate() -> None:
     walk = make_breathing_walk()
-    slow = apply_edit(walk, [("resample", {"frame_rate_hz": 24.0})])
+    slow = apply_edit(walk, [Resample(frame_rate_hz=24.0)])
     assert slow.frame_rate_hz == 24.0
     assert same_poses(slow, resample_clip(walk, 24.0), 1e-6)
     assert abs(slow.duration_s - walk.duration_s) < 1 / 24
@@ -20,28 +23,28 @@ def test_resampling_keeps_the_time_and_changes_the_rate() -> None:
 
 def test_frames_of_rates_that_divide_each_other_are_taken_as_they_are() -> None:
     walk = make_breathing_walk()
-    half = apply_edit(walk, [("resample", {"frame_rate_hz": 30.0})])
+    half = apply_edit(walk, [Resample(frame_rate_hz=30.0)])
     assert np.array_equal(half.poses, walk.poses[::2])
 
 
 def test_retiming_keeps_the_rate_and_changes_the_time() -> None:
     walk = make_breathing_walk()
-    fast = apply_edit(walk, [("retime", {"speed": 2.0})])
+    fast = apply_edit(walk, [Retime(speed=2.0)])
     assert fast.frame_rate_hz == walk.frame_rate_hz
     assert np.array_equal(fast.poses, walk.poses[::2])
-    slow = apply_edit(walk, [("retime", {"speed": 0.5})])
+    slow = apply_edit(walk, [Retime(speed=0.5)])
     assert slow.frame_count == 2 * walk.frame_count - 1
     assert np.abs(global_positions(slow)[::2] - global_positions(walk)).max() < 1e-5
 
 
 def test_there_and_back_is_nearly_the_motion() -> None:
     walk = make_walk()
-    back = apply_edit(walk, [("retime", {"speed": 0.5}), ("retime", {"speed": 2.0})])
+    back = apply_edit(walk, [Retime(speed=0.5), Retime(speed=2.0)])
     assert same_poses(back, walk, 1e-5)
 
 
-@pytest.mark.parametrize("command", [("resample", {"frame_rate_hz": 100_000.0}), ("retime", {"speed": 0.01})])
-def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: tuple[str, dict[str, float]]) -> None:
+@pytest.mark.parametrize("command", [Resample(frame_rate_hz=100_000.0), Retime(speed=0.01)])
+def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: Resample | Retime) -> None:
     walk = make_walk()
     with pytest.raises(EditError, match="frames; with this skeleton") as refused:
         apply_edit(walk, [command], most_numbers=10 * walk.poses.size)
@@ -50,11 +53,11 @@ def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: tuple[s
 
 def test_a_mirrored_mirror_image_is_the_motion() -> None:
     walk = make_breathing_walk(turn_rate_rad_s=0.5)
-    once = apply_edit(walk, [("mirror", {})])
+    once = apply_edit(walk, [Mirror()])
     left, right = (walk.skeleton.index_of(name) for name in ("LeftHand", "RightHand"))
     reflected = global_positions(walk)[:, right] * [-1.0, 1.0, 1.0]
     assert np.abs(global_positions(once)[:, left] - reflected).max() < 0.2
-    twice = apply_edit(walk, [("mirror", {}), ("mirror", {})])
+    twice = apply_edit(walk, [Mirror(), Mirror()])
     assert np.abs(global_positions(twice) - global_positions(walk)).max() < 1e-5
 
 
@@ -66,7 +69,7 @@ def test_a_body_that_is_not_known_is_told_only_where_it_matters() -> None:
 
     walk = make_walk()
     body = EditedBody(walk.skeleton, unknown)  # type: ignore[arg-type]
-    kept = apply_edit(walk, [("trim", {"stop": 50}), ("smooth", {}), ("rotate", {"angle_rad": 1.0})], body=body)
+    kept = apply_edit(walk, [Trim(stop=50), Smooth(), Rotate(angle_deg=degrees(1.0))], body=body)
     assert kept.frame_count == 50
     with pytest.raises(MappingError, match="nobody knows this body"):
-        apply_edit(walk, [("mirror", {})], body=body)
+        apply_edit(walk, [Mirror()], body=body)

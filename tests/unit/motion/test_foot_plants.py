@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from marey_motion import kinematics, quaternions
 from marey_motion.clip import Clip
@@ -12,7 +13,6 @@ from marey_motion.editing.foot_plants import (
     Foot,
     FootContacts,
     PlantedMotion,
-    PlantOptions,
     find_contacts,
     foot_slide_m,
     plant_feet,
@@ -24,6 +24,7 @@ from marey_motion.gait import generate_gait
 from marey_motion.motion import Motion
 from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import PlantOptions
 
 
 def _feet(skeleton: Skeleton, clip: Clip | None = None) -> list[Foot]:
@@ -158,7 +159,7 @@ def test_contacts_that_do_not_fit_the_motion_are_refused(walk: Clip) -> None:
     short = FootContacts(np.ones(3, np.bool_), np.ones(3, np.bool_))
     with pytest.raises(EditError, match="flags for 3 frames, the motion has 240"):
         plant_feet(walk.skeleton, Motion.of(walk), 60.0, _feet(walk.skeleton), contacts=[short, short])
-    with pytest.raises(EditError, match="blend_s"):
+    with pytest.raises(ValidationError, match="blend_s"):
         PlantOptions(blend_s=-1.0)
 
 

@@ -28,7 +28,7 @@ def test_an_edit_survives_every_form_in_which_it_travels(media_type: str) -> Non
 def test_what_is_left_out_is_the_default_and_commands_keep_their_names() -> None:
     short = edit_of(commands=[{"command": "smooth"}])
     assert short == edit_of(commands=[short.commands[0].model_dump(mode="json")])
-    assert short.model_dump(mode="json", exclude_defaults=True) == {"commands": [{"command": "smooth"}]}
+    assert short.model_dump(mode="json", exclude_unset=True) == {"commands": [{"command": "smooth"}]}
 
 
 def test_the_clips_that_commands_name_are_listed_once() -> None:

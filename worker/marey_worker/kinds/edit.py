@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from marey_motion import documents
 from marey_motion.clip import Clip
-from marey_motion.editing.registry import EditedClip, NamedCommand, edit_clip
+from marey_motion.editing.registry import EditedClip, edit_clip
 from marey_motion.editing.take import EditedBody
 from marey_motion.errors import EditError, MotionError
 from marey_motion.skeleton import Skeleton
@@ -53,7 +53,6 @@ class _Editing:
         if (unclear := params.unclear_place(context.into)) is not None:
             raise JobRefused("ambiguous-place", unclear)
         self._edit_pin, self._edit = _wanted_edit(context, params)
-        self._commands: tuple[NamedCommand, ...] = documents.commands_of_edit(self._edit)
         self._source_pins = _wanted_sources(context, self._edit)
 
     def run(self) -> dict[str, Any]:
@@ -98,7 +97,7 @@ class _Editing:
             self._require_newest(pin)
         body = self._body(motion)
         clip = documents.clip_from_document(motion, body.skeleton)
-        made = edit_clip(clip, self._commands, body=body, sources=sources)
+        made = edit_clip(clip, self._edit.commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
             raise EditError("the edit splits it, and several clips cannot replace one", code="several-clips")
         info = self._info(pin, known)
@@ -152,7 +151,11 @@ class _Editing:
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
         """Return the facts about the clip that still hold, and the edit that was applied."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
-        done = {"clip": pin.as_input().model_dump(), "edit": edit, "commands": [name for name, _ in self._commands]}
+        done = {
+            "clip": pin.as_input().model_dump(),
+            "edit": edit,
+            "commands": [command.command for command in self._edit.commands],
+        }
         if stored is None:
             return ClipInfo(source=ClipSource(format="edited", details=done))
         known = ClipInfo.model_validate(stored)

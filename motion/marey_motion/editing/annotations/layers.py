@@ -15,8 +15,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from marey_motion.errors import AnnotationError
-
-MAX_LABEL_LENGTH = 255
+from marey_schemas.names import MAX_LABEL_LENGTH
 
 
 class Segment(NamedTuple):
@@ -103,7 +102,7 @@ class Layer:
 # Segments
 
 
-def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool = False) -> Layer:
+def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool) -> Layer:
     """Add the segment [start, end).
 
     Parameters
@@ -152,14 +151,14 @@ def remove_segment(layer: Layer, at: int) -> Layer:
     return layer._with(index, index + 1)
 
 
-def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
+def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
     """Cut the segment that holds a frame in two, of which the second starts there.
 
     Parameters
     ----------
     layer : Layer    the layer
     at : int    first frame of the second part
-    label : str, optional    label of the second part; the same when None
+    label : str or None    label of the second part; the same when None
 
     Returns
     -------
@@ -177,7 +176,7 @@ def split_segment(layer: Layer, at: int, label: str | None = None) -> Layer:
     return layer._with(index, index + 1, segment._replace(end=at), rest)
 
 
-def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"] = "next") -> Layer:
+def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"]) -> Layer:
     """Merge the segment that holds a frame with a neighbour, under its own label and with the gap between.
 
     The nearest neighbour is the one with the smaller gap, the next one where both are equal.

@@ -27,8 +27,8 @@ from marey_motion.errors import EditError
 from marey_motion.motion import Motion
 from marey_motion.rigs import JointAxes, JointMapping
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import Solver
 
-Solver = Literal["auto", "ccd", "two_bone", "least_squares"]
 Ending = Literal["carried", "held"]
 
 _ANYWHERE = Freedom()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,11 +17,10 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import EditError
 from marey_motion.rigs import JointAxes
 from marey_motion.skeleton import Skeleton
+from marey_schemas.editing.constraints import Axes
 
 ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
 """Metres that a radian counts for beside positions: five degrees are as bad as a centimetre."""
-
-Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
 @dataclass(frozen=True, eq=False)
