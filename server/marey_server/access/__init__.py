@@ -1,1 +1,1 @@
-"""Access control: principals, roles, scopes, passwords and token secrets. Pure rules; the rows are in `store`."""
+"""Access control: principals, roles, scopes, passwords and token secrets; rules without a database (rows: `store`)."""

@@ -1,4 +1,4 @@
-"""Password hashes: scrypt (RFC 7914), in a text that carries its own parameters."""
+"""Password hashes by scrypt (RFC 7914), stored as text together with their parameters."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class _Parsed(NamedTuple):
 
 
 def hash_password(password: str) -> str:
-    """`scrypt$15$8$1$<salt>$<key>`. Takes about 0.1 s: call it where nobody waits for the thread."""
+    """Return `scrypt$15$8$1$<salt>$<key>`. It takes about 0.1 s, so it must not run on the event loop."""
     salt = secrets.token_bytes(16)
     key = _derive(password, salt, LOG2_N, _BLOCK, _PARALLEL, _KEY_BYTES)
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(salt), _text(key)))
 
 
 def password_matches(password: str, stored: str | None) -> bool:
-    """Return whether `password` is the one `stored` was made of. As slow without a stored hash as with one."""
+    """Return whether `password` matches the hash `stored`; without a hash, it takes the same time."""
     parsed = _parse(stored or _nobody())
     key = _derive(password, parsed.salt, parsed.log2_n, parsed.block, parsed.parallel, len(parsed.key))
     return hmac.compare_digest(key, parsed.key) and stored is not None
@@ -57,7 +57,7 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """Return a hash that no password has, for users that do not exist: the answer must take as long."""
+    """Return a hash that no password matches; checking it for unknown users makes the answer take the same time."""
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

@@ -1,4 +1,4 @@
-"""The caller of a service function."""
+"""Principal on whose behalf a service function runs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from marey_schemas.access import Scope
 
 @dataclass(frozen=True, slots=True)
 class Principal:
-    """Who asks, and how far the credential reaches.
+    """Caller, with the scopes of its credential.
 
-    `scopes` are texts such as `write` or `write!project=walk`. An attempt is a job's running try: it reads its project
-    and writes only through its own attempt's endpoints.
+    `scopes` are texts such as `write` or `write!project=walk`. An attempt is a running try of a job: it reads its
+    project, and writes only through the endpoints of its attempt.
     """
 
     kind: Literal["anonymous", "user", "attempt", "system"]
@@ -28,10 +28,10 @@ class Principal:
 
     @property
     def actor(self) -> str | None:
-        """The name that authorship and events show."""
+        """The name shown as author and in events."""
         return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
 
 
 ANONYMOUS = Principal("anonymous")
 SYSTEM = Principal("system", administrator=True, scopes=tuple(scope.value for scope in Scope))
-"""The server itself: reaper, garbage collection, first start."""
+"""Principal of the server itself: reaper, garbage collection, first start."""

@@ -16,10 +16,10 @@ def includes(role: Role, required: Role) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RequiredRole:
-    """The role and the scope that an operation requires in a project.
+    """Role and scope that an operation requires in a project.
 
-    Handlers declare it; a request's transaction carries it; `store.projects.require` enforces it. `guests`: callers
-    without a role may do it in a public project if the role is reader.
+    Handlers declare them, the transaction of a request holds them, and `store.projects.require` enforces them.
+    `guests`: whether callers without a role may perform a reader's operation in a public project.
     """
 
     role: Role

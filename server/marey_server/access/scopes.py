@@ -1,4 +1,6 @@
-"""Scopes of credentials: `read`, `write`, `jobs`, `work`, `admin`, alone or bound as in `write!project=walk`."""
+"""Scopes of credentials: `read`, `write`, `jobs`, `work` and `admin`, for every project or bound to one as in
+`write!project=walk`.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +8,17 @@ from collections.abc import Iterable
 
 
 def allows(scopes: Iterable[str], need: str, project: str | None = None) -> bool:
-    """Return whether `scopes` reach `need` in `project`; without a project, only unbound scopes do."""
+    """Return whether `scopes` include `need` in `project`; without a project, only unbound scopes count."""
     wanted = {need} if project is None else {need, f"{need}!project={project}"}
     return not wanted.isdisjoint(scopes)
 
 
 def reaches_somewhere(scopes: Iterable[str], need: str) -> bool:
-    """Return whether `scopes` reach `need` in all projects or in some."""
+    """Return whether `scopes` include `need` in at least one project."""
     return any(scope.partition("!")[0] == need for scope in scopes)
 
 
 def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
-    """Return those of `wanted` that reach further than `held` does."""
+    """Return those of the scopes `wanted` that `held` does not include."""
     held = set(held)
     return [scope for scope in wanted if scope not in held and scope.partition("!")[0] not in held]

@@ -1,7 +1,7 @@
-"""The texts that callers show as bearer tokens.
+"""Bearer tokens as text: their creation, their parts, and the hashes of their secrets.
 
-`marey_<prefix>_<secret>` belongs to a user; the prefix finds the row. `mareyjob_<secret>` belongs to an attempt of a
-job. Rows hold SHA-256 of the secret: it has 256 random bits, so that no slow hash is needed.
+`marey_<prefix>_<secret>` belongs to a user; the prefix identifies its row. `mareyjob_<secret>` belongs to an attempt of
+a job. Rows hold the SHA-256 of the secret, which has 256 random bits, so that no slow hash is needed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _ATTEMPT = "mareyjob_"
 
 
 class IssuedToken(NamedTuple):
-    """A new token: the text shown once, and what the database keeps of it."""
+    """New token: its text, which is shown once, and the parts that the database stores."""
 
     text: str
     prefix: str
@@ -24,13 +24,13 @@ class IssuedToken(NamedTuple):
 
 
 def issue_user_token() -> IssuedToken:
-    """Create a token of a user."""
+    """Create a user's token."""
     prefix, secret = secrets.token_hex(6), secrets.token_hex(32)
     return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
 
 
 def issue_attempt_token() -> IssuedToken:
-    """Create a token of an attempt; its row is found by the hash."""
+    """Create the token of an attempt; its row is found by the hash."""
     secret = secrets.token_hex(32)
     return IssuedToken(f"{_ATTEMPT}{secret}", "", hash_secret(secret))
 
@@ -41,12 +41,12 @@ def hash_secret(secret: str) -> str:
 
 
 def secret_matches(secret: str, secret_hash: str) -> bool:
-    """Return whether `secret` is the one that was hashed, in constant time."""
+    """Return whether `secret` has the given hash, compared in constant time."""
     return hmac.compare_digest(hash_secret(secret), secret_hash)
 
 
 def split_user_token(text: str) -> tuple[str, str] | None:
-    """Prefix and secret of a user's token, None if `text` is none."""
+    """Return prefix and secret of a user's token, or None if `text` is not one."""
     if not text.startswith(_USER):
         return None
     prefix, _, secret = text[len(_USER) :].partition("_")
@@ -54,5 +54,5 @@ def split_user_token(text: str) -> tuple[str, str] | None:
 
 
 def attempt_secret(text: str) -> str | None:
-    """Return the secret of an attempt's token, None if `text` is none."""
+    """Return the secret of an attempt's token, or None if `text` is not one."""
     return text[len(_ATTEMPT) :] or None if text.startswith(_ATTEMPT) else None

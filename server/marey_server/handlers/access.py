@@ -17,7 +17,7 @@ from marey_server.store.transaction import Transaction
 
 
 def read_me(tx: Transaction) -> Me:
-    """Return the caller, and how far the credential reaches."""
+    """Return the caller, with the scopes of the credential."""
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
@@ -25,14 +25,14 @@ def read_me(tx: Transaction) -> Me:
 
 
 def sign_in(tx: Transaction, principal: Principal, request: Login) -> NewToken:
-    """Return a token for somebody whose password was checked."""
+    """Return a token for a user whose password was checked."""
     tx.principal = principal
     wanted = TokenCreate(name="sign-in", scopes=principal.scopes, expires_in_s=request.expires_in_s)
     return tokens.create_token(tx, wanted)
 
 
 def sign_out(tx: Transaction) -> None:
-    """End the token that the caller used."""
+    """Revoke the token of this request."""
     if tx.principal.token_id is not None:
         tokens.revoke_token(tx, tx.principal.token_id)
 
@@ -45,19 +45,19 @@ class MeResource(Resource):
 
     @reads(access=Access.SIGNED_IN, scope=None, answer=Me)
     async def get(self) -> Rendered:
-        """Who you are and what your token allows."""
+        """Return your user and the scopes of your token."""
         return await self.answer(read_me)
 
 
 class LoginResource(Resource):
-    """Signing in."""
+    """Sign-in."""
 
     path = "/login"
     tag = "Access"
 
     @writes(access=Access.ANYONE, scope=None, body=Login, answer=NewToken, also=((429, None),))
     async def post(self, body: Login) -> Reply:
-        """Sign in with name and password; the answer holds a new token, shown only here."""
+        """Sign in with name and password; the answer contains a new token, shown only once."""
         self.services.limit_sign_in(body.name, self.request.remote_ip or "")
         async with self.services.sign_in_places:
             principal = await self.look_up(users.verify_password, body.name, body.password.get_secret_value())
@@ -66,14 +66,14 @@ class LoginResource(Resource):
 
 
 class LogoutResource(Resource):
-    """Signing out."""
+    """Sign-out."""
 
     path = "/logout"
     tag = "Access"
 
     @writes(access=Access.USER, scope=None)
     async def post(self) -> Rendered:
-        """End the token that this request is sent with."""
+        """Revoke the token with which this request is sent."""
         return await self.answer(sign_out)
 
 
@@ -85,12 +85,12 @@ class OwnTokens(Resource):
 
     @reads(access=Access.USER, query=PageQuery, answer=Token, paged=True)
     async def get(self, query: PageQuery) -> Rendered:
-        """Your tokens, without their secrets."""
+        """List your tokens, without their secrets."""
         return await self.answer(tokens.list_tokens, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.USER, body=TokenCreate, answer=NewToken, status=201)
     async def post(self, body: TokenCreate) -> Rendered:
-        """Make a token; its secret is shown only here."""
+        """Create a token; its secret is shown only once."""
         private = {"Cache-Control": "no-store"}
         return await self.answer_with(
             lambda made: Reply(made, location=f"/tokens/{made.id}", headers=private), tokens.create_token, body
@@ -98,7 +98,7 @@ class OwnTokens(Resource):
 
 
 class TokenResource(Resource):
-    """One token."""
+    """A token."""
 
     path = "/tokens/{token}"
     tag = "Access"
@@ -117,12 +117,12 @@ class AllUsers(Resource):
 
     @reads(access=Access.ADMINISTRATOR, scope="admin", query=PageQuery, answer=User, paged=True)
     async def get(self, query: PageQuery) -> Rendered:
-        """All users."""
+        """List all users."""
         return await self.answer(users.list_users, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=UserCreate, answer=User, status=201, etag=True)
     async def post(self, body: UserCreate) -> Rendered:
-        """Make a user."""
+        """Create a user."""
         password_hash = None
         if body.password is not None:
             await self.look_up(_require_administrator)
@@ -144,19 +144,19 @@ def _require_administrator(tx: Transaction) -> None:
 
 
 class UserResource(Resource):
-    """One user."""
+    """A user."""
 
     path = "/users/{user}"
     tag = "Access"
 
     @reads(access=Access.USER, answer=User, etag=True)
     async def get(self, user: str) -> Rendered:
-        """A user: for administrators, and oneself."""
+        """Return a user; for administrators, and for the user."""
         return await self.answer(users.find_user, user)
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
     async def patch(self, user: str, body: UserChange) -> Rendered:
-        """Change a user: administrators anything, everybody their own name and password."""
+        """Change a user: administrators may change all fields, users their own display name and password."""
         password_hash = verified_hash = None
         if body.password is not None:
             await self.look_up(users.find_user, user)
@@ -173,9 +173,9 @@ class UserResource(Resource):
         )
 
     async def _verify(self, user: str, body: UserChange) -> str | None:
-        """Return the stored hash that the current password fits.
+        """Return the stored hash that the given current password matches.
 
-        Raises `ForbiddenProblem` where one was given that does not.
+        Raises `ForbiddenProblem` if it does not match.
         """
         if body.current_password is None:
             return None
@@ -189,7 +189,7 @@ class UserResource(Resource):
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", precondition="required")
     async def delete(self, user: str) -> Rendered:
-        """Disable a user: the name stays with what he did, tokens and password stop working."""
+        """Disable a user: the name remains on the user's work; tokens and password no longer work."""
         return await self.answer(users.delete_user, user, expected_rev=self.precondition.expected_rev)
 
 

@@ -1,4 +1,4 @@
-"""Commands that change annotations."""
+"""Resources that create annotations and change them by commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_TRIES = 5
 
 
 class AnnotationCommands(Resource):
-    """The commands that an annotation understands."""
+    """Commands on an annotation."""
 
     path = "/projects/{project}/{kind}/{item}/commands"
     tag = "Annotations"
@@ -34,8 +34,8 @@ class AnnotationCommands(Resource):
     async def post(self, project: str, kind: str, item: str, body: AnnotationChange) -> Rendered:
         """Change an annotation (kind `annotations`) by commands: all of them, as one new revision, or none.
 
-        Each command changes what the one before it left. Where one cannot be carried out, the answer is 422 and points
-        at it.
+        Each command is applied to the result of the one before it. If a command cannot be applied, the answer is 422
+        and points at it.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
             raise NotFoundProblem(f"Commands can be applied to annotations, not to {kind}.", code="no-commands")
@@ -68,7 +68,7 @@ class ClipAnnotations(Resource):
         idempotency="key",
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
-        """Make an annotation of a clip (kind `clips`) from a document of the predecessor, beside the clip."""
+        """Create an annotation of a clip (kind `clips`), in the clip's folder, from a document of the predecessor."""
         if kind_of(kind) is not Kind.CLIP:
             raise NotFoundProblem(f"Clips are annotated, not {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)

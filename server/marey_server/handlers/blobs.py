@@ -1,4 +1,4 @@
-"""Bytes by digest: sent once, read in ranges."""
+"""Resources of blobs: bytes named by digest, sent once and read in ranges."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 def require_digest(text: str) -> str:
-    """Return the text, if it can name a blob. Raises `NotFoundProblem`."""
+    """Return the text if it is a digest. Raises `NotFoundProblem`."""
     if not _DIGEST.fullmatch(text):
         raise NotFoundProblem("A blob is identified by sha256: and 64 hexadecimal digits.", code="no-blob")
     return text
@@ -33,20 +33,20 @@ class Blob(BlobSender):
     tag = "Blobs"
 
     async def begin(self, digest: str) -> None:
-        """Look the credential up before the bytes come."""
+        """Check the credential before the bytes are received."""
         require_digest(digest)
         await self.look_up(only_identify)
         self.receiver = Receiver(self.services)
 
     async def receive(self, chunk: bytes) -> None:
-        """Take the next bytes."""
+        """Store the next bytes."""
         await self.receiver.write(chunk)
 
     @writes(access=Access.SIGNED_IN, body=RequestBody(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False))
     async def put(self, digest: str) -> Rendered:
         """Send bytes by their digest.
 
-        They become visible when a document refers to them; bytes that nothing refers to are dropped after a day.
+        Others can read them once a document refers to them; bytes without a reference are deleted after a day.
         """
         with await self.receiver.finish() as spool:
             return await self.answer(blobs.put_blob, spool, expected=digest)
@@ -60,12 +60,12 @@ class Blob(BlobSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, digest: str) -> Rendered | None:
-        """Bytes by their digest, whole or a range."""
+        """Return bytes by their digest, whole or a range."""
         return await self.send_blob(require_digest(digest))
 
 
 class MissingBlobs(Resource):
-    """Blobs that the server lacks."""
+    """Blobs that the server does not have."""
 
     path = "/blobs/missing"
     tag = "Blobs"

@@ -1,4 +1,4 @@
-"""Every resource that the server offers, in the order of the documentation."""
+"""List of all resources of the server, in the order of the documentation."""
 
 from marey_server.handlers import (
     access,

@@ -1,4 +1,4 @@
-"""The folders of a project."""
+"""Resources of the folders of a project."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ProjectCollections(Resource):
 
     @reads(access=Access.READER, query=CollectionsQuery, answer=Collection, paged=True)
     async def get(self, project: str, query: CollectionsQuery) -> Rendered:
-        """Folders, by path."""
+        """List folders by path."""
         return await self.answer(
             collections.list_collections,
             project,
@@ -46,7 +46,7 @@ class ProjectCollections(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CollectionCreate) -> Rendered:
-        """Make a folder, with those above it."""
+        """Create a folder, with its parents if they are missing."""
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/collections/{made.id}"),
             collections.create_collection,
@@ -56,38 +56,38 @@ class ProjectCollections(Resource):
 
 
 class CollectionResource(Resource):
-    """One folder."""
+    """A folder."""
 
     path = "/projects/{project}/collections/{collection}"
     tag = "ProjectCollections"
 
     @reads(access=Access.READER, answer=Collection, etag=True)
     async def get(self, project: str, collection: str) -> Rendered:
-        """A folder."""
+        """Return a folder."""
         return await self.answer(collections.read_collection, project, collection)
 
     @writes(access=Access.CONTRIBUTOR, body=CollectionChange, answer=Collection, precondition="required", etag=True)
     async def patch(self, project: str, collection: str, body: CollectionChange) -> Rendered:
-        """Rename or move a folder with all it holds."""
+        """Rename or move a folder with its contents."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(collections.move_collection, project, collection, body, expected_rev=expected_rev)
 
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, collection: str) -> Rendered:
-        """Delete a folder with all it holds; it can be restored."""
+        """Delete a folder with its contents; it can be restored."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(collections.delete_collection, project, collection, expected_rev=expected_rev)
 
 
 class CollectionRestoration(Resource):
-    """Bringing a deleted folder back."""
+    """Restoration of a deleted folder."""
 
     path = "/projects/{project}/collections/{collection}/restore"
     tag = "ProjectCollections"
 
     @writes(access=Access.MAINTAINER, answer=Collection, etag=True)
     async def post(self, project: str, collection: str) -> Rendered:
-        """Restore a folder with what was deleted along with it."""
+        """Restore a folder with the contents that were deleted along with it."""
         return await self.answer(collections.restore_collection, project, collection)
 
 

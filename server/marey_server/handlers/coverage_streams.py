@@ -1,6 +1,6 @@
-"""Coverage while a performer records: frames in, what to record next out.
+"""Resources that measure coverage during a recording session: they receive frames and say what to record next.
 
-Nothing is lost when a server dies: a stream is a row, and every request is in it before it is answered.
+A stream is stored in a row, which is updated before each answer, so that nothing is lost if the server dies.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ MOST_FRAMES_BYTES = 16 * MIB
 
 
 class ProjectCoverageStreams(Resource):
-    """The performances that are being measured."""
+    """Streams whose coverage is measured."""
 
     path = "/projects/{project}/coverage-streams"
     tag = "Evaluations"
 
     @reads(access=Access.READER, query=PageQuery, answer=CoverageStream, paged=True)
     async def get(self, project: str, query: PageQuery) -> Rendered:
-        """The streams of a project, the newest first."""
+        """List the coverage streams of a project, newest first."""
         return await self.answer(coverage_streams.list_streams, project, cursor=query.cursor, limit=query.limit)
 
     @writes(
@@ -45,9 +45,9 @@ class ProjectCoverageStreams(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
-        """Begin to measure the coverage of a performance, from nothing or from what an evaluation found.
+        """Start to measure the coverage of a performance, from nothing or from the result of an evaluation.
 
-        A stream to which no frames come for a day is dropped; a project has at most 64.
+        A stream that receives no frames for a day is deleted; a project has at most 64.
         """
         given = await self.look_up(coverage.read_given, project, body)
         new, state = await self.compute(coverage.begin, body, given)
@@ -60,26 +60,26 @@ class ProjectCoverageStreams(Resource):
 
 
 class CoverageStreamResource(Resource):
-    """One performance that is being measured."""
+    """A stream whose coverage is measured."""
 
     path = "/projects/{project}/coverage-streams/{stream}"
     tag = "Evaluations"
 
     @reads(access=Access.READER, answer=CoverageStreamState, etag=True)
     async def get(self, project: str, stream: str) -> Reply:
-        """A stream with its map, the performer, and what to record next."""
+        """Return a stream with its coverage map, the performer's state, and what to record next."""
         held = await self.look_up(coverage_streams.read_stream, project, stream)
         state = await self.compute(coverage.look, held)
         return Reply(state, rev=held.rev)
 
     @writes(access=Access.CONTRIBUTOR)
     async def delete(self, project: str, stream: str) -> Rendered:
-        """Drop a stream."""
+        """Delete a stream."""
         return await self.answer(coverage_streams.delete_stream, project, stream)
 
 
 class CoverageStreamFrames(Resource):
-    """The frames of a performance."""
+    """Frames of a coverage stream."""
 
     path = "/projects/{project}/coverage-streams/{stream}/frames"
     tag = "Evaluations"
@@ -90,10 +90,10 @@ class CoverageStreamFrames(Resource):
         answer=CoverageProgress,
     )
     async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
-        """Send the next frames, as poses of the stream's skeleton or as roots; hear what is still missing.
+        """Send the next frames, as poses of the stream's skeleton or as roots; the answer lists what is still missing.
 
-        The same frames at the same offset again get the same answer. At another offset than the stream's the answer is
-        409 with the right one in the context.
+        The same frames at the same offset get the same answer again. For another offset than the stream's, the answer
+        is 409 with the current offset in the context.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
         step = await self.compute(coverage.advance, held, body)

@@ -1,4 +1,4 @@
-"""The API's description of itself: for programs, and for people."""
+"""Resources that describe the API, for programs and for people."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OpenApiDocument(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("application/json",))
     async def get(self) -> Reply:
-        """This API as an OpenAPI 3.1 document."""
+        """Return this API as an OpenAPI 3.1 document."""
         description = await self.compute(self.services.description)
         return Reply(description.document, rev=description.tag, media_type="application/json")
 
@@ -67,7 +67,7 @@ class DocumentationPage(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/html",))
     async def get(self) -> Reply:
-        """This API as a page."""
+        """Return this API as an HTML page."""
         description = await self.compute(self.services.description)
         style_only = "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
         headers = {"Content-Security-Policy": style_only}

@@ -18,10 +18,10 @@ class EditPreviewResource(Resource):
 
     @reads(access=Access.READER, body=EditPreviewRequest, answer=Document)
     async def post(self, project: str, kind: str, item: str, body: EditPreviewRequest) -> Rendered:
-        """Some frames of what commands would make of a clip (kind `clips`); nothing is stored.
+        """Return some frames of the result of commands on a clip (kind `clips`); nothing is stored.
 
-        The whole edit is computed, so that these frames are those that a job would make. What would take longer than
-        some seconds is refused with 413.
+        The whole edit is computed, so that the frames equal those of a job. Edits that would take longer than some
+        seconds are refused with 413.
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
         form, answers = self.answer_form, self.services.answers

@@ -1,4 +1,4 @@
-"""Events of a project, page by page or as server-sent events."""
+"""Resource of a project's events, page by page or as server-sent events."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Events(Resource):
         headers=("Last-Event-ID",),
     )
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
-        """Return events in the order of their commits; as text/event-stream, also those to come."""
+        """Return events in the order of their commits; as text/event-stream, also future events."""
         after = self._last_received(query)
         found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
         if self.media is not EVENT_STREAM:
@@ -63,7 +63,7 @@ class Events(Resource):
         return int(text)
 
     async def _follow(self, project: str, after: int, found: list[Event]) -> None:
-        """Send events as they come, until the caller goes away or the server stops."""
+        """Send events as they occur, until the client disconnects or the server stops."""
         self.write(": follow\n\n")
         sent_at = time.monotonic()
         while True:

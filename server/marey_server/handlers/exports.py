@@ -1,4 +1,4 @@
-"""Items as files, with the right name and type."""
+"""Resource that returns items as files, with their names and media types."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ class Export(BlobSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ExportQuery) -> Rendered | Reply | None:
-        """An item as a file, or the original where it was imported from one.
+        """Return an item as a file; if it was imported from a file, the original can be returned.
 
-        Clips and aligned clips are bvh, npz, predecessor or json; annotations, models with their trees, and graphs are
-        predecessor or json; others json. What was imported from a file of the predecessor and has not changed since is
-        given back as it came.
+        Formats are bvh, npz, predecessor and json for clips and aligned clips, predecessor and json for annotations,
+        models with their trees, and graphs, and json for other kinds. An item that was imported from a file of the
+        predecessor and is unchanged is returned as that file.
         """
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)

@@ -1,4 +1,4 @@
-"""Is the process alive, can it serve, and how is it doing: for orchestrators and Prometheus. Outside the API's root."""
+"""Resources for orchestrators and Prometheus: liveness, readiness and metrics, outside the API's root."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from marey_server.store import fsck
 
 
 class Health(Answer):
-    """The state of the server."""
+    """State of the server."""
 
     status: str
 
 
 class Healthz(Resource):
-    """Whether the process answers at all."""
+    """Liveness of the process."""
 
     path = "/healthz"
     root = ""
@@ -26,12 +26,12 @@ class Healthz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
     async def get(self) -> Reply:
-        """Is the process alive."""
+        """Answer if the process is alive."""
         return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
 
 
 class Readyz(Resource):
-    """Whether requests should be sent here."""
+    """Readiness for requests."""
 
     path = "/readyz"
     root = ""
@@ -40,7 +40,7 @@ class Readyz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),))
     async def get(self) -> Reply:
-        """Can the server serve: database reachable, its schema current, blobs writable, not draining."""
+        """Answer whether the server is ready: database reachable, schema current, blobs writable, not draining."""
         if self.services.draining.is_set():
             raise UnavailableProblem("The server is stopping.", code="draining", headers={"Retry-After": "5"})
         faults = await self.look_up(fsck.find_faults)
@@ -59,7 +59,7 @@ class MetricsPage(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Bytes, answer_types=("text/plain",))
     async def get(self) -> Reply:
-        """Figures in the text format of Prometheus."""
+        """Return metrics in the text format of Prometheus."""
         text, media_type = self.services.metrics.exposition()
         return Reply(text, media_type=media_type, headers={"Cache-Control": "no-store"})
 

@@ -1,4 +1,4 @@
-"""Motion files in: sent with the request, or named by digest where the server has the bytes already."""
+"""Resource that imports motion files, sent with the request or named by the digest of a blob."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
 MAX_FORM_BYTES = 256 * 1024
 FILES_AHEAD = 2
-"""Files that are read at once, beside the next one in order."""
+"""Greatest number of files that are read concurrently, in addition to the next one in order."""
 FILES_PER_WRITE = 16
-"""Files that are stored in one transaction."""
+"""Greatest number of files that are stored in one transaction."""
 
 
 class ProjectImports(Resource):
-    """Bringing motion files into a project."""
+    """Import of motion files into a project."""
 
     path = "/projects/{project}/imports"
     tag = "ProjectImports"
 
     async def begin(self, project: str) -> None:
-        """Check that the caller may import, before the files come."""
+        """Check that the caller may import before the files are received."""
         await self.look_up(importing.require_importer, project)
         content_type = self.request.headers.get("Content-Type", "")
         self.fields: dict[str, bytearray] = {}
@@ -90,7 +90,7 @@ class ProjectImports(Resource):
             self._field = None
 
     async def _take_file(self, name: str, receiver: Receiver) -> None:
-        """Keep a file at hand; once they are too many for one request, store it for the job that will import them."""
+        """Keep a received file in memory; files beyond the limit of a request are stored as blobs for an import job."""
         spool = await receiver.finish()
         file = SourceFile(name, spool.digest, spool.size_bytes, spool)
         if self._is_large([*self.files, file]):
@@ -111,9 +111,9 @@ class ProjectImports(Resource):
         also=((202, Job),),
     )
     async def post(self, project: str) -> Reply:
-        """Import motion files: one entry per file, and one bad file harms no other.
+        """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
 
-        Send files as multipart/form-data, with the options as form fields, or name files by digest. Files of the same
+        Send files as multipart/form-data, with the options as form fields, or name files by digest. Files with known
         content change nothing. Many files, or many bytes, become a job (202), whose result is the same answer.
         """
         if self.parts is not None:
@@ -144,7 +144,7 @@ class ProjectImports(Resource):
         return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
 
     async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
-        """Read files in threads while those before them are stored; one entry per file, in their order."""
+        """Read files in threads while earlier ones are stored; return one entry for each file, in order."""
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
@@ -194,7 +194,7 @@ class ProjectImports(Resource):
         return SourceFile(file.name, file.digest, file.size_bytes, data)
 
     def on_finish(self) -> None:
-        """Drop what was received."""
+        """Discard the received files."""
         super().on_finish()
         for file in getattr(self, "files", ()):
             if isinstance(file.content, blobs.Spool):
@@ -202,7 +202,7 @@ class ProjectImports(Resource):
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:
-    """Options from form fields. Raises `InvalidProblem` naming the field."""
+    """Return the options in form fields. Raises `InvalidProblem`, which names the field."""
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:
@@ -217,7 +217,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
 
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
-    """Files named by digest. Raises `NotFound` where the caller may not read one."""
+    """Return files named by digest. Raises `NotFoundProblem` if the caller may not read one."""
     return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
 
 

@@ -1,4 +1,4 @@
-"""Items of every kind: one set of declarations serves skeletons, clips, models and all others."""
+"""Resources of items, the same for skeletons, clips, models and all other kinds."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ItemsQuery(CountedPageQuery):
     fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
 
     def filters(self) -> ItemFilters:
-        """Return the filters of the store."""
+        """Return the filters for the store."""
         return ItemFilters(
             collection=self.collection,
             directly_in=self.directly_in,
@@ -65,7 +65,7 @@ class ItemsQuery(CountedPageQuery):
 
 
 def kind_of(plural: str) -> Kind:
-    """Return the kind that a segment of the address names. Raises `NotFoundProblem`."""
+    """Return the kind named by a segment of the address. Raises `NotFoundProblem`."""
     try:
         return Kind.from_plural(plural)
     except KeyError:
@@ -73,14 +73,14 @@ def kind_of(plural: str) -> Kind:
 
 
 class ItemsOfKind(Resource):
-    """The items of a kind in a project."""
+    """Items of a kind in a project."""
 
     path = "/projects/{project}/{kind}"
     tag = "ItemsOfKind"
 
     @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True)
     async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
-        """Items of a kind, filtered and sorted."""
+        """List items of a kind, filtered and sorted."""
         return await self.answer(
             items.list_items,
             project,
@@ -102,7 +102,7 @@ class ItemsOfKind(Resource):
         idempotency="key",
     )
     async def post(self, project: str, kind: str, body: ItemCreate) -> Rendered:
-        """Make an item from its documents."""
+        """Create an item from its documents."""
         prepared = body.model_copy(update={"parts": await self.compute(items.prepare_parts, kind_of(kind), body.parts)})
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/{kind}/{made.id}"),
@@ -114,14 +114,14 @@ class ItemsOfKind(Resource):
 
 
 class ItemResource(Resource):
-    """One item."""
+    """An item."""
 
     path = "/projects/{project}/{kind}/{item}"
     tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Item, etag=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
-        """An item at its newest revision: name, place, tags, summary, documents."""
+        """Return an item at its newest revision: name, place, tags, summary, documents."""
         return await self.answer(items.read_item, project, kind_of(kind), item)
 
     @writes(access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True)
@@ -157,21 +157,21 @@ class Revisions(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=Revision, paged=True)
     async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
-        """The revisions of an item, newest first."""
+        """List the revisions of an item, newest first."""
         return await self.answer(
             items.list_revisions, project, kind_of(kind), item, cursor=query.cursor, limit=query.limit
         )
 
 
 class RevisionResource(Resource):
-    """One revision."""
+    """A revision."""
 
     path = "/projects/{project}/{kind}/{item}/revisions/{revision:int}"
     tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Revision)
     async def get(self, project: str, kind: str, item: str, revision: int) -> Rendered:
-        """One revision: author, message, job, documents."""
+        """Return a revision: author, message, job, documents."""
         return await self.answer(items.read_revision, project, kind_of(kind), item, revision)
 
 
@@ -189,19 +189,19 @@ class LineageResource(Resource):
 
     @reads(access=Access.READER, query=LineageQuery, answer=Lineage)
     async def get(self, project: str, kind: str, item: str, query: LineageQuery) -> Rendered:
-        """Return the inputs of a revision, the job that made it, and the revisions made from it."""
+        """Return the inputs of a revision, the job that created it, and the revisions that use it."""
         return await self.answer(items.read_lineage, project, kind_of(kind), item, revision_number=query.revision)
 
 
 class StalenessResource(Resource):
-    """Whether an item is outdated."""
+    """Staleness of an item."""
 
     path = "/projects/{project}/{kind}/{item}/stale"
     tag = "ItemsOfKind"
 
     @reads(access=Access.READER, answer=Staleness)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
-        """Whether something the item was made from has a newer revision."""
+        """Return whether an input of the item has a newer revision."""
         return await self.answer(items.read_staleness, project, kind_of(kind), item)
 
 

@@ -24,7 +24,7 @@ from marey_server.store.wakeups import wakeups
 
 LONGEST_WAIT_S = 30.0
 LOOK_AGAIN_S = 2.0
-"""How often a waiting request looks by itself: another process may have ended the job."""
+"""Interval in seconds at which a waiting request polls the job, which another process may have ended."""
 
 MAX_SUBMISSION_BYTES = 32 * MIB
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
@@ -38,7 +38,7 @@ class JobKinds(Resource):
 
     @reads(access=Access.ANYONE, answer=JobKind, paged=True)
     async def get(self) -> Reply:
-        """Every kind of job, with the inputs and parameters it takes."""
+        """List all kinds of jobs, with the inputs and parameters they take."""
         return Reply(Page(items=tuple(kind.document() for kind in job_kinds().values())))
 
 
@@ -50,7 +50,7 @@ class JobKindResource(Resource):
 
     @reads(access=Access.ANYONE, answer=JobKind)
     async def get(self, job_kind: str) -> Reply:
-        """A kind of job."""
+        """Return a kind of job."""
         try:
             return Reply(find_kind(job_kind).document())
         except UnknownKindError as error:
@@ -69,19 +69,19 @@ class JobsQuery(CountedPageQuery):
     sort: str = Field("-created_at", max_length=100, description="Sort keys: id, created_at, priority.")
 
     def filters(self) -> JobFilters:
-        """Return the filters of the store."""
+        """Return the filters for the store."""
         return JobFilters(self.state, self.kind, self.parent, self.author)
 
 
 class ProjectJobs(Resource):
-    """The jobs of a project."""
+    """Jobs of a project."""
 
     path = "/projects/{project}/jobs"
     tag = "Jobs"
 
     @reads(access=Access.READER, query=JobsQuery, answer=Job, paged=True)
     async def get(self, project: str, query: JobsQuery) -> Rendered:
-        """Jobs, newest first."""
+        """List jobs, newest first."""
         return await self.answer(
             reading.list_jobs,
             project,
@@ -102,10 +102,10 @@ class ProjectJobs(Resource):
         headers=("Prefer",),
     )
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
-        """Submit a job. Inputs are pinned to the revisions they have now; many of them are spread over many tasks.
+        """Submit a job. Inputs are pinned to their newest revisions; many inputs are split over many tasks.
 
-        An input `{"job": id}` is everything of the input's kind that another job makes; this one waits for it.
-        `Prefer: wait=n` answers when the job has ended, at the latest after n seconds.
+        An input `{"job": id}` stands for all outputs of that job that have the input's kind; the new job waits for it.
+        With `Prefer: wait=n`, the answer is sent when the job has ended, at the latest after n seconds.
         """
         submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))
         wait_s = wait_preferred(self)
@@ -121,7 +121,7 @@ def _accepted(job: Job) -> Reply:
 
 
 class ProjectJobBatch(Resource):
-    """Many jobs at once."""
+    """Batch of jobs."""
 
     path = "/projects/{project}/jobs/batch"
     tag = "Jobs"
@@ -142,14 +142,14 @@ class ProjectJobBatch(Resource):
 
 
 class JobResource(Resource):
-    """State of one job."""
+    """A job."""
 
     path = "/jobs/{job}"
     tag = "Jobs"
 
     @reads(access=Access.READER, answer=Job, headers=("Prefer",))
     async def get(self, job: str) -> Rendered | Reply:
-        """A job and how it stands. `Prefer: wait=n` answers when it has ended, at the latest after n seconds."""
+        """Return the state of a job; with `Prefer: wait=n`, when it has ended, at the latest after n seconds."""
         wait_s = wait_preferred(self)
         if wait_s == 0:
             return await self.answer(reading.read_job, job)
@@ -163,7 +163,7 @@ def wait_preferred(resource: Resource) -> float:
 
 
 async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
-    """Return the job when it has ended, when the time is over, or when the caller or the server is going away."""
+    """Return the job when it has ended, the time is over, the client has disconnected, or the server is stopping."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     with wakeups.listen([f"job:{job_id}"]) as listener:
@@ -176,14 +176,14 @@ async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
 
 
 class JobAttempts(Resource):
-    """The tries at a job."""
+    """Attempts of a job."""
 
     path = "/jobs/{job}/attempts"
     tag = "Jobs"
 
     @reads(access=Access.READER, answer=Attempt, paged=True)
     async def get(self, job: str) -> Rendered:
-        """Every try at a job: by which worker, when, and how it ended."""
+        """List the attempts of a job: worker, times, and outcome."""
         return await self.answer(reading.list_attempts, job)
 
 
@@ -195,7 +195,7 @@ class JobOutputs(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=JobOutput, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """The revisions a job made, or its tasks; of those, a page holds what `limit` tasks made."""
+        """List the revisions created by a job or its tasks; for tasks, a page holds the outputs of `limit` tasks."""
         return await self.answer(reading.list_outputs, job, query.cursor, query.limit)
 
 
@@ -207,7 +207,7 @@ class JobResults(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """Return the results of the tasks of a gathering job, in order; blobs they name stay until it is gathered."""
+        """Return the results of the tasks of a gathering job in order; the blobs they name are kept until it ends."""
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 
@@ -231,7 +231,7 @@ class JobEvents(Resource):
 
 
 class JobLogQuery(Request):
-    """The piece of the log to read."""
+    """Query of a page of a log."""
 
     offset: int = Field(0, ge=0, le=2**53, description="Offset of the first byte to return.")
     limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Greatest number of bytes to return.")
@@ -245,9 +245,9 @@ class JobLog(Resource):
 
     @reads(access=Access.READER, query=JobLogQuery, answer=Bytes, answer_types=("text/plain",), public=False)
     async def get(self, job: str, query: JobLogQuery) -> Rendered:
-        """Return the output of a job's attempts, one after another, from a byte on.
+        """Return the output of a job's attempts, one after another, from an offset in bytes.
 
-        The header `Log-Offset` says where the next piece begins; `Log-Sealed: true` that there will be none.
+        The header `Log-Offset` is the offset of the next page; `Log-Sealed: true` says that there is none.
         """
         return await self.answer_with(_log_reply, reading.read_job_log, job, query.offset, query.limit)
 
@@ -258,29 +258,29 @@ def _log_reply(page: LogPage) -> Reply:
 
 
 class JobCancellation(Resource):
-    """Stopping a job."""
+    """Cancellation of a job."""
 
     path = "/jobs/{job}/cancel"
     tag = "Jobs"
 
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job)
     async def post(self, job: str) -> Rendered:
-        """Cancel a job and its tasks: at once where nobody works on it, else as soon as the worker stops."""
+        """Cancel a job and its tasks: at once if no worker has it, else as soon as the worker stops."""
         return await self.answer(reading.cancel_job, job, self.services.queue_policy)
 
 
 class JobRetry(Resource):
-    """Trying a job again."""
+    """Retry of a job."""
 
     path = "/jobs/{job}/retry"
     tag = "Jobs"
 
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job, status=202, idempotency="key")
     async def post(self, job: str) -> Rendered:
-        """Submit a failed or cancelled job again, with the inputs it had; the answer is the new job.
+        """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 
-        Jobs it needs that did not succeed are tried again before it, and those that ended only because it did not
-        succeed, after it: the rest of a pipeline goes on.
+        Unsuccessful jobs that it depends on are retried before it, and jobs that ended only because it did not succeed
+        after it, so that the rest of a pipeline continues.
         """
         return await self.answer_with(_accepted, retrying.retry_job, job)
 

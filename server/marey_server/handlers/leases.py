@@ -1,4 +1,4 @@
-"""Requests of workers: claims, heartbeats, logs, results and failures."""
+"""Resources for workers: claims, heartbeats, logs, results and failures."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from marey_server.store.jobs.staging import PreparedOutput
 from marey_server.store.wakeups import wakeups
 
 LOOK_AGAIN_S = 2.0
-"""How often a waiting worker's request looks by itself: jobs end their rest, other processes submit."""
+"""Interval in seconds at which a waiting claim polls the queue: retries become due, other processes submit jobs."""
 
 MAX_STAGED_BYTES = 256 * MIB
 MAX_LOG_BYTES = MIB
 
 
 class Leases(Resource):
-    """Work for workers."""
+    """Leases of jobs."""
 
     path = "/leases"
     tag = "Work"
 
     @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList)
     async def post(self, body: ClaimRequest) -> Reply:
-        """Claim jobs; with `wait_s`, wait for some to come. A lease that is not renewed runs out."""
+        """Claim jobs; with `wait_s`, wait until there are some. A lease that is not renewed expires."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
         with wakeups.listen([f"work:{kind}" for kind in body.kinds]) as listener:
@@ -61,7 +61,7 @@ class Leases(Resource):
 
 
 class Completions(Resource):
-    """Many completions at once."""
+    """Completions of many jobs."""
 
     path = "/leases/completions"
     tag = "Work"
@@ -73,7 +73,7 @@ class Completions(Resource):
         answer=BatchCompleteAnswer,
     )
     async def post(self, body: BatchCompleteRequest) -> Rendered:
-        """Complete many jobs that the caller claimed, in one transaction; each is refused by itself."""
+        """Complete many jobs that the caller claimed, in one transaction; each is accepted or refused separately."""
         return await self.answer_with(
             lambda results: Reply(BatchCompleteAnswer(results=tuple(results))),
             completion.complete_many,
@@ -82,14 +82,14 @@ class Completions(Resource):
 
 
 class AttemptHeartbeat(Resource):
-    """Signs of life."""
+    """Heartbeat of an attempt."""
 
     path = "/jobs/{job}/attempts/{fence:int}/heartbeat"
     tag = "Work"
 
     @writes(access=Access.ATTEMPT, scope=None, body=RequestBody(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
     async def post(self, job: str, fence: int, body: Heartbeat) -> Rendered:
-        """Keep the lease; hear whether to stop."""
+        """Renew the lease; the answer says whether to stop."""
         return await self.answer(queue.heartbeat, job, fence, body, self.services.queue_policy)
 
 
@@ -107,7 +107,7 @@ class AttemptLog(Resource):
         headers=("Upload-Offset",),
     )
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
-        """Append to the attempt's log at `Upload-Offset`; 409 with the true offset where it goes on elsewhere."""
+        """Append to the attempt's log at `Upload-Offset`; 409 with the current offset if that is another one."""
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequestProblem(
@@ -118,7 +118,7 @@ class AttemptLog(Resource):
 
 
 class AttemptOutputs(Resource):
-    """Results of an attempt."""
+    """Outputs of an attempt."""
 
     path = "/jobs/{job}/attempts/{fence:int}/outputs"
     tag = "Work"
@@ -130,7 +130,7 @@ class AttemptOutputs(Resource):
         answer=StageAnswer,
     )
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
-        """Stage results: they become visible when the attempt completes. One of the same name replaces the earlier."""
+        """Stage outputs, which become visible when the attempt completes; an output replaces one of the same name."""
         prepared = await self.compute(partial(_prepare, body))
         return await self.answer_with(
             lambda staged: Reply(StageAnswer(staged=staged)), staging.stage, job, fence, prepared
@@ -142,7 +142,7 @@ def _prepare(request: StageRequest) -> list[PreparedOutput]:
 
 
 class AttemptCompletion(Resource):
-    """The end of an attempt that succeeded."""
+    """Successful end of an attempt."""
 
     path = "/jobs/{job}/attempts/{fence:int}/complete"
     tag = "Work"
@@ -151,19 +151,19 @@ class AttemptCompletion(Resource):
         access=Access.ATTEMPT, scope=None, body=RequestBody(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer
     )
     async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
-        """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
+        """Publish the staged outputs and end the job; repeating a `write_id` repeats the answer."""
         return await self.answer(completion.complete, job, fence, body)
 
 
 class AttemptFailure(Resource):
-    """The end of an attempt that did not succeed."""
+    """Unsuccessful end of an attempt."""
 
     path = "/jobs/{job}/attempts/{fence:int}/fail"
     tag = "Work"
 
     @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer)
     async def post(self, job: str, fence: int, body: FailRequest) -> Rendered:
-        """End the attempt; the job is tried again or has failed. The same `write_id` again gives the same answer."""
+        """End the attempt; the job is retried or has failed. Repeating a `write_id` repeats the answer."""
         return await self.answer(completion.fail, job, fence, body, self.services.queue_policy)
 
 

@@ -1,4 +1,4 @@
-"""The documents of items: read whole or cut, and replaced by a new revision."""
+"""Resources of the documents of items: read, whole or in part, and replaced by a new revision."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PartQuery(Request):
     joints: CommaSeparated | None = Field(None, description="Names of the joints to return, in the desired order.")
 
     def frame_slice(self) -> slice | None:
-        """`frames` as a slice."""
+        """The query's `frames` as a slice."""
         if self.frames is None:
             return None
         start, _, stop = self.frames.partition(":")
@@ -41,7 +41,7 @@ class PartQuery(Request):
 
 
 class PartChange(Request):
-    """Message of the revision that a change makes."""
+    """Query of a change of a part: the message of the new revision."""
 
     message: Message = Field("", description="Message shown in the history.")
 
@@ -49,7 +49,7 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part, its arrays `encoded` in blocks or decoded. A part at a named revision never changes."""
+    """Read a part; its arrays are returned in blocks if `encoded`. A part of a named revision never changes."""
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     arrays: Literal["encoded", "decoded"] = "encoded" if encoded else "decoded"
     load = partial(items.load_part, tx, found, frames=query.frame_slice(), joints=query.joints, arrays=arrays)
@@ -61,16 +61,16 @@ def read_part(
 
 
 class PartResource(Resource):
-    """One document of an item: a clip's motion, a skeleton's mapping."""
+    """A document of an item, such as a clip's motion or a skeleton's mapping."""
 
     path = "/projects/{project}/{kind}/{item}/parts/{part}"
     tag = "Items"
 
     @reads(access=Access.READER, query=PartQuery, answer=Document, etag=True)
     async def get(self, project: str, kind: str, item: str, part: str, query: PartQuery) -> Rendered:
-        """A document, whole or some frames and joints of it.
+        """Return a document, whole or some frames and joints of it.
 
-        As MessagePack or BSON with `arrays=blocks` in the media type, arrays come compressed as they are stored.
+        As MessagePack or BSON with `arrays=blocks` in the media type, arrays are sent compressed, as they are stored.
         """
         encoded = self.media.arrays == "blocks"
         return await self.answer_with(
@@ -88,7 +88,7 @@ class PartResource(Resource):
     async def put(
         self, project: str, kind: str, item: str, part: str, query: PartChange, body: Mapping[str, Any]
     ) -> Rendered:
-        """Replace a document; the item gets a new revision that shares its other documents."""
+        """Replace a document; the item gets a new revision, in which its other documents are unchanged."""
         prepared = await self.compute(items.prepare_part, kind_of(kind), part, body)
         expected_rev = self.precondition.expected_rev
         return await self.answer(
@@ -116,10 +116,10 @@ class Parts(Resource):
 
     @reads(access=Access.READER, body=PartsRequest, answer=Document)
     async def post(self, project: str, body: PartsRequest) -> Reply:
-        """Read documents of several items in one request.
+        """Return documents of several items.
 
-        The answer is `{"documents": [...]}` in the order asked, with null for a document that is not there. Where
-        they are large together, the last ones are missing from the list: ask for those again.
+        The answer is `{"documents": [...]}` in the order of the request, with null for a document that does not exist.
+        If the documents together are too large, the last ones are missing from the list: request them again.
         """
         return Reply(await self.look_up(_read_parts, project, body.parts, self.media))
 

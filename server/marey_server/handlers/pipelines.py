@@ -1,4 +1,4 @@
-"""Pipelines: jobs that work on what others of them make, submitted together."""
+"""Resource of pipelines: jobs submitted together, some of which read outputs of others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_server.store.jobs.submission import submit_pipeline
 
 
 class ProjectPipelines(Resource):
-    """Graphs of jobs."""
+    """Pipelines of jobs."""
 
     path = "/projects/{project}/pipelines"
     tag = "Jobs"
@@ -25,11 +25,11 @@ class ProjectPipelines(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
-        """Submit jobs of which some work on what others make, all or none.
+        """Submit jobs, some of which read outputs of others, all or none.
 
-        An input `{"step": name}` is everything of the input's kind that the step makes, at the revisions it makes. What
-        was computed before is not computed again: of a pipeline submitted a second time, only what depends on a change
-        is.
+        An input `{"step": name}` stands for all outputs of that step that have the input's kind, at the revisions it
+        creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects are
+        computed.
         """
         return await self.answer_with(
             lambda made: Reply(made, headers={"Retry-After": "1"}), submit_pipeline, project, body

@@ -1,4 +1,4 @@
-"""Projects and who belongs to them."""
+"""Resources of projects and their members."""
 
 from __future__ import annotations
 
@@ -23,49 +23,49 @@ class ProjectsQuery(PageQuery):
 
 
 class Projects(Resource):
-    """All projects that the caller may see."""
+    """Projects that the caller may read."""
 
     path = "/projects"
     tag = "Projects"
 
     @reads(access=Access.ANYONE, query=ProjectsQuery, answer=Project, paged=True)
     async def get(self, query: ProjectsQuery) -> Rendered:
-        """Your projects, and public ones."""
+        """List your projects and public ones."""
         return await self.answer(projects.list_projects, sort=query.sort, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.USER, body=ProjectCreate, answer=Project, status=201, etag=True, idempotency="key")
     async def post(self, body: ProjectCreate) -> Rendered:
-        """Make a project; you become its owner."""
+        """Create a project; you become its owner."""
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{made.name}"), projects.create_project, body
         )
 
 
 class ProjectResource(Resource):
-    """One project."""
+    """A project."""
 
     path = "/projects/{project}"
     tag = "Projects"
 
     @reads(access=Access.READER, answer=Project, etag=True)
     async def get(self, project: str) -> Rendered:
-        """A project, and your role in it."""
+        """Return a project and your role in it."""
         return await self.answer(projects.read_project, project)
 
     @writes(access=Access.OWNER, body=ProjectChange, answer=Project, precondition="required", etag=True)
     async def patch(self, project: str, body: ProjectChange) -> Rendered:
-        """Change title, description or visibility."""
+        """Change the title, description or visibility of a project."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(projects.change_project, project, body, expected_rev=expected_rev)
 
     @writes(access=Access.OWNER, precondition="required")
     async def delete(self, project: str) -> Rendered:
-        """Delete a project with all it holds; it can be restored."""
+        """Delete a project with its contents; it can be restored."""
         return await self.answer(projects.delete_project, project, expected_rev=self.precondition.expected_rev)
 
 
 class ProjectRestoration(Resource):
-    """Bringing a deleted project back."""
+    """Restoration of a deleted project."""
 
     path = "/projects/{project}/restore"
     tag = "Projects"
@@ -77,31 +77,31 @@ class ProjectRestoration(Resource):
 
 
 class ProjectMembers(Resource):
-    """Who belongs to a project."""
+    """Members of a project."""
 
     path = "/projects/{project}/members"
     tag = "Projects"
 
     @reads(access=Access.READER, query=PageQuery, answer=Member, paged=True, public=False)
     async def get(self, project: str, query: PageQuery) -> Rendered:
-        """Members and their roles."""
+        """List the members and their roles."""
         return await self.answer(members.list_members, project, cursor=query.cursor, limit=query.limit)
 
 
 class MemberResource(Resource):
-    """One member."""
+    """A member of a project."""
 
     path = "/projects/{project}/members/{user}"
     tag = "Projects"
 
     @reads(access=Access.READER, answer=Member, etag=True, public=False)
     async def get(self, project: str, user: str) -> Rendered:
-        """The role of a member."""
+        """Return the role of a member."""
         return await self.answer(members.read_member, project, user)
 
     @writes(access=Access.OWNER, body=MemberChange, answer=Member, precondition="optional", etag=True)
     async def put(self, project: str, user: str, body: MemberChange) -> Rendered:
-        """Make a user a member, or change the role."""
+        """Add a member, or change the member's role."""
         believed = self.precondition
         return await self.answer(
             members.put_member, project, user, body, expected_rev=believed.expected_rev, absent=believed.absent
@@ -109,7 +109,7 @@ class MemberResource(Resource):
 
     @writes(access=Access.OWNER, precondition="required")
     async def delete(self, project: str, user: str) -> Rendered:
-        """End a membership; a project keeps at least one owner."""
+        """Remove a member; a project keeps at least one owner."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(members.remove_member, project, user, expected_rev=expected_rev)
 

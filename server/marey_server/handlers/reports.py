@@ -1,4 +1,4 @@
-"""The reports of evaluations and models, and their figures, as they were written when these were made."""
+"""Resources of the reports of evaluations and models, and of their figures, as stored with the item."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src
 
 
 class ReportQuery(Request):
-    """The revision to read."""
+    """Query of a report: the revision to read."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the report; absent: the newest.")
 
 
 class FigureQuery(ReportQuery):
-    """The form of a figure to read."""
+    """Query of a figure: its form and the revision."""
 
     format: Literal["png", "svg", "csv", "json"] = Field(
         "png", description="Form of the figure: an image (png, svg) or the plotted data (json, csv)."
@@ -53,10 +53,10 @@ class FigureQuery(ReportQuery):
 
 
 class StoredFileSender(BlobSender):
-    """Resources that answer with a file which a document names."""
+    """Base of resources that answer with a file named by a document."""
 
     async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
-        """Answer with the file, to be shown where it is asked for and trusted nowhere."""
+        """Answer with the file, to be displayed by browsers, with headers that restrict its rights."""
         return await self.send_blob(
             file.blob,
             disposition="inline",
@@ -67,7 +67,7 @@ class StoredFileSender(BlobSender):
 
 
 class ItemReport(StoredFileSender):
-    """The report of an evaluation or a model."""
+    """Report of an evaluation or a model."""
 
     path = "/projects/{project}/{kind}/{item}/report"
     tag = "Reports"
@@ -82,13 +82,15 @@ class ItemReport(StoredFileSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
-        """The report of an evaluation or a model (kinds `evaluations`, `models`): one page that needs nothing else."""
+        """Return the report of an evaluation or a model (kinds `evaluations`, `models`) as one self-contained HTML
+        page.
+        """
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         return await self.send_file(report.html, query, "text/html; charset=utf-8", _scripts(report))
 
 
 class Figure(StoredFileSender):
-    """A figure of a report."""
+    """Figure of a report."""
 
     path = "/projects/{project}/{kind}/{item}/figures/{figure}"
     tag = "Reports"
@@ -103,21 +105,21 @@ class Figure(StoredFileSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, figure: str, query: FigureQuery) -> Rendered | None:
-        """A figure of a report (kinds `evaluations`, `models`): as a picture, a drawing, or the numbers in it."""
+        """Return a figure of a report (kinds `evaluations`, `models`) as an image, a vector drawing, or its numbers."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         file = file_of(find_figure(report, figure, query.trial), query)
         return await self.send_file(file, query, FIGURE_TYPES[query.format], "sandbox")
 
 
 def _scripts(report: ReportDocument) -> str:
-    """Return the part of the policy that lets the page run its own scripts, named by content, and no others."""
+    """Return the part of the policy that allows the scripts of the page itself, by digest, and no others."""
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"
 
 
 def read_report(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ReportDocument:
-    """Return the report of an item, of whichever kind it is. Raises `NotFoundProblem`."""
+    """Return the report of an item of any kind that has one. Raises `NotFoundProblem`."""
     part: dict[str, Any] = items.read_part(tx, project, kind, item_id, "report", revision=revision, arrays="none").tree
     return _REPORT_OF[part["schema"]].model_validate(part)
 
@@ -126,7 +128,7 @@ _REPORT_OF = {str(one.model_fields["schema_"].default): one for one in REPORTS}
 
 
 def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredFigure:
-    """Return a figure of a report. Raises `NotFoundProblem`, and says what there is."""
+    """Return a figure of a report. Raises `NotFoundProblem`, which lists the figures of the report."""
     named = [figure for figure in report.figures if figure.name == name]
     for figure in named:
         if figure.trial == trial:
@@ -140,7 +142,7 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
-    """Return the form of a figure that is asked for. Raises `NotFoundProblem`."""
+    """Return the requested form of a figure. Raises `NotFoundProblem`."""
     if query.format != "csv":
         return {"png": figure.png, "svg": figure.svg, "json": figure.json_}[query.format]
     table = query.table or next(iter(figure.csv), None)
@@ -151,7 +153,7 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
 
 
 class WalkGraphQuery(ReportQuery):
-    """The walks to read and their form."""
+    """Query of a walk graph: the trials and the form."""
 
     format: WalkGraphFormat = Field(
         "json", description="Format of the graph; GraphML can be read by networkx, Gephi, yEd and igraph."
@@ -160,17 +162,17 @@ class WalkGraphQuery(ReportQuery):
 
 
 class EvaluationWalkGraph(Resource):
-    """The walk graph of an evaluation."""
+    """Walk graph of an evaluation."""
 
     path = "/projects/{project}/{kind}/{item}/walk-graph"
     tag = "Reports"
 
     @reads(access=Access.READER, query=WalkGraphQuery, answer=Bytes, answer_types=tuple(MEDIA_TYPES.values()))
     async def get(self, project: str, kind: str, item: str, query: WalkGraphQuery) -> Reply:
-        """The frames that the trials of an evaluation (kind `evaluations`) displayed, and the jumps between them.
+        """Return the frames displayed by the trials of an evaluation (kind `evaluations`) and the jumps between them.
 
-        Nodes are frames of clips with the ticks that they were displayed for, edges are jumps with their number; the
-        walks say in which order each trial took them.
+        Nodes are frames of clips with the number of ticks for which they were displayed; edges are jumps with their
+        number; walks list the edges of each trial in order.
         """
         source = await self.look_up(walk_graphs.read_walks, project, kind_of(kind), item, query.revision)
         data = await self.compute_long(walk_graphs.write_walk_graph, source, query.trial, query.format)

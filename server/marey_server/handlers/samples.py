@@ -1,4 +1,4 @@
-"""Samples of models: motions that were never captured, the same for the same seed."""
+"""Resources of samples of models: generated motions, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_server.motions.models import FoundModel, UsableModel
 
 
 class SampleQuery(Request):
-    """Number, seed and revision of samples."""
+    """Query of samples: their number, seed, and the model's revision."""
 
     n: int = Field(
         1,
@@ -33,19 +33,19 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Samples to draw, and the format of their files."""
+    """Query of samples as files: the samples to draw, and the format."""
 
     format: MotionFormat = Field("bvh", description="File format; several files are returned in one ZIP archive.")
     unit: WrittenUnit = Field("cm", description="Unit of length of BVH files.")
 
 
 class ModelUser(Resource):
-    """Resources that let a model generate motion."""
+    """Base of resources that let a model generate motion."""
 
     async def usable_model(
         self, project: str, kind: str, item: str, revision: int | None
     ) -> tuple[FoundModel, UsableModel]:
-        """Return the model that is asked for, parsed; those used last are kept."""
+        """Return the requested model, parsed; the most recently used ones are cached."""
         found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
         known = self.services.models.get(found.part.digest)
         if known is None:
@@ -63,9 +63,9 @@ class ModelSamples(ModelUser):
 
     @reads(access=Access.READER, query=SampleQuery, answer=Document, etag=True)
     async def get(self, project: str, kind: str, item: str, query: SampleQuery) -> Rendered:
-        """Motions drawn from a model (kind `models`), with their latent vectors and likelihoods.
+        """Return motions drawn from a model (kind `models`), with their latent vectors and likelihoods.
 
-        The same for the same seed and revision. `motions` are documents like the part `motion` of a clip.
+        The same revision and seed give the same answer. `motions` are documents like the part `motion` of a clip.
         """
         found, model = await self.usable_model(project, kind, item, query.revision)
         form, answers = self.answer_form, self.services.answers
@@ -90,7 +90,7 @@ class SampleFiles(ModelUser):
         answer_types=(*MOTION_MEDIA_TYPES, "application/zip"),
     )
     async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
-        """Motions drawn from a model (kind `models`) as files: one as it is, several as a ZIP archive."""
+        """Return motions drawn from a model (kind `models`) as files: one alone, several as a ZIP archive."""
         found, model = await self.usable_model(project, kind, item, query.revision)
         file = await self.compute(models.sample_file, found, model, query.n, query.seed, query.format, query.unit)
         headers = {"Content-Disposition": attachment(file.name), **_caching(query)}
@@ -98,12 +98,12 @@ class SampleFiles(ModelUser):
 
 
 def _state(found: FoundModel, query: SampleQuery) -> str:
-    """Return the entity tag of samples: content and revision of the model, number and seed."""
+    """Return the entity tag of samples, from content and revision of the model, number and seed."""
     return f"{found.part.digest.removeprefix('sha256:')[:32]}.{found.part.revision}.{query.n}.{query.seed}"
 
 
 def _caching(query: SampleQuery) -> dict[str, str]:
-    """Return caching headers: an answer for a named revision never changes."""
+    """Return caching headers; the answer for a named revision never changes."""
     return {"Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache"}
 
 

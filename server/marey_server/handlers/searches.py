@@ -1,4 +1,4 @@
-"""Searches: motions of models that meet constraints."""
+"""Resources that search models for motions that meet constraints."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from marey_server.motions.searching import FoundSearchable, Searchable, Searchab
 
 
 class FoundFileQuery(Request):
-    """Query of a search whose result is a file: its format and unit."""
+    """Query of a search with a file as result: its format and unit."""
 
     format: MotionFormat = Field("bvh", description="File format of the motion.")
     unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")
 
 
 class Searcher(Resource):
-    """Resources that search models."""
+    """Base of resources that search models."""
 
     async def searchables(
         self, project: str, kind: str, item: str, request: SearchRequest
     ) -> tuple[list[FoundSearchable], list[Searchable]]:
-        """Return the model of each step with its tree, parsed; those used last are kept."""
+        """Return the model of each step with its tree, parsed; the most recently used ones are cached."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
         parsed: dict[SearchableKey, Searchable] = {}
         for one in found:
@@ -50,18 +50,18 @@ class Searcher(Resource):
 
 
 class Search(Searcher):
-    """Motions of a model that meet constraints."""
+    """Search for motions of a model."""
 
     path = "/projects/{project}/{kind}/{item}/search"
     tag = "Models"
 
     @reads(access=Access.READER, body=SearchRequest, answer=Document)
     async def post(self, project: str, kind: str, item: str, body: SearchRequest) -> Rendered:
-        """The motion of a model (kind `models`) that meets constraints best, or motions that follow one another.
+        """Return the motion of a model (kind `models`) that meets constraints best, or a sequence of motions.
 
-        The model's tree is searched, and the best sample refined. A model without a tree, or with that of another one,
-        gets one drawn for the search; `steps[].tree` says so. Nothing is stored, and the same request has the same
-        answer.
+        The model's tree is searched, and the best sample is refined. For a model without a tree, or with the tree of
+        another one, a tree is drawn for the search; `steps[].tree` says so. Nothing is stored, and the same request
+        gets the same answer.
         """
         found, searchables = await self.searchables(project, kind, item, body)
         form, answers = self.answer_form, self.services.answers
@@ -74,7 +74,7 @@ class Search(Searcher):
 
 
 class SearchFile(Searcher):
-    """Motions of a model that meet constraints, as a file."""
+    """Search for motions of a model, as a file."""
 
     path = "/projects/{project}/{kind}/{item}/search/export"
     tag = "Models"
@@ -87,7 +87,7 @@ class SearchFile(Searcher):
         answer_types=MOTION_MEDIA_TYPES,
     )
     async def post(self, project: str, kind: str, item: str, query: FoundFileQuery, body: SearchRequest) -> Reply:
-        """Return the motion that a search finds as one file, with all its steps."""
+        """Return the motion found by a search as one file, with all its steps."""
         found, searchables = await self.searchables(project, kind, item, body)
 
         def written() -> Reply:

@@ -1,4 +1,4 @@
-"""Resumable uploads: announce, send pieces, ask how far it got, go on. They end as blobs."""
+"""Resumable uploads: creation, sending of pieces, state, and their end as blobs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_server.store import uploads
 from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
-"""Bytes that are written at a time; an interrupted request loses at most as many."""
+"""Number of bytes written at a time; an interrupted request loses at most this number."""
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
@@ -22,7 +22,7 @@ def upload_reply(upload: uploads.StoredUpload) -> Reply:
 
 
 def finish_upload(tx: Transaction, upload_id: str) -> uploads.StoredUpload:
-    """Make a blob of an upload whose last byte has come; leave any other as it is."""
+    """Store an upload as a blob if all its bytes were received; otherwise leave it unchanged."""
     upload = uploads.read_upload(tx, upload_id)
     if upload.offset == upload.length:
         uploads.finish(tx, upload_id)
@@ -37,7 +37,7 @@ class Uploads(Resource):
 
     @writes(access=Access.SIGNED_IN, body=UploadCreate, answer=Upload, status=201, idempotency="key")
     async def post(self, body: UploadCreate) -> Rendered:
-        """Announce bytes that come in pieces."""
+        """Create an upload, whose bytes are then sent in pieces."""
 
         def created(upload: uploads.StoredUpload) -> Reply:
             reply = upload_reply(upload)
@@ -47,13 +47,13 @@ class Uploads(Resource):
 
 
 class UploadResource(Resource):
-    """One upload."""
+    """An upload."""
 
     path = "/uploads/{upload}"
     tag = "Blobs"
 
     async def begin(self, upload: str) -> None:
-        """Check where the piece belongs before it comes."""
+        """Check the offset of the piece before it is received."""
         text = self.request.headers.get("Upload-Offset", "")
         if not text.isascii() or not text.isdigit() or len(text) > 12:
             raise BadRequestProblem("Send Upload-Offset with the offset of the piece.", code="bad-offset")
@@ -61,7 +61,7 @@ class UploadResource(Resource):
         await self._append()
 
     async def receive(self, chunk: bytes) -> None:
-        """Take the next bytes; what is complete is kept even if the connection breaks."""
+        """Store the next bytes; complete parts of a piece are kept even if the connection breaks."""
         self.piece += chunk
         if len(self.piece) >= PIECE_BYTES:
             await self._append()
@@ -88,9 +88,9 @@ class UploadResource(Resource):
         headers=("Upload-Offset",),
     )
     async def patch(self, upload: str) -> Rendered:
-        """Send the next piece. With the last one the upload becomes a blob, whose digest is answered.
+        """Send the next piece. With the last one the upload becomes a blob, whose digest is returned.
 
-        At the wrong offset the answer is 409 with the right one: in the header Upload-Offset and in the context.
+        For a wrong offset, the answer is 409 with the current one in the header Upload-Offset and in the context.
         """
         if self.piece:
             await self._append()

@@ -1,4 +1,4 @@
-"""One request's work inside one transaction: who asks, what is done, and the answer's bytes.
+"""Execution of a request in one transaction: identification of the caller, the function, and rendering of the answer.
 
 All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once.
 """
@@ -22,14 +22,14 @@ CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
 
 @dataclass
 class Caller:
-    """The credential of a request, and who it turned out to belong to."""
+    """Credential of a request, and the principal that it belongs to."""
 
     token: str | None
     operation: Operation
     principal: Principal | None = None
 
     def identify(self, tx: Transaction) -> None:
-        """Resolve the credential and let the transaction act for its owner, within what the operation allows.
+        """Resolve the credential and set the transaction's principal, within the limits of the operation.
 
         The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
         """
@@ -40,7 +40,7 @@ class Caller:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may never do this, whatever it is done to.
+    """Refuse callers who may not perform an operation on any object.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """
@@ -66,7 +66,7 @@ def require_access(operation: Operation, principal: Principal) -> None:
 
 @dataclass(frozen=True)
 class Call:
-    """Work of one request in its transaction, and the form of its answer."""
+    """Function of a request to be run in a transaction, and the form of its answer."""
 
     caller: Caller
     form: AnswerForm
@@ -78,11 +78,11 @@ class Call:
     idempotency_key: str | None = None
     fingerprint: str = ""
     project: str | None = None
-    """The one that the address names."""
+    """Name of the project in the address, if any."""
 
 
 def run_call(tx: Transaction, call: Call) -> Rendered:
-    """Do it, once per idempotency key, and render the answer."""
+    """Run the function of a request, once per idempotency key, and render the answer."""
     call.caller.identify(tx)
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
@@ -98,7 +98,7 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
 
 
 def only_identify(tx: Transaction) -> None:
-    """Do nothing more than `run_plain` does by itself: look the credential up."""
+    """Do nothing; run by `run_plain` to resolve the credential only."""
 
 
 def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Declarations of handler methods.
+"""Declarations of handler methods by the decorators `@reads` and `@writes`.
 
-`@reads` and `@writes` attach an `Operation` to a method. Everything else follows from it: checks before the method
-runs, the OpenAPI document, the documentation page, and the table that the access test walks through.
+They attach an `Operation` to a method. The checks before the method runs, the OpenAPI document, the documentation page
+and the access test are all derived from it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ MIB = 1024 * KIB
 
 Method = Callable[..., Awaitable[Any]]
 Declared = Callable[..., Coroutine[Any, Any, None]]
-"""What Tornado calls: it performs the method as its declaration says."""
+"""Function that Tornado calls; it runs the method as declared."""
 
 
 class Access(StrEnum):
-    """Least access for an operation. Roles are roles in the project of the path, including every higher role."""
+    """Least access that an operation requires. Roles are roles in the project of the path, and include higher ones."""
 
     ANYONE = "anyone"
     SIGNED_IN = "signed_in"
@@ -43,12 +43,12 @@ class Access(StrEnum):
 
     @property
     def role(self) -> Role | None:
-        """The role in a project, or None where it is none."""
+        """The role in a project, or None for an access that is not a role."""
         return next((role for role in Role if role.value == self.value), None)
 
 
 class Document:
-    """Marks a body or an answer that is a document: a tree with arrays, of the schema it names."""
+    """Marker of a body or an answer that is a document: a tree with arrays, of the schema it names."""
 
 
 class Bytes:
@@ -56,7 +56,7 @@ class Bytes:
 
 
 class Files:
-    """Marks a body that is `multipart/form-data` with files and form fields."""
+    """Marker of a body that is `multipart/form-data` with files and form fields."""
 
 
 Content = type[BaseModel] | type[Document] | type[Bytes]
@@ -64,9 +64,9 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 
 @dataclass(frozen=True, slots=True)
 class RequestBody:
-    """A body that a method takes: a model, a document, bytes or files.
+    """Body of a request: a model, a document, bytes or files.
 
-    `streamed` bodies are given to the resource piece by piece, as they come.
+    `streamed` bodies are passed to the resource piece by piece while they are received.
     """
 
     content: Content | type[Files]
@@ -78,7 +78,7 @@ class RequestBody:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """One method of one resource, as declared."""
+    """Declaration of one method of one resource."""
 
     method: str
     summary: str
@@ -101,13 +101,13 @@ class Operation:
 
     @property
     def required_role(self) -> RequiredRole:
-        """The role that the store enforces in every project which this operation touches."""
+        """The role that the store enforces in every project that this operation uses."""
         role = self.access.role
         return STRICTEST if role is None else RequiredRole(role, self.scope or "read", guests=self.public)
 
     @property
     def may_create(self) -> bool:
-        """Whether `If-None-Match: *` is a precondition of it."""
+        """Whether the operation accepts `If-None-Match: *`."""
         return self.precondition in ("create", "optional")
 
 
@@ -129,10 +129,10 @@ def reads(
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
-    `answer` is what one answer holds, or with `paged` one element of a page; `answer_types` are the media types where
-    they are not those of models and documents. `stream`: it also comes as server-sent events. `public=False`: guests of
-    a public project may not. `also` are further statuses, `headers` further request headers. With a `body`, it is a
-    question too long for an address.
+    `answer` is the type of the answer, or, with `paged`, of one element of a page; `answer_types` are its media types,
+    if they are not those of models and documents. `stream`: the answer is also available as server-sent events.
+    `public=False`: guests of a public project are refused. `also` are further statuses, `headers` further request
+    headers. A `body` is for queries that are too long for an address.
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
@@ -156,9 +156,9 @@ def writes(
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
-    `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` takes
-    either or none. `idempotency="key"`: honours Idempotency-Key; `nature`: doing it twice does it once anyway.
-    Readers and guests of a project change nothing in it, so `access` cannot be that of readers.
+    `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts
+    either or none. `idempotency`: `key` accepts Idempotency-Key; `nature` means that repeating the request has no
+    further effect. `access` cannot be that of readers, because readers and guests of a project may not change it.
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")

@@ -1,4 +1,4 @@
-"""The documentation page: the OpenAPI document for people. One HTML page without scripts or outside addresses."""
+"""Documentation page of the API: the OpenAPI document as one HTML page without scripts or external resources."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ nav a { margin-right: .8rem }
 
 
 def render_page(document: Schema) -> bytes:
-    """Return the page of an OpenAPI document."""
+    """Return the HTML page for an OpenAPI document."""
     return "".join(_page(document)).encode()
 
 

@@ -1,7 +1,7 @@
 """Entity tags and preconditions (RFC 9110, section 13).
 
-A tag is `"<rev>.<form>"`: the state of a thing and the form it was sent in. A precondition of a write compares states
-only, so that what was read as MessagePack can be changed with JSON.
+A tag is `"<rev>.<form>"`: the state of a resource and the form it was sent in. Preconditions of writes compare states
+only, so that a resource read as MessagePack can be changed with JSON.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from marey_server.errors import BadRequestProblem, PreconditionFailedProblem, Pr
 from marey_server.store.revs import ExpectedRev
 
 MOST_STATES = 100
-"""Each is a parameter of the statement that writes."""
+"""Greatest number of tags; each becomes a parameter of the statement that writes."""
 
 _TAG = re.compile(r'\s*(W/)?"([\x21\x23-\x7e\x80-\xff]*)"\s*')
 _REV = re.compile("[0-9]{1,9}")
@@ -29,19 +29,19 @@ class Precondition:
 
 
 ANY_STATE = Precondition()
-"""`If-Match: *`."""
+"""Whether the header is `If-Match: *`."""
 
 ABSENT = Precondition(absent=True)
-"""`If-None-Match: *`: only create."""
+"""Whether the header is `If-None-Match: *`, which allows only creation."""
 
 
 def entity_tag(state: int | str, form: str) -> str:
-    """Return the ETag header of a state in a form."""
+    """Return the ETag header for a state and a form."""
     return f'"{state}.{form}"'
 
 
 def parse_tags(header: str) -> list[str]:
-    """Return the opaque values of a list of tags, weak or strong; `["*"]` for the star. Raises `BadRequestProblem`."""
+    """Return the opaque values of a list of tags, weak or strong; `["*"]` for `*`. Raises `BadRequestProblem`."""
     if header.strip() == "*":
         return ["*"]
     tags: list[str] = []
@@ -63,7 +63,7 @@ def parse_tags(header: str) -> list[str]:
 
 
 def matches(if_none_match: str | None, tag: str) -> bool:
-    """Return whether the caller holds `tag` already, so that 304 is the answer."""
+    """Return whether If-None-Match contains `tag`, so that the answer is 304."""
     if not if_none_match:
         return False
     held = parse_tags(if_none_match)
@@ -71,10 +71,10 @@ def matches(if_none_match: str | None, tag: str) -> bool:
 
 
 def write_precondition(if_match: str | None, if_none_match: str | None, *, may_create: bool = False) -> Precondition:
-    """Return the precondition of a change.
+    """Return the precondition of a write.
 
-    Raises `PreconditionRequiredProblem` where the caller sent none, `PreconditionFailedProblem` where none of the tags
-    can ever match, `BadRequestProblem` where they are malformed.
+    Raises `PreconditionRequiredProblem` if the request has none, `PreconditionFailedProblem` if no tag can match, and
+    `BadRequestProblem` if the tags are malformed.
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":

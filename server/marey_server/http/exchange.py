@@ -20,9 +20,9 @@ from marey_server.process.observe import request_id
 from marey_server.process.services import Services
 
 LINGER_BYTES = 64 * 2**20
-"""How much of a refused body is read and thrown away, so that its sender gets to read why."""
+"""Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
 _LENGTH = re.compile("[0-9]{1,4300}")
-"""Pattern of a length; the limit on digits keeps `int` from refusing it."""
+"""Pattern of a Content-Length; the number of digits is limited because `int` refuses very long ones."""
 _SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class Exchange(RequestHandler):
-    """One request and its answer."""
+    """HTTP request and its answer."""
 
     path: ClassVar[str]
     root: ClassVar[str] = API
@@ -53,14 +53,14 @@ class Exchange(RequestHandler):
 
     @property
     def services(self) -> Services:
-        """Services of the process."""
+        """The services of the process."""
         services: Services = self.application.services  # type: ignore[attr-defined]
         return services
 
     # -- the body that comes ------------------------------------------------------------------------------------------
 
     def declared_length(self) -> int:
-        """Return the length of the body as its sender says; 0 where it does not, or says what Tornado refuses next."""
+        """Return the Content-Length of the request; 0 if it is missing, or malformed so that Tornado refuses it."""
         text = self.request.headers.get("Content-Length", "0").partition(",")[0].strip()  # the same may stand twice
         return int(text) if _LENGTH.fullmatch(text) else 0
 
@@ -69,14 +69,14 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Throw away what comes of the body of a refused request; when it does not end, cut the connection."""
+        """Discard the received part of a refused request's body; if it is too long, close the connection."""
         if self.received_bytes > LINGER_BYTES:
             self.request.connection.close()  # type: ignore[union-attr]
 
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
     def send(self, rendered: Rendered) -> None:
-        """Put status, headers and body of an answer into the response."""
+        """Set status, headers and body of the response."""
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
@@ -85,7 +85,7 @@ class Exchange(RequestHandler):
             self.write(rendered.body)
 
     async def flush_within(self, seconds: float) -> None:
-        """Wait until what was written has gone out; who does not take it in time is cut off."""
+        """Wait until the written data is sent; close the connection if the client does not take it in time."""
         try:
             await asyncio.wait_for(self.flush(), seconds)
         except TimeoutError:
@@ -93,7 +93,7 @@ class Exchange(RequestHandler):
             raise StreamClosedError from None
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read. The rest of it is read and dropped: closing at once could lose the answer."""
+        """Answer before the body is read, then discard the rest of it; closing at once could lose the answer."""
         self.refused = True
         self._write_problem(error)
         if self.request.headers.get("Expect", "").lower() == "100-continue":
@@ -102,18 +102,18 @@ class Exchange(RequestHandler):
             await self.flush()
 
     def method_not_allowed(self) -> MethodNotAllowedProblem:
-        """Return the refusal of a method that was not declared."""
+        """Return the error for a method that the resource does not declare."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
         return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
 
     def is_awaited(self) -> bool:
-        """Return whether an answer still has somebody to go to, and the server time to make one."""
+        """Return whether the client is still connected and the server has time to answer."""
         return not self._gone and not self.services.draining.is_set()
 
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
 
     async def _undeclared(self, **_path: str) -> None:
-        """Methods without a declaration are refused before they are called."""
+        """Refuse a method without a declaration."""
 
     get: Declared = _undeclared
     head: Declared = _undeclared
@@ -124,16 +124,16 @@ class Exchange(RequestHandler):
     options: Declared = _undeclared
 
     def set_default_headers(self) -> None:
-        """Headers of every answer."""
+        """Set the headers of every answer."""
         self.clear_header("Server")
         for name, value in _SECURITY_HEADERS.items():
             self.set_header(name, value)
 
     def compute_etag(self) -> None:
-        """No tag from the bytes of an answer: tags name states, and hashing an answer costs more than sending it."""
+        """Return no tag: the tags of this API name states, and hashing an answer costs more than sending it."""
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Any error as a problem document; details of our own faults stay in the log."""
+        """Answer any error with a problem document; details of internal errors are only logged."""
         if self._headers_written:  # part of an answer is out: only a cut connection says that it is not whole
             self.request.connection.close()  # type: ignore[union-attr]
             return
@@ -150,15 +150,15 @@ class Exchange(RequestHandler):
         self.send(render_problem(error, self.request_id))
 
     def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
-        """Faults of ours are logged with their traceback, refusals are not faults."""
+        """Log internal errors with their traceback; refusals are not logged as errors."""
         log_fault(value, self.request_id, self.request.method or "", self.template())
 
     def on_finish(self) -> None:
-        """The answer is on its way."""
+        """Remove the request from those in progress after its answer was written."""
         self.services.in_flight.discard(self)
 
     def on_connection_close(self) -> None:
-        """The caller has gone."""
+        """Note that the client has closed the connection."""
         super().on_connection_close()
         self._gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
@@ -166,7 +166,7 @@ class Exchange(RequestHandler):
 
 
 def render_problem(error: BaseException, request_id: str) -> Rendered:
-    """Return the problem document of an error. Of faults that are not refusals it says nothing but the request id."""
+    """Return the problem document of an error; for internal errors, it contains only the request id."""
     if isinstance(error, ApiProblem):
         problem = _of_refusal(error, request_id)
         headers = dict(error.headers)
@@ -198,7 +198,7 @@ def _problem(status: int, code: str, title: str, detail: str, request_id: str) -
 
 
 def log_fault(error: BaseException, request_id: str, method: str, path: str) -> None:
-    """Write a fault of ours to the log, with its traceback."""
+    """Log an internal error with its traceback."""
     if isinstance(error, ApiProblem | HTTPError | StreamClosedError | UnauthenticatedProblem):
         return
     log.error("%s %s failed", method, path, exc_info=error, extra={"request_id": request_id})

@@ -1,4 +1,4 @@
-"""`multipart/form-data` read as it streams (RFC 7578), so that no file has to fit in memory."""
+"""Streaming reader of `multipart/form-data` (RFC 7578), so that files need not fit into memory."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedM
 
 MAX_HEAD_BYTES = 16 * 1024
 MAX_BOUNDARY_BYTES = 70
-"""RFC 2046, section 5.1.1."""
+"""Pattern of a boundary (RFC 2046, section 5.1.1)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PartHead:
-    """The head of a part: the form field, and the file name if it is a file."""
+    """Head of a part: the form field, and the file name if it is a file."""
 
     field: str
     file_name: str | None
@@ -25,7 +25,7 @@ class PartHead:
 
 @dataclass(frozen=True, slots=True)
 class PartEnd:
-    """The end of a part."""
+    """End of a part."""
 
 
 Piece = PartHead | bytes | PartEnd
@@ -47,9 +47,9 @@ def boundary_of(content_type: str) -> bytes:
 
 
 class MultipartReader:
-    """Cuts a stream into parts: for every part one `PartHead`, its bytes in pieces, one `PartEnd`.
+    """Splitter of a stream into parts: one `PartHead` for each, its bytes in pieces, and one `PartEnd`.
 
-    `python-multipart` parses; this class bounds the heads and the number of parts, and skips a preamble.
+    `python-multipart` parses; this class limits the size of heads and the number of parts, and skips a preamble.
     """
 
     def __init__(self, boundary: bytes, *, max_parts: int) -> None:
@@ -78,7 +78,7 @@ class MultipartReader:
         )
 
     def feed(self, data: bytes) -> list[Piece]:
-        """Return what the next bytes of the stream complete. Raises `BadRequestProblem` or `TooLargeProblem`."""
+        """Return the events completed by the next bytes. Raises `BadRequestProblem` or `TooLargeProblem`."""
         if self._preamble is not None:
             data = self._skip_preamble(self._preamble + data)
         try:

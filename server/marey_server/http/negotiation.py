@@ -1,4 +1,4 @@
-"""Media types: which form of an answer the caller gets, and in which form a body came (RFC 9110, section 12)."""
+"""Media types of answers and bodies (RFC 9110, section 12)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_RANGES = 64
 
 @dataclass(frozen=True, slots=True)
 class MediaType:
-    """A form that an answer can take. `form` is its name in ETags."""
+    """Media type of an answer. `form` is its name in ETags."""
 
     name: str
     form: str
@@ -41,7 +41,7 @@ DOCUMENT_FORMS = (JSON, MSGPACK, BSON, MSGPACK_BLOCKS, BSON_BLOCKS)
 
 @dataclass(frozen=True, slots=True)
 class _Range:
-    """One element of an Accept header."""
+    """Element of an Accept header."""
 
     type: str
     subtype: str
@@ -62,9 +62,9 @@ class _Range:
 
 
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
-    """Return the offer the caller likes best; the first offer wins ties.
+    """Return the offered media type that the client prefers; of equal ones, the first.
 
-    Raises `NotAcceptableProblem`, listing what is offered.
+    Raises `NotAcceptableProblem`, which lists the offered types.
     """
     chosen = _best(accept, offers) if accept else offers[0]
     if chosen is None:
@@ -111,9 +111,9 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
 
 
 def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
-    """Return the media type of a body; JSON if it names none.
+    """Return the media type of a body; JSON if the request names none.
 
-    Raises `UnsupportedMediaTypeProblem`, listing what is understood.
+    Raises `UnsupportedMediaTypeProblem`, which lists the supported types.
     """
     if not content_type:
         return codecs.JSON
@@ -128,7 +128,7 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
 
 
 def require_plain_encoding(content_encoding: str | None) -> None:
-    """Refuse compressed bodies, so that no small request unfolds into a large one.
+    """Refuse compressed bodies, because a small request could expand to a large one.
 
     Raises `UnsupportedMediaTypeProblem`.
     """
@@ -139,7 +139,10 @@ def require_plain_encoding(content_encoding: str | None) -> None:
 
 
 def bearer_token(authorization: str | None) -> str | None:
-    """The token of an Authorization header, None without one. Raises `UnauthenticatedProblem` where it is malformed."""
+    """Return the token of an Authorization header, or None without one.
+
+    Raises `UnauthenticatedProblem` if the header is malformed.
+    """
     if authorization is None:
         return None
     scheme, _, token = authorization.strip().partition(" ")

@@ -1,4 +1,4 @@
-"""The OpenAPI 3.1 document, made from the declarations on the handlers: nothing in it is written twice."""
+"""OpenAPI 3.1 document, generated from the declarations of the handlers."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def build_document(routes: Iterable[Route], version: str) -> Schema:
 
 
 class _Models:
-    """The JSON schemas of every model that travels, and references to them."""
+    """JSON schemas of all models in requests and answers, and references to them."""
 
     def __init__(self, routes: list[Route]) -> None:
         wanted: dict[tuple[type[BaseModel], JsonSchemaMode], None] = {(Problem, "serialization"): None}
@@ -111,22 +111,22 @@ class _Models:
         self.components: dict[str, Schema] = definitions.get("$defs", {})
 
     def reading(self, model: type[BaseModel]) -> Schema:
-        """Reference to a model that a caller sends."""
+        """Return a reference to a model in a request."""
         return dict(self._refs[model, "validation"])
 
     def writing(self, model: type[BaseModel]) -> Schema:
-        """Reference to a model that the server answers."""
+        """Return a reference to a model in an answer."""
         return dict(self._refs[model, "serialization"])
 
     def partial(self, model: type[BaseModel]) -> Schema:
-        """Reference to a model of which only some fields are there."""
+        """Return a reference to a model of which only some fields are present."""
         name = f"Some{model.__name__}"
         full = self.components[self.writing(model)["$ref"].rpartition("/")[2]]
         self.components[name] = {key: value for key, value in full.items() if key != "required"} | {"title": name}
         return {"$ref": _REF.format(model=name)}
 
     def document(self) -> Schema:
-        """Return a document of any known schema; the open one admits those of the others, too."""
+        """Return the schema of any document; "any of", because the open schema matches documents of the others, too."""
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 
 
@@ -178,7 +178,7 @@ def _query_parameters(operation: Operation) -> list[Schema]:
 
 
 def _without_null(schema: Schema) -> Schema:
-    """A parameter without a value is absent from the query, because null cannot be sent."""
+    """Remove null from the schema of a parameter: a parameter without a value is left out of the query."""
     shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
     shown.pop("title", None)
     choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]

@@ -20,14 +20,14 @@ def _split(value: Any) -> Any:
 
 
 CommaSeparatedOf = Annotated[tuple[T, ...], Field(max_length=MAX_VALUES), BeforeValidator(_split)]
-"""Several values of a type in one parameter, separated by commas."""
+"""List of values in one parameter, separated by commas."""
 
 CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=1024)]]
-"""Several texts."""
+"""List of texts in one parameter, separated by commas."""
 
 
 class PageQuery(Request):
-    """Page of a list."""
+    """Query of a page of a list."""
 
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Greatest number of entries in a page.")
     cursor: str | None = Field(
@@ -36,7 +36,7 @@ class PageQuery(Request):
 
 
 class CountedPageQuery(PageQuery):
-    """Page of a list, optionally with the count of all entries."""
+    """Query of a page of a list, optionally with the number of all entries."""
 
     count: Literal["exact"] | None = Field(
         None, description="Return the length of the whole list, which is slow for long lists."

@@ -1,4 +1,4 @@
-"""Receiving of request bodies: collected on the event loop, hashed and written in threads."""
+"""Reception of request bodies: collected on the event loop, hashed and written in threads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ INLINE_BYTES = 64 * 1024
 
 
 class Receiver:
-    """Takes a stream of bytes into a `Spool`, off the event loop, holding at most `BATCH_BYTES` of it."""
+    """Sink that writes a stream of bytes to a `Spool` in a thread, with at most `BATCH_BYTES` of it in memory."""
 
     def __init__(self, services: Services) -> None:
         self.spool = Spool()
@@ -21,13 +21,13 @@ class Receiver:
         self._pending = bytearray()
 
     async def write(self, data: bytes) -> None:
-        """Take the next bytes; waits while a batch is being written."""
+        """Add the next bytes; waits while a batch is being written."""
         self._pending += data
         if len(self._pending) >= BATCH_BYTES:
             await self._flush()
 
     async def finish(self) -> Spool:
-        """Return the received body with its digest. The caller closes it."""
+        """Return the received body with its digest. The caller must close it."""
         if len(self._pending) <= INLINE_BYTES:
             self._write(bytes(self._pending))
             self._pending.clear()

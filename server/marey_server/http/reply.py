@@ -1,4 +1,4 @@
-"""Answers of handlers and their rendering to bytes. Rendering needs no request and can run in any thread."""
+"""Answers of handlers, and their rendering to bytes, which needs no request and can run in any thread."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_server.http.negotiation import MediaType
 API = "/api/v1"
 
 AnswerCache = LruCache[tuple[str, str], bytes]
-"""Bodies of documents that never change, by digest and media type.
+"""Cache of rendered documents that never change, by digest and media type.
 
 Reading the same document again only copies bytes to the socket. Permission is not cached: every request asks the store
 before it takes a body from here.
@@ -27,7 +27,7 @@ before it takes a body from here.
 
 @dataclass(frozen=True, slots=True)
 class Lasting:
-    """A document that never changes, by its digest; `load` is called where the bytes to send are not at hand."""
+    """Document that never changes, identified by its digest; `load` is called if its rendered bytes are not cached."""
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
@@ -40,7 +40,7 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    `rev` is the state for the ETag; `location` a path below the API's root.
+    `rev` is the state for the ETag; `location` is a path below the API's root.
     """
 
     content: Content | Lasting | None = None
@@ -53,7 +53,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """An answer as it goes out."""
+    """Answer as status, headers and bytes."""
 
     status: int
     headers: Mapping[str, str]
@@ -62,7 +62,7 @@ class Rendered:
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
-    """Requested form of an answer: media type, entity tag that the caller holds, and status of success."""
+    """Requested form of an answer: media type, entity tags that the client has, and status of success."""
 
     media: MediaType
     if_none_match: str | None
@@ -70,7 +70,7 @@ class AnswerForm:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Return the bytes of a reply; 304 without any where the caller holds this state in this form."""
+    """Return the bytes of a reply; if the client has this state in this form already, 304 without a body."""
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location
@@ -94,7 +94,7 @@ def _load(content: Lasting, media: MediaType) -> bytes:
 
 
 def encode(content: Content, media: MediaType) -> bytes:
-    """Return a model or tree in a media type; bytes as they are."""
+    """Return a model or tree encoded in a media type; bytes are returned unchanged."""
     if isinstance(content, bytes):
         return content
     if isinstance(content, BaseModel):

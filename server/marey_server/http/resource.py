@@ -44,16 +44,16 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 INLINE_BYTES = 32 * 1024
-"""Bodies and answers up to this size are converted on the event loop; larger ones in a thread."""
+"""Greatest size of bodies and answers that are converted on the event loop; larger ones are converted in a thread."""
 EARLY_CHECK_BYTES = 1024 * 1024
-"""Before a larger body is taken in, the credential is looked up."""
+"""Greatest size of a body that is received before the credential is checked."""
 _METHODS = ("get", "post", "put", "patch", "delete")
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
 
 @stream_request_body
 class Resource(Exchange):
-    """A thing with a path and declared methods."""
+    """Resource with a path and declared methods."""
 
     tag: ClassVar[str]
     uneventful = False
@@ -78,7 +78,7 @@ class Resource(Exchange):
 
     @property
     def principal(self) -> Principal | None:
-        """The principal of the request, once it is authenticated."""
+        """The principal of the request, after authentication."""
         caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
         return caller.principal if caller is not None else None
 
@@ -100,7 +100,9 @@ class Resource(Exchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """The answer that `function(tx, ...)` gives, by the declaration: a model, its ETag, the declared status."""
+        """Run `function(tx, ...)` and return the rendered answer: its result as a model, the ETag and the declared
+        status.
+        """
         return await self.answer_with(self._declared_reply, function, *args, **kwargs)
 
     async def answer_with(
@@ -110,7 +112,9 @@ class Resource(Exchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """The answer that `to_reply` makes of what `function(tx, ...)` returns, both in the transaction's thread."""
+        """Run `function(tx, ...)`, pass its result to `to_reply` in the same transaction, and return the rendered
+        answer.
+        """
         key = self._idempotency_key()
         fingerprint = self._fingerprint() if key else ""
         answers = self.services.answers
@@ -130,13 +134,13 @@ class Resource(Exchange):
             return await self.compute(function, *args, **kwargs)
 
     def on_finish(self) -> None:
-        """The answer is on its way."""
+        """Note the use of the caller's token after the answer was written."""
         super().on_finish()
         if self.principal is not None:
             self.services.note_use(self.principal)
 
     async def pause(self, seconds: float) -> bool:
-        """Wait; return at once, with True, when the server is stopping."""
+        """Wait for a time; if the server is stopping, return True at once."""
         try:
             await asyncio.wait_for(self.services.draining.wait(), seconds)
         except TimeoutError:
@@ -155,10 +159,10 @@ class Resource(Exchange):
         pass
 
     begin: Declared = _begin
-    """Called before the first byte of a streamed body, with the path's variables."""
+    """Method called before the first byte of a streamed body, with the variables of the path."""
 
     async def receive(self, chunk: bytes) -> None:
-        """Called with each piece of a streamed body."""
+        """Process the next piece of a streamed body."""
 
     def _declared_reply(self, outcome: Any) -> Reply:
         if self.operation.answer is None:
@@ -236,12 +240,12 @@ class Resource(Exchange):
 
     @property
     def path_variables(self) -> dict[str, Any]:
-        """The variables of the path, converted."""
+        """The variables of the path, converted to their types."""
         numbers = set(re.findall(r"\{(\w+):int\}", self.path))
         return {name: int(text) if name in numbers else text for name, text in self.path_kwargs.items()}
 
     async def data_received(self, chunk: bytes) -> None:
-        """Take a piece of the body in, or throw it away where the request was refused already."""
+        """Process the next piece of the body, or discard it if the request was refused already."""
         self.received_bytes += len(chunk)
         if self.refused:
             self.drop()
@@ -259,7 +263,7 @@ class Resource(Exchange):
             await self.refuse(error)
 
     async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
-        """Run a declared method and send what it answers."""
+        """Run a declared method and send its answer."""
         if self.refused:
             return
         self.performing = True

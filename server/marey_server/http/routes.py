@@ -1,4 +1,4 @@
-"""The table of all routes, used for serving, for the documentation and for the access test."""
+"""Table of all routes, used for serving, documentation and the access test."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _CONTROL = re.compile(rb"[\x00-\x1f\x7f]")
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """One operation and the template of its path, as in `/api/v1/projects/{project}`."""
+    """Operation and the template of its path, as in `/api/v1/projects/{project}`."""
 
     template: str
     operation: Operation
@@ -31,13 +31,13 @@ class Route:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The names of the path's variables."""
+        """The names of the variables in the path."""
         return tuple(_VARIABLE.findall(self.template))
 
 
 @dataclass(slots=True)
 class _Node:
-    """One segment of a path: what may follow it."""
+    """Segment of a path, with the segments that may follow."""
 
     literals: dict[str, _Node] = field(default_factory=dict)
     variable: _Node | None = None
@@ -45,7 +45,7 @@ class _Node:
 
 
 class UnknownPath(Resource):
-    """Answer of every other address."""
+    """Answer to a request for an unknown path."""
 
     root = ""
     path = "(unknown)"
@@ -56,7 +56,7 @@ class UnknownPath(Resource):
 
 
 class RouteTable(Router):
-    """Finds the resource of an address segment by segment, so that the number of routes does not matter."""
+    """Search tree of path segments, so that the time to find a resource does not depend on the number of routes."""
 
     def __init__(self, application: Application, resources: Iterable[type[Resource]]) -> None:
         self._application = application

@@ -1,7 +1,4 @@
-"""Sends blobs piece by piece: the whole, or one byte range (RFC 9110, section 14).
-
-Several ranges are answered with the whole.
-"""
+"""Streaming of blobs, whole or one byte range (RFC 9110, section 14); several ranges get the whole blob."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
 IMMUTABLE = "private, max-age=31536000, immutable"
 WRITE_TIMEOUT_S = 60
-"""A caller who takes longer for one piece has gone, or wants to hold us up."""
+"""Time limit for a client to receive one piece; after it, the connection is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +32,7 @@ class ByteRange:
     last: int | None
 
     def within(self, size: int) -> tuple[int, int]:
-        """Start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiableProblem`."""
+        """Return start and stop in a representation of `size` bytes. Raises `RangeNotSatisfiableProblem`."""
         if self.first is None:
             start, stop = max(size - (self.last or 0), 0), size
         else:
@@ -49,7 +46,10 @@ class ByteRange:
 
 
 def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRange | None:
-    """Return the range that is asked for; None for the whole: no range, several, malformed, or of another state."""
+    """Return the requested range, or None for the whole.
+
+    Several or malformed ranges, and an If-Range of another state, get the whole, too.
+    """
     if header is None or (if_range is not None and if_range.strip() != etag):
         return None
     match = _RANGE.fullmatch(header.strip())
@@ -64,7 +64,7 @@ def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRang
 
 @dataclass(frozen=True, slots=True)
 class _Opened:
-    """A blob about to be sent: its size, the part of it that was asked for, and the first piece."""
+    """Blob about to be sent: its size, the requested range, and the first piece."""
 
     size: int
     start: int
@@ -73,7 +73,7 @@ class _Opened:
 
 
 def _open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: bool) -> _Opened:
-    """Decide what of a blob is sent, and read its first piece unless only the head is asked for."""
+    """Find the requested range of a blob, and read its first piece unless only the headers are requested."""
     size = blobs.require_readable(tx, digest)
     start, stop = wanted.within(size) if wanted is not None else (0, size)
     first = b"" if head else blobs.read_blob(tx, digest, start, min(stop, start + PIECE_BYTES))
@@ -87,7 +87,7 @@ def attachment(file_name: str) -> str:
 
 
 class BlobSender(Resource):
-    """Resources that answer with the bytes of a blob."""
+    """Base of resources that answer with the bytes of a blob."""
 
     async def send_blob(
         self,
@@ -98,9 +98,9 @@ class BlobSender(Resource):
         cache_control: str = IMMUTABLE,
         headers: Mapping[str, str] = MappingProxyType({}),
     ) -> Rendered | None:
-        """Answer with the blob, as far as Range, If-Range and If-None-Match ask for it. Raises `NotFoundProblem`.
+        """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
 
-        `cache_control` is for addresses that do not name the blob itself; `headers` go with the bytes.
+        `cache_control` is for addresses that do not contain the digest; `headers` are sent with the bytes.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
@@ -121,7 +121,7 @@ class BlobSender(Resource):
         return None
 
     async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:
-        """Send piece after piece, each read only when the one before has gone out."""
+        """Send the pieces of a blob, each read after the one before was sent."""
         self.send(first)
         self.set_header("Content-Length", str(opened.stop - opened.start))
         if self.request.method == "HEAD":

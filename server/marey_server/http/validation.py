@@ -1,4 +1,4 @@
-"""Query parameters and bodies against their models; every fault is named with its place."""
+"""Validation of query parameters and bodies by their models; the place of each fault is reported."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[bytes]]) -> Model | None:
-    """The query parameters as `model`. Raises `BadRequestProblem` naming each unknown, repeated or unfit parameter."""
+    """Return the query parameters as `model`. Raises `BadRequestProblem` for unknown, repeated or invalid ones."""
     known = {field.alias or name: field for name, field in model.model_fields.items()} if model else {}
     values: dict[str, str] = {}
     faults = []
@@ -56,9 +56,9 @@ def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
 
 
 def decode_body(data: bytes, media_type: str) -> Any:
-    """Return the tree a body holds.
+    """Return the tree in a body.
 
-    Raises `BadRequestProblem` where it is none, `InvalidProblem` where it holds what may not travel.
+    Raises `BadRequestProblem` if it cannot be decoded, and `InvalidProblem` if it contains values that are not allowed.
     """
     try:
         return codecs.decode_tree(data, media_type)
@@ -71,7 +71,10 @@ def decode_body(data: bytes, media_type: str) -> Any:
 
 
 def validate_body(model: type[Model], tree: Any) -> Model:
-    """A tree as `model`, without guessing: "5" is no number. Raises `InvalidProblem` with a JSON Pointer per fault."""
+    """Return a tree as `model`, without conversion of types: "5" is not a number.
+
+    Raises `InvalidProblem` with a JSON Pointer for each fault.
+    """
     try:
         if survey(tree):
             return model.model_validate(tree)
@@ -83,9 +86,9 @@ def validate_body(model: type[Model], tree: Any) -> Model:
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
-    """Return whether a tree holds arrays.
+    """Return whether a tree contains arrays.
 
-    Raises `InvalidProblem` at a text with a NUL character, which databases do not store.
+    Raises `InvalidProblem` for a text with a NUL character, which databases do not store.
     """
     if isinstance(tree, Mapping):
         return sum(survey(member, (*steps, key)) for key, member in tree.items()) > 0
