@@ -1,4 +1,4 @@
-"""The application: what it is made of, how it starts, and how it stops."""
+"""Application: its construction, start and stop."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class CannotListen(Exception):
 
 
 class Application(TornadoApplication):
-    """The Tornado application: all routes, and the services that their handlers share."""
+    """Tornado application: all routes, and the services that their handlers share."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.routes = RouteTable(self, RESOURCES)
@@ -68,7 +68,7 @@ class Application(TornadoApplication):
         super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
 
     def record_request(self, handler: RequestHandler) -> None:
-        """Log and count a request whose answer is on its way."""
+        """Log and count a request after its answer was written."""
         if not isinstance(handler, Resource):
             return
         duration_s = handler.request.request_time()
@@ -110,7 +110,7 @@ def describe(routes: RouteTable) -> Description:
 
 @dataclass(frozen=True)
 class Running:
-    """A server that takes requests."""
+    """Server that accepts requests."""
 
     app: Application
     address: str
@@ -119,7 +119,7 @@ class Running:
 
 @asynccontextmanager
 async def listening(app: Application) -> AsyncIterator[Running]:
-    """Take requests until the block ends; then drain: refuse new ones, finish those under way, close."""
+    """Accept requests inside the block; then refuse new ones, finish those in progress, and close."""
     settings = app.services.settings
     try:
         sockets = bind_sockets(settings.port, settings.host)
@@ -162,7 +162,7 @@ async def _drain(services: Services, server: HTTPServer) -> None:
 def open_database(settings: Settings) -> Database:
     """Open the database of a server; create its folder, tables and first administrator if they are missing.
 
-    Raises `DatabaseUnusable` where it cannot be opened.
+    Raises `DatabaseUnusable`.
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     with opening(settings.resolved_database_url):
@@ -210,7 +210,7 @@ async def compiling_kernels() -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def serving(settings: Settings) -> AsyncIterator[Running]:
-    """A server with its database and its local workers; they stop first, then it drains."""
+    """Run a server with its database and local workers inside the block; at its end the workers stop first."""
     database = open_database(settings)
     async with (
         listening(create_app(settings, database)) as running,
@@ -229,7 +229,7 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
 def make_worker_token(database: Database, settings: Settings) -> str:
     """Create a token for the workers that this process starts.
 
-    Those of earlier starts at this address stop working; servers that share the database keep theirs.
+    Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep theirs.
     """
     address = f"{settings.host}:{settings.port} on {socket.gethostname()}"
     return database.write(SYSTEM, _replace_worker_token, f"workers beside the server at {address}"[:MAX_NAME_LENGTH])
@@ -257,7 +257,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
 
 
 def next_command(settings: Settings, address: str) -> str:
-    """Return the first command to type, with server and token if it would not find them itself."""
+    """Return the first command to run, with server and token if the command would not find them by itself."""
     reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     defaults = Settings.model_fields
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"

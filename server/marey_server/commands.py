@@ -1,6 +1,6 @@
-"""Commands that `marey` runs on the server's own machine: serve, and maintenance of the database.
+"""Commands of `marey` for the server's own machine: serve, and maintenance of the database.
 
-Functions print what people should see and raise `CommandFailed` with a sentence when they cannot do what was asked.
+Functions print their results, and raise `CommandFailed` with a sentence if they fail.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ def serve(**settings: Any) -> None:
 
 
 def read_settings(**given: Any) -> Settings:
-    """Settings from flags, variables and `marey.toml`; a wrong one is named in one line."""
+    """Return settings from flags, variables and `marey.toml`. Raises `CommandFailed` with one line about an invalid
+    one.
+    """
     try:
         return Settings(**given)
     except ValidationError as error:
@@ -65,7 +67,7 @@ def upgrade(**settings: Any) -> None:
 
 
 def backup(*, target: Path, **settings: Any) -> None:
-    """Copy an SQLite database as it is at one moment, while a server may be writing to it."""
+    """Copy an SQLite database in a consistent state, even while a server is writing to it."""
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
         raise CommandFailed(f"{target} exists; choose a file that does not exist")
@@ -77,7 +79,7 @@ def backup(*, target: Path, **settings: Any) -> None:
 
 
 def restore(*, source: Path, **settings: Any) -> None:
-    """Restore a database from a backup; no database may exist at that place."""
+    """Restore a database from a backup; refused if a database exists at that place."""
     chosen = read_settings(**settings)
     target = _sqlite_file(chosen, must_exist=False)
     # A log that stays behind would be played into the backup.
@@ -95,7 +97,7 @@ def restore(*, source: Path, **settings: Any) -> None:
 
 
 def fsck(*, as_json: bool = False, **settings: Any) -> None:
-    """Verify every digest and reference; fails when something is wrong."""
+    """Verify every digest and reference; fail if there are defects."""
     from marey_server.app import connect_database
     from marey_server.store.fsck import check_store
 
@@ -118,7 +120,7 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
-    """A new token of an administrator in place of the data folder's `admin.token`, when that one is lost."""
+    """Create an administrator's token, and write it to `admin.token` in the data folder in place of a lost one."""
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem
@@ -140,7 +142,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
 
 @contextmanager
 def _database_of(settings: Settings) -> Iterator[str]:
-    """Give the URL of the database; a failure inside the block is reported in one sentence."""
+    """Yield the URL of the database; report an error inside the block in one sentence."""
     from marey_server.store.database.opening import DatabaseUnusable, opening
 
     try:

@@ -1,4 +1,4 @@
-"""Every error the server answers with, grouped by status. Each class docstring is the default `title`.
+"""Errors that the server answers with, grouped by status. The docstring of a class is its default `title`.
 
 Raise them anywhere; the handlers turn them into problem documents. `code` is stable and documented.
 """

@@ -1,4 +1,4 @@
-"""Places where a test can make the process die, stop or fail, to see what it leaves behind.
+"""Fault injection for tests: places where the process can be made to die, stop or fail.
 
 `MAREY_FAULT=name:kill` kills the process (SIGKILL) when it passes the point `name`; `name:stop` stops it (SIGSTOP);
 `name:error` raises ENOSPC; `name@3:kill` acts on the third pass only. Several are separated by commas.

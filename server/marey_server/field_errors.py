@@ -1,4 +1,4 @@
-"""Validation errors of pydantic as answers show them: a pointer into the request, a code, a sentence."""
+"""Conversion of pydantic's validation errors to those of answers: a pointer into the request, a code, a sentence."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ MAX_ERRORS = 50
 
 
 def json_pointer(steps: Sequence[str]) -> str:
-    """Return the JSON Pointer (RFC 6901) of a path of steps."""
+    """Return the JSON Pointer (RFC 6901) of a path of keys and indices."""
     return "".join("/" + step.replace("~", "~0").replace("/", "~1") for step in steps)
 
 
 def field_errors(
     error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` faults of `tree`, which was validated; `pointer` writes down where each is."""
+    """Return the first `MAX_ERRORS` faults of `tree` that validation found; `pointer` formats the place of each."""
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     return [
         FieldError(
@@ -33,8 +33,9 @@ def field_errors(
 
 
 def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
-    """Return the steps of a location that the tree has, and of a missing field its name: pydantic puts the names of the
-    alternatives it tried in between.
+    """Return the part of a location that exists in the tree, plus the name of a missing field.
+
+    The other parts are names of union members that pydantic tried.
     """
     steps = []
     for index, step in enumerate(location):

@@ -1,1 +1,1 @@
-"""Claims jobs, runs them in child processes, and writes the results back through the client."""
+"""Worker: claims jobs, runs them in child processes, and sends the results to the server through the client."""

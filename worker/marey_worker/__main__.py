@@ -1,4 +1,4 @@
-"""`python -m marey_worker`."""
+"""Entry point of `python -m marey_worker`."""
 
 from marey_worker.commands import main
 

@@ -1,4 +1,4 @@
-"""One attempt at a job: a child computes, this watches over it and does what it asks."""
+"""Execution of one attempt of a job: a child process computes; this process supervises it and answers its requests."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TRANSFERS_AT_ONCE = 4
 
 
 class LogUploader:
-    """The file a job prints to, and how much of it the server has.
+    """Upload of the file that a job prints to, with the number of bytes that the server has.
 
     The log of the attempt is a prefix of this file, so that its length, which the server returns, is where to continue,
     even if earlier answers were lost.
@@ -90,7 +90,7 @@ class LogUploader:
 
 @cache
 def environment() -> dict[str, str]:
-    """Versions of the interpreter and of the libraries that numbers depend on."""
+    """Return the versions of the interpreter and of the libraries that affect numbers."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for library in LIBRARIES:
         try:
@@ -113,7 +113,7 @@ class Stop(Enum):
 
 @dataclass
 class Watch:
-    """The limits of one attempt: lease, time and memory."""
+    """Limits of one attempt: lease, time and memory."""
 
     lease: Lease
     keeper: LeaseKeeper
@@ -141,7 +141,7 @@ class Watch:
         return None
 
     def explain(self, stop: Stop) -> str:
-        """Return the reason as a sentence with its numbers."""
+        """Return the reason to stop as a sentence with its numbers."""
         resources = self.lease.resources
         return {
             Stop.LEASE_LOST: "the lease was lost",
@@ -154,7 +154,7 @@ class Watch:
 
 
 class RunningAttempt:
-    """Runs one lease to its end."""
+    """Execution of one lease from claim to end."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class RunningAttempt:
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Run the job in `child`; call `finish` next. Afterwards the child is idle or dead."""
+        """Run the job in `child`, which is idle or dead afterwards; then call `finish`."""
         try:
             child.send(self._order())
             end = self._attend(child)
@@ -190,7 +190,7 @@ class RunningAttempt:
         return end
 
     def finish(self, end: Done | Failed | Stop) -> None:
-        """Report the end to the server, while the child may do another job already."""
+        """Report the end to the server; the child may run the next job meanwhile."""
         try:
             self._report(end)
         except LeaseLost as error:
@@ -216,7 +216,7 @@ class RunningAttempt:
     # -- while the child computes --
 
     def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Do what the child asks until the job ends, one way or another."""
+        """Answer the requests of the child until the job ends."""
         log_due = time.monotonic() + LOG_EVERY_S
         while True:
             try:
@@ -236,7 +236,7 @@ class RunningAttempt:
                 log_due = time.monotonic() + LOG_EVERY_S
 
     def _serve(self, request: Request, child: ChildProcess) -> None:
-        """Do one thing the child asked for, and answer."""
+        """Carry out one request of the child, and answer it."""
         try:
             child.send(ChildReply(request.request, self._carried_out(request)))
         except LeaseLost:
@@ -266,14 +266,14 @@ class RunningAttempt:
                 return None
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Documents from the cache or the server, as many of the first ones as fit into one answer."""
+        """Return documents from the cache or the server; if they are large together, the last ones are missing."""
         keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
         found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
         sizes = accumulate(len(data or b"") for data in found)
         return found[: max(1, sum(size <= ANSWER_LIMIT_BYTES for size in sizes))]
 
     def _cache_key(self, name: str) -> str:
-        """Names of things are names within a server and a project's rights; digests are too."""
+        """Return the key of a part in the cache; names of parts are unique only on one server and in one project."""
         return f"{self._server} {self._lease.project} {name}"
 
     def _death(self, child: ChildProcess) -> Failed:
@@ -317,7 +317,7 @@ class RunningAttempt:
         )  # fmt: skip
 
     def _try_to_send_log(self) -> None:
-        """Send new output; a failure is logged only, so that no result is lost because of it."""
+        """Send new output; a failure is only logged, so that no result is lost because of it."""
         try:
             self._job_log.send()
         except LeaseLost:

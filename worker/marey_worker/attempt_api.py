@@ -1,4 +1,4 @@
-"""Requests of a worker about its jobs."""
+"""Requests of a worker to the server about its jobs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from marey_schemas.worker_protocol import (
 )
 
 PATIENT = Retries(tries=100, longest_s=10.0, total_s=600.0)
-"""Retries of the final request of an attempt: computed results are worth waiting for."""
+"""Retries of the final request of an attempt, which go on for long, so that computed results are not lost."""
 
 PLAIN_TEXT = "text/plain; charset=utf-8"
 
@@ -38,7 +38,7 @@ _NONE: bytes = msgpack.packb(None)
 
 
 def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
-    """Ask for work. Not repeated: an answer that was lost is a lease that runs out."""
+    """Claim jobs. The request is not repeated: if an answer is lost, its leases expire."""
     response = transport.send(
         "POST", "/leases", content=as_json(request), repeatable=False, timeout_s=request.wait_s + 30.0
     )
@@ -46,7 +46,7 @@ def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
 
 
 class AttemptApi:
-    """The endpoints of one attempt, with its own token. Every method may raise `LeaseLost`."""
+    """Client of one attempt's endpoints, with its own token. Every method may raise `LeaseLost`."""
 
     def __init__(self, transport: Transport, lease: Lease) -> None:
         self._transport = transport.with_token(lease.attempt_token)
@@ -56,12 +56,12 @@ class AttemptApi:
         self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
 
     def heartbeat(self, progress: Progress | None, *, patiently: bool = False) -> HeartbeatAnswer:
-        """Say that the worker is alive."""
+        """Renew the lease."""
         sender = self._patient if patiently else self._transport
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
-        """Append to the attempt's log; how long that is now, or was already where it does not end at `offset`."""
+        """Append to the attempt's log at `offset`; return the length of the log, also if it does not end there."""
         headers = {"Upload-Offset": str(offset)}
         try:
             return read_model(LogAnswer, self._post("log", piece, media_type=PLAIN_TEXT, headers=headers))
@@ -71,21 +71,21 @@ class AttemptApi:
             return LogAnswer(offset=error.context["offset"])
 
     def stage(self, body: bytes) -> None:
-        """Stage outputs: an encoded `StageRequest`."""
+        """Stage outputs, given as an encoded `StageRequest`."""
         self._post("outputs", body, self._patient, media_type=BLOCKS)
 
     def complete(self, request: CompleteRequest) -> None:
-        """Publish what is staged; the same request again is answered the same."""
+        """Publish the staged outputs and end the job; a repeated request gets the same answer."""
         self._post("complete", as_json(request), self._patient)
 
     def fail(self, request: FailRequest) -> None:
-        """End the attempt without success; the same request again is answered the same."""
+        """End the attempt without success; a repeated request gets the same answer."""
         self._post("fail", as_json(request))
 
     def read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Read documents as MessagePack with arrays in blocks, undecoded; None for one that is not there.
+        """Read documents as MessagePack with arrays in blocks, undecoded; None for one that does not exist.
 
-        Documents at the end of a long list may be left out, never the first one.
+        Documents at the end of a long list may be left out, but not the first one.
         """
         path = f"/projects/{self._project}/parts"
         body = as_json(PartsRequest(parts=tuple(places)))
@@ -94,12 +94,12 @@ class AttemptApi:
         return _split_documents(answer.content)
 
     def read_item(self, kind: Kind, item: str) -> Item:
-        """Return an item as it is now."""
+        """Return an item at its newest revision."""
         with _dead_token_is_lost_lease():
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find the items of that name directly in a collection; None: anywhere in the project."""
+        """Find items by name, directly in a collection, or, for None, anywhere in the project."""
         asked = f"{name}*" if name.endswith("*") else name  # a final asterisk asks for names that begin so
         query = {"name": asked, "directly_in": collection}
         with _dead_token_is_lost_lease():

@@ -1,4 +1,6 @@
-"""The process that computes. It stays warm: modules load once, compiled kernels are kept, jobs follow one another."""
+"""Child process that computes. It runs one job after another, so that modules and compiled kernels are loaded only
+once.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ DETAIL_CHARACTERS = 1000
 
 
 def main() -> None:
-    """Serve the pipe whose number is the first argument, until it closes."""
+    """Serve the pipe whose file descriptor is the first argument, until it closes."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the supervisor, which decides
     faulthandler.enable()
@@ -55,7 +57,7 @@ def main() -> None:
 
 
 class Garbage:
-    """Collection of cyclic garbage after each job, which skips the objects of loaded modules.
+    """Collection of cyclic garbage after each job, without the objects of loaded modules.
 
     Modules hold nearly all objects and live as long as the process; searching them would take 0.1 s after every job.
     """
@@ -65,7 +67,7 @@ class Garbage:
         self.collect()
 
     def collect(self) -> None:
-        """Free cyclic garbage; if modules were loaded since the last time, skip all objects of now from now on."""
+        """Free cyclic garbage; if modules were loaded since the last call, exclude all current objects from now on."""
         gc.collect()
         if len(sys.modules) != self._modules:
             self._modules = len(sys.modules)
@@ -73,7 +75,7 @@ class Garbage:
 
 
 def load(kinds: list[str]) -> None:
-    """Import what the kinds need, so that the first job does not wait for it."""
+    """Import the modules that the kinds need, so that the first job does not wait for it."""
     for name in kinds:
         module = find_kind(name).implementation.partition(":")[0]
         try:
@@ -83,7 +85,7 @@ def load(kinds: list[str]) -> None:
 
 
 def run_job(run: Run, pipe: Connection) -> End:
-    """Run one job and return its end, of any kind, as a message."""
+    """Run one job and return its end, successful or not, as a message."""
     context = Context(run, pipe)
     allow_memory(run.memory_limit_bytes)
     try:
@@ -110,7 +112,7 @@ def run_job(run: Run, pipe: Connection) -> End:
 
 
 def write_output_to(path: Path) -> None:
-    """Send what this process prints, and what native code and the interpreter print when they crash, to a file."""
+    """Redirect the output of this process, including that of native code and of a crash, to a file."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -118,7 +120,7 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """Run a task, a gathering, or a whole job; a fan-out without tasks runs and is gathered at once."""
+    """Run a task, a gathering job, or a whole job; a fan-out without tasks is run and then gathered."""
     params = kind.params.model_validate(run.params)
     is_task, gathers = run.position is not None, run.position is None and run.size is not None
     results = context.task_results() if gathers else [_function(kind.implementation)(context, params)]

@@ -1,4 +1,4 @@
-"""The supervisor's side of a child process: start, messages, kill."""
+"""Child process from the supervisor's side: start, messages, kill."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 
 class ChildBroken(Exception):
-    """A child died before it had been given anything to do."""
+    """Child process that died before it was given a job."""
 
 
 class ChildProcess:
-    """A warm process of its own session. Started, used and killed by one thread; replies may come from others."""
+    """Child process in its own session. One thread starts, uses and kills it; other threads may send replies."""
 
     def __init__(self, kinds: Sequence[str], *, threads: int) -> None:
         ours, theirs = socket.socketpair()
@@ -43,7 +43,7 @@ class ChildProcess:
         self._sending = threading.Lock()
 
     def wait_until_ready(self) -> None:
-        """Wait until the child has loaded what it needs. Raises `ChildBroken` where it dies before."""
+        """Wait until the child has loaded its modules. Raises `ChildBroken` if it dies before."""
         try:
             while not isinstance(self.receive(READY_S), Ready):
                 continue
@@ -57,16 +57,16 @@ class ChildProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
+        """Whether the process is running."""
         return self._process.poll() is None
 
     @property
     def resident_bytes(self) -> int:
-        """Memory the process and all it started hold."""
+        """Return the memory of the process and its descendants."""
         return resident_bytes(self.pid)
 
     def send(self, message: Any) -> None:
-        """Send a message; a child that has died is noticed when it is listened to."""
+        """Send a message; if the child has died, the next `receive` reports it."""
         with self._sending:
             try:
                 self._pipe.send(message)
@@ -74,18 +74,18 @@ class ChildProcess:
                 return
 
     def receive(self, timeout_s: float) -> Any | None:
-        """Return the next message, or None if none came in time. Raises `EOFError` once the child has died."""
+        """Return the next message, or None if none came in time. Raises `EOFError` if the child has died."""
         try:
             return self._pipe.recv() if self._pipe.poll(timeout_s) else None
         except ConnectionResetError as error:
             raise EOFError from error
 
     def wait(self) -> int:
-        """Return the exit status of the process; a negative one is a signal."""
+        """Return the exit status of the process; a negative number is a signal."""
         return self._process.wait()
 
     def kill(self, *, grace_s: float = TERMINATE_S) -> None:
-        """End the process and all it started: politely, and after `grace_s` in any case."""
+        """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
         if self.alive:
             self._signal(signal.SIGTERM)
             deadline = time.monotonic() + grace_s

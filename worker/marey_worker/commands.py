@@ -1,4 +1,4 @@
-"""A worker as a program."""
+"""Command line of the worker."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
 MIB = 1 << 20
 BRIEF = Retries(tries=6)
-"""Retries of an attempt's requests: a worker that shall stop does not wait long for an unreachable server."""
+"""Retries of an attempt's requests, limited so that a stopping worker does not wait long for an unreachable server."""
 
 
 def work(
@@ -37,10 +37,10 @@ def work(
     log_form: LogForm | None = None,
     attached: bool = False,
 ) -> None:
-    """Run a worker until SIGTERM or SIGINT, then exit; not with 0 if a job was running.
+    """Run a worker until SIGTERM or SIGINT; the exit status is not 0 if a job was running then.
 
-    `log_form`: text where none is named and standard error is a terminal, else JSON, as for the server.
-    `attached`: stop, too, when standard input closes, because whoever started this worker has gone.
+    `log_form`: default text if standard error is a terminal, else JSON, as for the server. `attached`: stop also when
+    standard input closes, because the process that started this worker has ended.
     """
     if credential.token is None:
         raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
@@ -62,7 +62,7 @@ def work(
 
 
 def main() -> None:
-    """`python -m marey_worker`: what `marey serve` starts."""
+    """Run `python -m marey_worker`, which `marey serve` starts."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server")
     parser.add_argument("--slots", type=int, default=1, help="jobs at the same time")

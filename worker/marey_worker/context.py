@@ -1,4 +1,4 @@
-"""Context of a job: everything that the function of a kind may use."""
+"""Context of a job: the interface that the function of a kind uses for its inputs and results."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from marey_worker.messages import (
 T = TypeVar("T")
 
 _numbers = itertools.count(1)
-"""Request numbers, unique in the process, so that an answer after the end of its job is ignored."""
+"""Request numbers, unique in the process, so that an answer that arrives after the end of its job is ignored."""
 
 DOCUMENTS_PER_REQUEST = 16
 REQUESTS_AHEAD = 2
@@ -49,7 +49,7 @@ class JobRefused(Exception):
 
 
 class RequestRefused(Exception):
-    """The supervisor could not do what the job asked of it."""
+    """The supervisor could not carry out a request of the job."""
 
 
 class NoSuchThing(RequestRefused):
@@ -68,9 +68,9 @@ class Task(NamedTuple):
 
 
 class Context:
-    """A running job: its inputs, and methods that read documents, report progress and stage results.
+    """Running job: its inputs, and methods that read documents, report progress and stage results.
 
-    Everything goes through the supervisor; reading ahead and staging overlap with computing.
+    All methods send requests to the supervisor; reading ahead and staging overlap with computation.
     """
 
     def __init__(self, run: Run, pipe: Connection) -> None:
@@ -87,7 +87,7 @@ class Context:
     # -- reading --
 
     def document(self, kind: Kind, item: str, revision: int, part: str) -> Any:
-        """Return a part of a revision; arrays are numpy arrays. Raises `NoSuchThing` where there is none."""
+        """Return a part of a revision, with arrays as numpy arrays. Raises `NoSuchThing` if it does not exist."""
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None:
             raise NoSuchThing(f"There is no part {part!r} of {kind} {item!r} at revision {revision}.", f"no-{kind}")
@@ -96,7 +96,9 @@ class Context:
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
-        """Each input with a part of it, read ahead while the caller works; None where it lacks one that may lack."""
+        """Yield each input with one of its parts, read ahead of the caller; None for an optional part that does not
+        exist.
+        """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
                 detail = f"There is no part {part!r} of {pin.kind} {pin.item!r} at revision {pin.revision}."
@@ -106,7 +108,7 @@ class Context:
     def documents_of_each(
         self, pins: Iterable[PinnedInput], *parts: str
     ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
-        """Each input with several parts of it, read ahead while the caller works; None for a part that it lacks."""
+        """Yield each input with several of its parts, read ahead of the caller; None for a part that does not exist."""
         wanted = (
             (pin, PartPlace(kind=pin.kind, item=pin.item, revision=pin.revision, part=part))
             for pin in pins
@@ -117,13 +119,13 @@ class Context:
             yield documents[0][0], tuple(document for _, document in documents)
 
     def item(self, kind: Kind, item: str) -> Item:
-        """Return an item as it is now. Raises `NoSuchThing` where there is none."""
+        """Return an item at its newest revision. Raises `NoSuchThing` if it does not exist."""
         asked = self._send(lambda request: ReadItem(request, kind, item))
         found: Item = self._value(asked, f"no-{kind}")
         return found
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find the items of that name directly in a collection; None: anywhere in the project."""
+        """Find items by name, directly in a collection, or, for None, anywhere in the project."""
         found: list[Item] = self._ask(lambda request: FindItems(request, kind, name, collection))
         return found
 
@@ -140,7 +142,7 @@ class Context:
     # -- writing --
 
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
-        """Hand over results. They become visible when the whole job is done, all at once."""
+        """Stage results. All of them become visible together when the job completes."""
         tree = StageRequest(outputs=tuple(outputs)).model_dump(by_alias=True)
         body = encode_tree(tree, MSGPACK, arrays="blocks")
         while len(self._staging) >= STAGED_AT_ONCE:
@@ -153,7 +155,7 @@ class Context:
         return digest
 
     def finish_staging(self) -> None:
-        """Wait until everything that was staged has arrived."""
+        """Wait until the server has stored all staged results."""
         while self._staging:
             self._value(self._staging.popleft())
 
@@ -162,13 +164,13 @@ class Context:
         self._pipe.send(Made(Progress(done=done, total=total, note=note)))
 
     def log(self, text: str) -> None:
-        """Write a line to the job's log, as `print` does too."""
+        """Write a line to the job's log; `print` does the same."""
         print(text, flush=True)  # noqa: T201 - the log is this process's output
 
     # -- the pipe --
 
     def _read_ahead(self, wanted: Iterable[tuple[T, PartPlace]]) -> Iterator[tuple[T, Any]]:
-        """Each thing with its document, or None; some requests are sent before the first one is waited for."""
+        """Yield each object with its document, or None; several requests are sent before the first answer."""
         rest = iter(wanted)
         waiting: deque[tuple[int, list[tuple[T, PartPlace]]]] = deque()
         while True:
@@ -196,7 +198,7 @@ class Context:
         return request
 
     def _value(self, request: int, missing: str = "not-found") -> Any:
-        """Return the answer. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
+        """Return the value of an answer. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
         while request not in self._replies:
             reply: ChildReply = self._pipe.recv()
             self._replies[reply.request] = reply

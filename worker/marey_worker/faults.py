@@ -1,8 +1,8 @@
-"""Places where a test can make a worker die or stop, to see what it leaves behind.
+"""Fault injection for tests: places where a worker can be made to die or stop.
 
 `MAREY_FAULT=worker.after_claim:kill` kills the process (SIGKILL) when it passes that point, `:stop` stops it (SIGSTOP);
-`worker.after_blob@3:kill` acts on the third pass. Several are separated by commas; names of other programs' points are
-left alone. Points: `worker.after_claim`, `worker.after_blob`, `worker.before_complete`, `worker.after_complete`.
+`worker.after_blob@3:kill` acts on the third pass. Several are separated by commas; points of other programs are
+ignored. Points: `worker.after_claim`, `worker.after_blob`, `worker.before_complete`, `worker.after_complete`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections import Counter
 
 VARIABLE = "MAREY_FAULT"
 SETTLE_S = 0.2
-"""A stop reaches the threads of a process one by one; the one that asked for it must not run ahead."""
+"""Pause after SIGSTOP, which stops the threads of a process one by one; the calling thread must not continue first."""
 ACTIONS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 _passes: Counter[str] = Counter()

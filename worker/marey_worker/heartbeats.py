@@ -1,4 +1,4 @@
-"""Keeps a lease while its job runs: heartbeats from a thread of their own, on the monotonic clock."""
+"""Heartbeats that renew a lease while its job runs, sent by a separate thread on the monotonic clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""After this share of a lease without a heartbeat, nothing is published before one has succeeded."""
+"""Share of a lease without a successful heartbeat after which another one must succeed before results are published."""
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
@@ -25,10 +25,10 @@ JITTER = 0.2
 
 
 class LeaseKeeper:
-    """Heartbeats of one attempt.
+    """Thread that sends the heartbeats of one attempt.
 
-    `lost` and `cancelled` are set when the server says so. A server that does not answer is asked again; work goes on,
-    and `confirm` decides before anything is published.
+    `lost` and `cancelled` are set when the server says so. If the server does not answer, heartbeats are retried and
+    the job goes on; `confirm` checks the lease before results are published.
     """
 
     def __init__(self, api: AttemptApi, lease: Lease) -> None:
@@ -48,17 +48,17 @@ class LeaseKeeper:
         self._thread.start()
 
     def tell(self, progress: Progress) -> None:
-        """Remember how far the job is, for the next heartbeat."""
+        """Set the progress that the next heartbeat reports."""
         self._progress = progress
 
     def stop(self) -> None:
-        """Send no more heartbeats."""
+        """Stop sending heartbeats."""
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Make sure that the lease is held before the final answer; `patiently` where there is a result to lose.
+        """Check that the lease is still held before the final request; `patiently` if there are results to lose.
 
-        Raises `LeaseLost`, or why the server does not answer.
+        Raises `LeaseLost`, or the client's error if the server does not answer.
         """
         self._saying_last_word = True
         if self.lost.is_set() or time.monotonic() - self._heard > CONFIRM_AFTER * self._ttl_s:

@@ -1,4 +1,4 @@
-"""Limits of a child process, and its end with its supervisor."""
+"""Limits of a child process, and its termination together with its supervisor."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when the thread that started it ends.
+    """Make the kernel kill this process when the thread that started it ends.
 
-    Where the kernel cannot (other systems than Linux), the child ends at its next message, which nobody reads.
+    On other systems than Linux, the child ends at its next message, because the pipe is closed.
     """
     if sys.platform != "linux":
         return
@@ -28,9 +28,9 @@ def die_with_parent() -> None:
 
 
 def allow_memory(limit_bytes: int | None) -> None:
-    """Let this process map `limit_bytes` more than now, or as much as it likes.
+    """Let this process map at most `limit_bytes` more than now; without a limit, remove the restriction.
 
-    An allocation beyond that raises `MemoryError` at once, before the machine runs short.
+    An allocation beyond that raises `MemoryError` at once, before the machine runs out of memory.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     soft = resource.RLIM_INFINITY if limit_bytes is None else psutil.Process().memory_info().vms + limit_bytes
@@ -40,7 +40,7 @@ def allow_memory(limit_bytes: int | None) -> None:
 
 
 def resident_bytes(pid: int) -> int:
-    """Memory that a process and all it started hold; 0 once it has ended."""
+    """Return the memory of a process and its descendants; 0 if it has ended."""
     try:
         process = psutil.Process(pid)
         family = [process, *process.children(recursive=True)]

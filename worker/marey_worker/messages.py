@@ -1,4 +1,4 @@
-"""Messages between supervisor and child over their pipe. The child never sees a token or an address."""
+"""Messages between supervisor and child over their pipe. The child never gets a token or an address."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.worker_protocol import PinnedInput
 
 @dataclass(frozen=True)
 class Run:
-    """Do this job."""
+    """Order to run a job."""
 
     job: str
     kind: str
@@ -35,7 +35,7 @@ class Run:
 
 @dataclass(frozen=True)
 class ChildReply:
-    """The answer to a request: bytes, a digest or nothing; or why it was not carried out."""
+    """Answer to a request: bytes, a digest or nothing; or the reason why it failed."""
 
     request: int
     value: Any = None
@@ -48,14 +48,14 @@ class ChildReply:
 
 @dataclass(frozen=True)
 class Ready:
-    """The child has loaded what it needs to work."""
+    """Message that the child has loaded its modules."""
 
 
 @dataclass(frozen=True)
 class ReadParts:
-    """Read parts of revisions: the documents as they travel, None for one that is not there.
+    """Request for parts of revisions; the answer contains encoded documents, None for one that does not exist.
 
-    The answer may leave out documents at the end of a long list, never the first one.
+    The answer may leave out documents at the end of a long list, but not the first one.
     """
 
     request: int
@@ -64,7 +64,7 @@ class ReadParts:
 
 @dataclass(frozen=True)
 class ReadItem:
-    """Read an item as it is now."""
+    """Request for an item at its newest revision."""
 
     request: int
     kind: Kind
@@ -73,7 +73,7 @@ class ReadItem:
 
 @dataclass(frozen=True)
 class FindItems:
-    """Find items by their name, directly in a collection or anywhere in the project."""
+    """Request for items by name, directly in a collection or anywhere in the project."""
 
     request: int
     kind: Kind
@@ -83,7 +83,7 @@ class FindItems:
 
 @dataclass(frozen=True)
 class ReadBlob:
-    """Read bytes by digest."""
+    """Request for a blob by digest."""
 
     request: int
     digest: str
@@ -91,14 +91,14 @@ class ReadBlob:
 
 @dataclass(frozen=True)
 class ReadResults:
-    """Read what the tasks of this job returned."""
+    """Request for the results of the job's tasks."""
 
     request: int
 
 
 @dataclass(frozen=True)
 class PutFile:
-    """Send a file; the answer is its digest."""
+    """Request to send a file; the answer is its digest."""
 
     request: int
     path: Path
@@ -106,7 +106,7 @@ class PutFile:
 
 @dataclass(frozen=True)
 class Stage:
-    """Stage outputs: an encoded `StageRequest`."""
+    """Request to stage outputs, given as an encoded `StageRequest`."""
 
     request: int
     body: bytes
@@ -121,14 +121,14 @@ class Made:
 
 @dataclass(frozen=True)
 class Done:
-    """The job is done; everything it staged has been acknowledged."""
+    """Message that the job has succeeded and all its staged outputs are acknowledged."""
 
     result: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The job cannot be done."""
+    """Message that the job has failed."""
 
     code: str
     detail: str

@@ -1,4 +1,4 @@
-"""Signatures of failures: a job is not retried after two attempts with the same signature."""
+"""Signatures of failures; a job is not retried after two attempts with the same signature."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def of_exit(status: int) -> str:
 
 
 def told_exit(status: int) -> str:
-    """Return the same in words."""
+    """Return a sentence about a process that ended unexpectedly."""
     if status == -signal.SIGKILL:
         return "the process that ran the job was killed (SIGKILL); most likely the machine ran out of memory"
     if status < 0:

@@ -1,4 +1,4 @@
-"""One worker: slots that claim and run jobs, until it is asked to stop."""
+"""Supervisor of a worker: slots that claim and run jobs until the worker is stopped."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ JOBS_PER_CHILD = 1000
 class WorkerOptions:
     """Options of a worker.
 
-    `kinds` and `labels` say what it takes; `slots` how many jobs at a time; `threads` how many a job may use.
+    `kinds` and `labels` select its jobs; `slots` is the number of concurrent jobs; `threads` is the number of threads
+    for all of them.
     """
 
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
@@ -57,12 +58,15 @@ class WorkerOptions:
 
 
 def default_cache(environment: Mapping[str, str]) -> Path:
-    """Return the folder of cached inputs: below `XDG_CACHE_HOME`, or `~/.cache`."""
+    """Return the default folder of cached inputs, below `XDG_CACHE_HOME` or `~/.cache`."""
     return Path(environment.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "inputs"
 
 
 class Supervisor:
-    """Speaks with the server for its children, and outlives whatever happens to them."""
+    """Supervisor process of a worker, which communicates with the server for its children.
+
+    It goes on if a child crashes.
+    """
 
     def __init__(self, transport: Transport, options: WorkerOptions) -> None:
         self._transport = transport
@@ -75,11 +79,11 @@ class Supervisor:
         self._refusal: MareyError | None = None
 
     def stop(self) -> None:
-        """Claim nothing more, give back what runs, and let `run` return."""
+        """Stop claiming jobs, return the running ones to the queue, and let `run` return."""
         self._stopping.set()
 
     def run(self) -> int:
-        """Work until stopped; the exit status: not 0 if a job was running then, or the worker failed or was refused."""
+        """Work until stopped; the exit status is not 0 if a job was running, or the worker failed or was refused."""
         slots = [threading.Thread(target=self._work, name=f"slot-{n}", daemon=True) for n in range(self._options.slots)]
         for slot in slots:
             slot.start()
@@ -96,7 +100,7 @@ class Supervisor:
     # -- one slot --
 
     def _work(self) -> None:
-        """Work until stopped. A fault of ours ends the whole worker: one without its slots helps nobody."""
+        """Claim and run jobs in one slot until stopped. An unexpected error stops the whole worker."""
         try:
             self._claim_and_run()
         except Exception:
@@ -140,7 +144,7 @@ class Supervisor:
         return claim(self._claims, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
-        """Have a job done; its success is reported while the child does the next one."""
+        """Run a job; its success is reported while the child runs the next one."""
         self._running.add(lease.job)
         try:
             faults.point("worker.after_claim")
@@ -167,7 +171,7 @@ class Supervisor:
 
 
 class _Bench:
-    """The warm child of a slot: replaced when it has died, or has done enough jobs for its memory to be a mess."""
+    """Holder of a slot's child process, which is replaced after it died or has run a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options
@@ -182,7 +186,7 @@ class _Bench:
             self._child.kill(grace_s=0.0)
 
     def child(self) -> ChildProcess:
-        """Return a child that is ready for a job."""
+        """Return a child that is ready for a job, started if necessary."""
         if self._child is not None and (not self._child.alive or self._jobs >= JOBS_PER_CHILD):
             self._child.kill(grace_s=0.0)
             self._child = None

@@ -1,6 +1,6 @@
 """Worker processes beside the server, on the same machine.
 
-A worker gets its token through a pipe to its standard input, which stays open: when the server goes, however it goes,
+A worker gets its token through a pipe to its standard input, which stays open: when the server ends, even by a crash,
 the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables.
 """
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 PAUSES = Backoff(first_s=0.5, longest_s=30.0, jitter=0.25)
 HEALTHY_AFTER_S = 30.0
-"""A worker that lived so long did not fail at the start: the next one starts soon."""
+"""Run time in seconds after which a worker counts as started, so that its replacement starts without a long pause."""
 
 STOP_S = 20.0
 
@@ -52,7 +52,7 @@ async def local_workers(
 
 
 class _LocalWorker:
-    """One worker: started again, with growing pauses, whenever it ends by itself."""
+    """Worker process that is restarted, with growing pauses, whenever it ends by itself."""
 
     def __init__(self, name: str, url: str, token: str, cache: Path, environment: Mapping[str, str]) -> None:
         self._name = name
@@ -65,7 +65,7 @@ class _LocalWorker:
         self._stopping = asyncio.Event()
 
     async def keep_running(self) -> None:
-        """Start the worker, wait for its end, start it again."""
+        """Start the worker and wait for its end, repeatedly."""
         quick_ends = 0
         while not self._stopping.is_set():
             started = time.monotonic()
@@ -79,7 +79,7 @@ class _LocalWorker:
             await self._pause(pause_s)
 
     async def stop(self) -> None:
-        """Ask the worker to give back what it does and end; insist after a while."""
+        """Ask the worker to return its jobs and end; kill it if it does not end in time."""
         self._stopping.set()
         process = self._process
         if process is None or process.returncode is not None:

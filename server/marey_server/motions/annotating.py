@@ -1,4 +1,4 @@
-"""Changes annotations by commands, and converts documents of the predecessor into annotations."""
+"""Commands on annotations, and conversion of the predecessor's documents into annotations."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation
 from marey_server.store.revs import ExpectedRev, is_expected, moved_on
 
 MOST_WORK = 30_000_000
-"""Commands times segments and keyframes; a request of this size takes some seconds of one thread."""
+"""Greatest product of the numbers of commands and of segments and keyframes; its computation takes some seconds."""
 
 
 def apply_commands(
     found: FoundAnnotation, change: AnnotationChange, *, expected_rev: ExpectedRev = None
 ) -> ChangedAnnotation:
-    """Apply commands to an annotation one after another, all of them or none. Needs no database.
+    """Apply commands to an annotation in order, all or none. Needs no database.
 
-    The result holds an error instead of raising it: `put_changed` raises it inside the transaction that answers a
-    repeated request with its first answer, even if the annotation has changed since.
+    An error is returned, not raised: `put_changed` raises it inside the transaction that stores the answer for repeated
+    requests, so that they get the same answer even if the annotation has changed since.
     """
     if not is_expected(found.rev, expected_rev):
         return ChangedAnnotation(found.rev, moved_on(found.rev))

@@ -1,4 +1,4 @@
-"""Coverage of performances that come in as streams: what is computed between reading a stream's row and writing it."""
+"""Coverage of streams of frames: the computation between reading and writing the row of a stream."""
 
 from __future__ import annotations
 
@@ -114,10 +114,10 @@ def look(stream: Stream) -> CoverageStreamState:
 
 
 def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
-    """Return the step that frames make, or the stored answer if the same request came before.
+    """Return the stream's next state after the frames of a request, or the stored answer to a repeated request.
 
-    Raises `CoverageOffset` where they do not go on where the stream is, `InvalidProblem` where they are no frames of
-    it.
+    Raises `CoverageOffset` if the frames do not start at the stream's offset, and `InvalidProblem` if they do not fit
+    the stream.
     """
     said = _said(frames)
     if (answer := answered_before(held, said)) is not None:
@@ -146,7 +146,7 @@ def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
 
 
 def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
-    """Return the number of windows that the poses of a request complete."""
+    """Add the poses of a request to the stream, and return the number of windows that they complete."""
     from marey_motion.documents import clip_from_document
 
     if held.rig is None:
@@ -171,7 +171,9 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
 
 
 def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
-    """In single precision, as clips are kept; what is too large for it becomes infinite and is refused as such."""
+    """Convert to single precision, as clips are stored; values that are too large become infinite and are refused
+    later.
+    """
     with np.errstate(over="ignore"):
         return None if array is None else array.astype(np.float32)
 
@@ -192,7 +194,7 @@ def body_of(rig: bytes) -> MatchingBody:
 
 
 def _load_kernels(body: MatchingBody | None) -> None:
-    """Load compiled code that the first frames would wait for otherwise."""
+    """Load compiled code in advance, so that the first frames do not wait for it."""
     from marey_motion.clip import Clip
     from marey_motion.evaluation.online import OnlineCoverage
 
@@ -206,7 +208,7 @@ def _load_kernels(body: MatchingBody | None) -> None:
 
 @contextmanager
 def refusing(field: str) -> Iterator[None]:
-    """Turn what is refused inside the block into an answer about a field of the request."""
+    """Turn motion errors inside the block into an answer that points at a field of the request."""
     from marey_motion.errors import MotionError
 
     try:
@@ -230,7 +232,7 @@ def _packed(online: OnlineCoverage) -> bytes:
 
 
 def _said(frames: CoverageFrames) -> str:
-    """Return the digest of a request: the same frames at the same offset, in whatever media type they came."""
+    """Return the digest of a request's frames and offset, independent of the media type."""
     hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
     hashed.update("/".join(frames.translated_joints).encode())
     for name in ("poses", "translations", "roots"):
@@ -254,7 +256,7 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 
 
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
-    """Return the members of `CoverageNow`."""
+    """Return the members of `CoverageNow` for a stream."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
     return {
         "index": online.index,

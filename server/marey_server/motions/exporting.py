@@ -1,4 +1,4 @@
-"""Items as files: what a file needs is read in one transaction, and written in a thread."""
+"""Export of items as files: the sources are read in one transaction, and the file is written in a thread."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
 WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
-"""The kinds whose part `motion` can be written as a file of motion."""
+"""Kinds with a part `motion` that can be written as a motion file."""
 
 ExportTime = Literal["canonical", "source"]
 
 
 @dataclass(frozen=True, slots=True)
 class ServedFile:
-    """A file to hand out."""
+    """File to send: its name, media type, and content."""
 
     name: str
     media_type: str
@@ -30,7 +30,7 @@ class ServedFile:
 
 
 def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
-    """Return everything that a file of an item can need. Raises `NotFoundProblem`."""
+    """Return the documents that any file format of an item may need. Raises `NotFoundProblem`."""
     found = items.read_item(tx, project, kind, item_id)
     number = found.revision if revision is None else revision
     held = items.read_revision(tx, project, kind, item_id, number).parts
@@ -45,7 +45,7 @@ def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revisio
 def find_unchanged_original(
     tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None, options: PredecessorOptions
 ) -> OriginalFile | None:
-    """Return the file that a model, a tree or a graph was imported from, if that still says the same.
+    """Return the file that a model, a tree or a graph was imported from, if the item is unchanged.
 
     Raises `NotFoundProblem`.
     """
@@ -67,7 +67,7 @@ def find_original(
 ) -> OriginalFile:
     """Return the file that an item, or a model's tree, was imported from.
 
-    Raises `NotFoundProblem` where it was made otherwise.
+    Raises `NotFoundProblem` if it was not imported from a file.
     """
     if kind in (Kind.MODEL, Kind.GRAPH):
         asked = PredecessorOptions(part=options.part)  # in whatever layout it came
@@ -86,7 +86,7 @@ def find_original(
 def write_file(
     source: ItemToExport, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
 ) -> ServedFile:
-    """Write the file of an item. Raises `InvalidProblem` where the format cannot hold it."""
+    """Write the file of an item. Raises `InvalidProblem` if the format cannot represent it."""
     if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem("Only aligned clips can be exported in their source's time.", code="no-such-export")
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"

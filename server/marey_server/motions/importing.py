@@ -1,4 +1,4 @@
-"""Import of uploaded files: read and encoded in threads, then stored, many files in one transaction."""
+"""Import of uploaded files: read and encoded in threads, then stored, several in one transaction."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:  # numeric modules take a second to load: only who imports fil
     from marey_motion.importing.plan import PlannedFile
 
 REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
-"""Refusals that concern the request, not one of its files."""
+"""Errors that concern the whole request and not a single file."""
 
 _SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=64)
-"""Checked and encoded hierarchies, by their JSON."""
+"""Cache of checked and encoded skeleton hierarchies, by their JSON."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceFile:
-    """A file to import: bytes that were sent just now, or `content` None for a blob that is stored already."""
+    """File to import: received bytes, or a stored blob (`content` is None)."""
 
     name: str
     digest: str
@@ -48,7 +48,7 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """A file that was read and encoded, ready to be stored, or its entry if there is nothing to store."""
+    """File that was read and encoded, ready to be stored, or its entry in the answer if there is nothing to store."""
 
     name: str
     sources: tuple[SourceFile, ...] = ()
@@ -61,12 +61,12 @@ class PreparedImport:
 
 
 def require_importer(tx: Transaction, project: str) -> None:
-    """Refuse callers who may not import into the project, before their files are received."""
+    """Check that the caller may import into the project, before the files are received."""
     projects.require(tx, project)
 
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
-    """Read the skeleton that an import names. Raises `NotFound`."""
+    """Read the skeleton named in the options of an import. Raises `NotFoundProblem`."""
     from marey_motion.importing.items import GivenSkeleton
 
     part = items.read_part(tx, project, Kind.SKELETON, item_id, "hierarchy")
@@ -74,7 +74,7 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
 
 
 def plan(names: Sequence[str]) -> list[PlannedFile]:
-    """Plan each file of a batch."""
+    """Return the import plan of each file of a batch."""
     from marey_motion.importing.plan import plan_imports
 
     return plan_imports(names)
@@ -83,7 +83,7 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
 def prepare(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> PreparedImport:
-    """Read one file, with its companion, and encode its documents: the slow part, which needs no database."""
+    """Read a file with its companion and encode its documents. This is the slow part and needs no database."""
     from marey_motion.importing.files import import_file, planned_entry
     from marey_motion.importing.items import FileToImport
 
@@ -112,13 +112,13 @@ def prepare(
 
 
 def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> set[str]:
-    """Find the digests of the files' skeletons that the project does not have yet."""
+    """Return the digests of the files' skeletons that the project does not have yet."""
     digests = {_hierarchy(draft).digest for file in files for draft in file.drafts if draft.kind is Kind.SKELETON}
     return digests - items.find_contents(tx, project, Kind.SKELETON, "hierarchy", digests)
 
 
 def add_mappings(files: Sequence[PreparedImport], new: Collection[str]) -> list[PreparedImport]:
-    """Add joint mapping and axes to skeletons that are new: those that the first file of each skeleton shows."""
+    """Add joint mapping and axes to new skeletons, derived from the first file of each skeleton."""
     mappings: dict[str, PreparedDocument] = {}
     return [_with_mapping(file, new, mappings) for file in files]
 
@@ -162,9 +162,9 @@ def _refused(name: str, error: ApiProblem) -> ImportEntry:
 
 
 def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> list[ImportEntry]:
-    """Store the original files and the items that were read from them; one entry per file.
+    """Store the original files and the items read from them; return one entry for each file.
 
-    A file that cannot be stored is refused and harms no other.
+    A file that cannot be stored is refused and does not affect others.
     """
     row = projects.require(tx, project)
     entries = []
@@ -191,7 +191,7 @@ def _publish(tx: Transaction, row: ProjectRow, project: str, file: PreparedImpor
 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
-    """Make the draft of a graph with models of the project. Raises `InvalidProblem`."""
+    """Return the draft of a graph with models of the project. Raises `InvalidProblem`."""
     from marey_motion.errors import MotionError
     from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 

@@ -1,4 +1,4 @@
-"""Models in use: read once, kept parsed between requests, and made to generate motion."""
+"""Models that generate motion for requests: reading, parsing and sampling. Parsed models are cached."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 MIB = 1 << 20
 LARGEST_ANSWER_BYTES = 32 * MIB
-"""Greatest size of the poses of all samples in an answer."""
+"""Greatest size in bytes of the poses of all samples in an answer."""
 
 SAMPLES_SCHEMA = "marey/motion-samples@1"
 EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The date of files in archives: the same samples are the same bytes."""
+"""Date of the files in archives; it is constant, so that the same samples give the same bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundModel:
-    """A revision of a model that the caller may read."""
+    """Revision of a model that the caller may read."""
 
     item: str
     name: str
@@ -42,7 +42,7 @@ class FoundModel:
 
 @dataclass(frozen=True, slots=True)
 class LoadedModel:
-    """The documents that a model is made of."""
+    """Documents of a model."""
 
     model: dict[str, Any]
     hierarchy: dict[str, Any]
@@ -50,14 +50,14 @@ class LoadedModel:
 
 @dataclass(frozen=True, slots=True)
 class UsableModel:
-    """A model that generates motion."""
+    """Parsed model that can generate motion."""
 
     primitive: MotionPrimitive
     skeleton: RevisionRef
 
 
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
-    """Return a model by its item. Raises `NotFoundProblem`."""
+    """Return the model of an item. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(f"An item of the kind {kind} generates no motion; only models do.", code="not-a-model")
     part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
@@ -88,7 +88,7 @@ def parse_model(loaded: LoadedModel) -> UsableModel:
 
 
 def size_bytes(model: UsableModel) -> int:
-    """Return the size in bytes of a model's arrays, and of those that are computed from its mixture."""
+    """Return the size in bytes of a model's arrays, including those computed from its mixture."""
     primitive = model.primitive
     parts = (primitive.spatial, primitive.temporal)
     arrays = [array for part in parts for array in (part.mean, part.directions, part.projections)]
@@ -99,7 +99,10 @@ def size_bytes(model: UsableModel) -> int:
 
 
 def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int) -> dict[str, Any]:
-    """Samples as a document: latent vectors, likelihoods, motions. Raises `InvalidProblem` where they are too many."""
+    """Return samples as a document: latent vectors, likelihoods, motions.
+
+    Raises `InvalidProblem` if the samples are too large for an answer.
+    """
     from marey_motion.documents import clip_to_document
 
     latents, clips = _draw(model.primitive, count, seed)
@@ -115,7 +118,7 @@ def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int
 
 @dataclass(frozen=True, slots=True)
 class SampleFile:
-    """A file of samples: one motion, or an archive of several."""
+    """File with samples: one motion, or an archive of several."""
 
     name: str
     media_type: str
@@ -125,7 +128,7 @@ class SampleFile:
 def sample_file(
     found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
 ) -> SampleFile:
-    """One sample as a file, or several as a ZIP archive of files. Raises `InvalidProblem`."""
+    """Return one sample as a file, or several as a ZIP archive of files. Raises `InvalidProblem`."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 
@@ -151,7 +154,7 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, list[Clip]]:
-    """Latent vectors (count, L) and their motions."""
+    """Return latent vectors (count, L) drawn from the model, and their motions."""
     latents = primitive.sample(count, seed)
     frames = float((primitive.time_functions(latents)[:, -1] + 1.5).sum())
     size = frames * primitive.spatial.mean.shape[1] * 4

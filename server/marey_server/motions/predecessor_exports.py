@@ -1,4 +1,4 @@
-"""Annotations, models with their trees, and graphs as files of the predecessor."""
+"""Export of annotations, models with their trees, and graphs to the predecessor's file formats."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from marey_server.errors import InvalidProblem, NotFoundProblem
 Parts = Mapping[str, dict[str, Any]]
 
 PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PROCESSED: ("alignment",)}
-"""Which parts of an item are files of the predecessor of their own."""
+"""Parts of items that are separate files in the predecessor's formats, by kind."""
 
 
 @dataclass(frozen=True, slots=True)
 class PredecessorOptions:
-    """Options that the predecessor's formats leave open.
+    """Options of the predecessor's formats.
 
-    `end_index` and `form` are of annotations, `layout` of models; no layout is that of the file that a model was
-    imported from, where it has not changed since, and else 3. `part` selects a model or its tree, or what is kept
-    beside an aligned clip from the clip.
+    `end_index` and `form` apply to annotations, `layout` to models; the default layout is that of the file that an
+    unchanged model was imported from, otherwise 3. `part` selects a model or its tree, or the data of an aligned clip
+    other than its motion.
     """
 
     end_index: Literal["inclusive", "exclusive"] = "inclusive"
@@ -39,7 +39,7 @@ class PredecessorOptions:
     layout: Literal["2", "3"] | None = None
 
     def require_part_of(self, kind: Kind) -> None:
-        """Raise `InvalidProblem` where a part is asked for that items of a kind do not have."""
+        """Raise `InvalidProblem` if items of the kind do not have the requested part."""
         if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
             held = " or ".join(PARTS_OF.get(kind, ())) or "none"
             detail = f"A {kind} has no part {self.part!r} of its own as a file of the predecessor; it has {held}."
@@ -47,9 +47,9 @@ class PredecessorOptions:
 
 
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
-    """The file that a model, a tree or a graph was imported from, where it says the same as the part that is asked for.
+    """Return the file that a model, a tree or a graph was imported from, if the requested part is unchanged.
 
-    Arrays of the parts may be references to what is stored.
+    Arrays of the parts may be references to stored ones.
     """
     if options.layout is not None:
         return None
@@ -73,9 +73,9 @@ def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOr
 def write_predecessor(
     kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
-    """Return the name and the bytes of a file.
+    """Return the name and the bytes of a file in a format of the predecessor.
 
-    Raises `InvalidProblem` where the item has none, `NotFoundProblem` for a model without a tree.
+    Raises `InvalidProblem` if the item has no such file, and `NotFoundProblem` for a model without a tree.
     """
     from marey_motion.errors import MotionError
 
@@ -115,7 +115,7 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
 
 
 def _alignment(part: Mapping[str, Any]) -> bytes:
-    """Return the time function, and the sections that keyframes cut the canonical frames into."""
+    """Return the time function, and the sections between keyframes in canonical frames."""
     from marey_motion.formats.predecessor.alignment import write_predecessor_alignment
 
     info = AlignmentInfo.model_validate(part)

@@ -1,4 +1,4 @@
-"""Previews of edits: read in one transaction, computed in a thread, never stored."""
+"""Previews of edits: read in one transaction, computed in a thread, and not stored."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_SHOWN = 5_000_000
 
 @dataclass(frozen=True, slots=True)
 class PreviewSource:
-    """Everything that a preview needs: commands, motions, and the skeletons and mappings that they move.
+    """Inputs of a preview: commands, motions, and their skeletons and mappings.
 
     `hierarchies` are by item and revision, `mappings` by item, at its newest revision.
     """
@@ -49,7 +49,7 @@ class PreviewSource:
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
-    """Read what a preview needs. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
+    """Read the inputs of a preview. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
     if kind is not Kind.CLIP:
         raise NotFoundProblem(f"An item of the kind {kind} cannot be edited; clips can.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
@@ -73,7 +73,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
 def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
     """Return the document of the preview.
 
-    Raises `InvalidProblem` where the commands cannot be applied or there is no such frame.
+    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames.
     """
     from marey_motion.documents import clip_to_document
     from marey_motion.editing.registry import edit_clip
@@ -134,7 +134,7 @@ def _size(motion: Tree) -> int:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """Return a clip, and its body; the mapping is looked at when a command asks for it. Raises `MotionError`."""
+    """Return a clip and its body; the mapping is parsed only if a command needs it. Raises `MotionError`."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

@@ -1,4 +1,4 @@
-"""Answers of searches: motions, and the error of each constraint."""
+"""Results of searches: motions, and the error of each constraint."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 FAR_CM = 5.0
-"""Error above which a position is out of the model's reach; inverse kinematics would hide it."""
+"""Error of a position constraint above which the model cannot reach it; inverse kinematics would hide the error."""
 
 MOST_WORK = 3e9
 """Greatest cost of a search, in nanoseconds of one thread (estimated)."""
@@ -43,7 +43,7 @@ CM = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """Motions that were found, in the world and in real time."""
+    """Motions found by a search, in world coordinates and real time."""
 
     steps: tuple[Step, ...]
     sequel: Sequel
@@ -52,16 +52,16 @@ class SearchResult:
 
     @property
     def clip(self) -> Clip:
-        """All steps as one clip."""
+        """All steps joined to one clip."""
         last = self.found if self.finished is None else self.finished.found
         return last.motion.as_clip(last.skeleton, last.frame_rate_hz)
 
 
 def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchResult:
-    """Find the motions that a request asks for.
+    """Find the motions that a request describes.
 
-    Raises `InvalidProblem` that points at the constraint that is wrong, `TooLargeProblem` for what takes more than some
-    seconds.
+    Raises `InvalidProblem` with a pointer to the faulty constraint, and `TooLargeProblem` for searches that would take
+    more than some seconds.
     """
     from marey_motion.errors import MotionError
     from marey_motion.modelling.search import work as search_work
@@ -128,7 +128,7 @@ def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tupl
 
 
 def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
-    """Return a refusal with a JSON Pointer to what the error names."""
+    """Return an `InvalidProblem` with a JSON Pointer to the constraint that the error names."""
     where = str(error.where or "")
     if not request.steps:
         where = where.removeprefix("steps[0]").removeprefix(".")
@@ -143,7 +143,7 @@ def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
 def answer_of(
     result: SearchResult, searchables: Sequence[Searchable], found: Sequence[FoundSearchable], request: SearchRequest
 ) -> dict[str, Any]:
-    """Return the answer as a document."""
+    """Return the result of a search as a document."""
     from marey_motion.documents import clip_to_document
 
     errors = _errors(result, request)
@@ -160,7 +160,7 @@ def answer_of(
 
 
 def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str) -> SampleFile:
-    """Write all steps to one file. Raises `InvalidProblem` where the format cannot hold it."""
+    """Write all steps to one file. Raises `InvalidProblem` if the format cannot represent it."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 
@@ -197,7 +197,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
 
 
 def _tolerance(constraint: wire.SearchConstraint, unit: str) -> float:
-    """Give a constraint's tolerance in the unit of its error."""
+    """Return a constraint's tolerance in the unit of its error."""
     if isinstance(constraint, wire.JointPositionConstraint | wire.RootPositionConstraint):
         return constraint.tolerance_m / CM
     return float(getattr(constraint, f"tolerance_{unit}"))

@@ -1,4 +1,4 @@
-"""Motions of models that meet constraints: models with their trees, kept between requests, and the search itself."""
+"""Models that requests search for motions, with their trees. Parsed models are cached."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ SearchableKey = tuple[str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class FoundSearchable:
-    """A model that the caller may search, its tree, and the mapping of its skeleton, as far as there are any.
+    """Model that the caller may search, with its tree and the mapping of its skeleton, if they exist.
 
-    A tree of another state of the model is none of its own.
+    A tree that belongs to another state of the model is not used.
     """
 
     model: FoundModel
@@ -38,14 +38,14 @@ class FoundSearchable:
     mapping: FoundPart | None
 
     def key(self, seed: int) -> SearchableKey:
-        """Return its cache key; a model without a tree of its own has one drawn with `seed`."""
+        """Return the cache key; it contains `seed` if the model has no tree, because a tree is then drawn with it."""
         tree = f"seed {seed}" if self.tree is None else self.tree.digest
         return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedSearchable:
-    """The documents of a model that can be searched."""
+    """Documents of a model that can be searched."""
 
     found: FoundSearchable
     model: LoadedModel
@@ -55,10 +55,10 @@ class LoadedSearchable:
 
 @dataclass(frozen=True, slots=True)
 class Searchable:
-    """A model that can be searched.
+    """Model that can be searched.
 
-    `stored` says whether the tree is that of the model, or was drawn here because it has none, or one of another model.
-    `drawing_work` is what that took, about nanoseconds. `log_likelihoods` are those of the examples, in rising order.
+    `stored` says whether the tree belongs to the model, or was drawn for the search. `drawing_work` is the estimated
+    cost of drawing it in nanoseconds. `log_likelihoods` are those of the examples in ascending order.
     """
 
     usable: UsableModel
@@ -82,7 +82,7 @@ def find_searchables(
 
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
-    """Read the model's documents. Raises `NotFoundProblem` if its skeleton was deleted."""
+    """Read the documents of a model and its tree. Raises `NotFoundProblem` if its skeleton was deleted."""
     tree, mapping = (
         None if part is None else items.load_part(tx, part, arrays="decoded") for part in (found.tree, found.mapping)
     )
@@ -90,9 +90,9 @@ def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> Lo
 
 
 def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
-    """Return the model itself, with a tree.
+    """Return the parsed model with a tree.
 
-    Raises `InvalidProblem` where its numbers describe none, `TooLargeProblem` where drawing a tree takes too long.
+    Raises `InvalidProblem` if its numbers are not valid, and `TooLargeProblem` if drawing a tree would take too long.
     """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError
@@ -126,7 +126,7 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
 
 
 def require_drawable(work: float) -> None:
-    """Refuse to draw trees for a request that take more than some seconds. Raises `TooLargeProblem`."""
+    """Raise `TooLargeProblem` if the trees that a request needs would take more than some seconds to draw."""
     if work > MOST_DRAWING_WORK:
         raise TooLargeProblem(
             "Drawing samples of so many keyframes, joints or models takes too long for a search; give each model a "
@@ -150,5 +150,5 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
 
 
 def size_bytes(made: Searchable) -> int:
-    """Return the size in bytes of a model's arrays and of its tree's."""
+    """Return the size in bytes of a model's arrays and of its tree's arrays."""
     return models.size_bytes(made.usable) + made.tree.samples.nbytes + made.tree.means.nbytes

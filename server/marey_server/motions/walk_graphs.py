@@ -1,4 +1,4 @@
-"""The walk graph of an evaluation: the frames that its trials displayed and the jumps between them."""
+"""Walk graph of an evaluation: the frames that its trials displayed and the jumps between them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES_SHOWN = 5
 
 @dataclass(frozen=True, slots=True)
 class WalkSource:
-    """The documents of an evaluation that its walk graph is computed from."""
+    """Documents of an evaluation from which its walk graph is computed."""
 
     name: str
     evaluation: Mapping[str, Any]
@@ -32,7 +32,7 @@ class WalkSource:
 
 
 def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> WalkSource:
-    """Read an evaluation and the ticks of its trials. Raises `NotFoundProblem`."""
+    """Read an evaluation and the displayed frames of its trials. Raises `NotFoundProblem`."""
     if kind is not Kind.EVALUATION:
         raise NotFoundProblem(
             f"An item of the kind {kind} has no walk graph; evaluations have one.", code="not-an-evaluation"

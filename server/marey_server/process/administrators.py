@@ -1,4 +1,4 @@
-"""Administrators' tokens for whoever owns the server's own machine: at the first start, and when one was lost."""
+"""Administrator tokens for the owner of the server's machine: at the first start, and to replace a lost one."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ def make_first_administrator(tx: Transaction, token_file: Path) -> None:
 
 
 def give_token(tx: Transaction, administrator: str | None, token_file: Path, *, name: str) -> None:
-    """A new token of an administrator (None: who was made first), of every scope and without end, in a private file.
+    """Create an administrator's token with every scope and no expiry, and write it to a private file.
 
-    The file is written before the transaction commits: if the process dies in between, the next one makes both again.
-    Raises `NotFoundProblem` where no active administrator has that name.
+    Without a name, it belongs to the administrator who was created first. The file is written before the transaction
+    commits: if the process dies in between, the next start creates both again. Raises `NotFoundProblem` if no active
+    administrator has that name.
     """
     tx.principal = users.administrator_principal(tx, administrator)
     wanted = TokenCreate(name=name, scopes=tx.principal.scopes, expires_in_s=None)

@@ -1,9 +1,9 @@
-"""Threads for computations, places among them for long ones, and settings of the C library's memory.
+"""Threads for computations, a limit on long computations, and memory settings of the C library.
 
 Long computations must leave a thread for short ones: exports, documents, passwords.
 
-Of its own accord glibc returns blocks of some 100 kB to the system as soon as they are freed, and gets them back page
-by page. For clips that takes as long as everything else in reading one.
+By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. For
+clips, that takes as long as the rest of reading one.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ T = TypeVar("T")
 
 THREAD_NAME = "marey-compute"
 LONGEST_WAIT_S = 20.0
-"""Longest wait for a place among the long computations; then the request is answered with 503."""
+"""Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 KEPT_BLOCK_BYTES = 8 * 2**20
-"""Larger blocks are returned to the system at once."""
+"""Size in bytes above which freed blocks are returned to the system at once."""
 KEPT_BYTES = 32 * 2**20
-"""More than this at the end of a heap is returned; threads have heaps of their own."""
+"""Free bytes at the end of a heap above which they are returned; each thread has its own heap."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 
 class ComputeThreads:
-    """As many threads as there are processors, of which all but one may be taken by long computations."""
+    """Pool with a thread for each processor, of which all but one may run long computations."""
 
     def __init__(self, threads: int | None = None) -> None:
         count = max(2, threads or os.cpu_count() or 2)
@@ -45,12 +45,15 @@ class ComputeThreads:
         self._long_places = asyncio.Semaphore(count - 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run numeric work or file work in a thread, away from the event loop."""
+        """Run a computation or file access in a thread, away from the event loop."""
         return self._pool.submit(function, *args, **kwargs)
 
     @asynccontextmanager
     async def long_place(self) -> AsyncIterator[None]:
-        """A place for what may take seconds. Raises `UnavailableProblem` where none gets free."""
+        """Reserve a thread for a long computation inside the block.
+
+        Raises `UnavailableProblem` if none becomes free in time.
+        """
         try:
             await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_S)
         except TimeoutError:
@@ -65,7 +68,7 @@ class ComputeThreads:
             self._long_places.release()
 
     def close(self) -> None:
-        """Begin nothing more. What runs is not waited for: nobody is there any more who could be answered."""
+        """Start no more computations; running ones are not awaited, because their clients are gone."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
@@ -79,7 +82,7 @@ def compute_on_one_thread_each() -> None:
 
 
 def leave() -> None:
-    """End this process, whose work is done, even though a computation is still running that nobody waits for."""
+    """End this process without waiting for computations that are still running."""
     if not any(thread.name.startswith(THREAD_NAME) for thread in threading.enumerate()):
         return
     logging.shutdown()

@@ -1,7 +1,7 @@
-"""Housekeeping of the server: reclaims overdue leases, serves waiting results, collects garbage.
+"""Housekeeping of the server: reclaims expired leases, serves waiting results, collects garbage.
 
-One process at a time leads; what it does is safe beside others all the same, since every step repeats its conditions
-in the statement that takes it. Each chore is a task of its own, so that one that fails keeps no other from being done.
+Only the leading process does it, but concurrent housekeeping would be safe, because every statement repeats its
+conditions. Each chore is a task of its own, so that a failing chore does not affect the others.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 Chore = Callable[[Services, str], Awaitable[None]]
-"""Gets the services and the name under which this process leads."""
+"""Chore; its arguments are the services and this process's name in the leader election."""
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ FIRST_GARBAGE_S = 60.0
 
 @asynccontextmanager
 async def keeping_house(services: Services) -> AsyncIterator[None]:
-    """Run the periodic chores inside the block; at its end, let another process lead."""
+    """Run the periodic chores inside the block; at its end, give up the leadership."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     chores = (
@@ -58,7 +58,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
 
 
 async def _give_up_lead(services: Services, holder: str) -> None:
-    """Let another process lead at once; without a database it does when the lease has run out."""
+    """Give up the leadership; if the database is unreachable, it ends when its lease expires."""
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
     except ApiProblem as error:
@@ -66,7 +66,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
-    """Do a chore again and again. A failure is logged and does not stop it."""
+    """Run a chore periodically. A failure is logged and does not stop it."""
     await asyncio.sleep(first_s)
     while True:
         try:
@@ -79,7 +79,7 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
 
 
 async def _reap(services: Services, holder: str) -> None:
-    """Take back every overdue lease, page by page; not before workers have had time to renew them."""
+    """Reclaim every expired lease, page by page, after workers have had time to renew theirs."""
     try:
         leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
         if leads and may_reap:
@@ -107,7 +107,7 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Serve the jobs that wait for a result that is there."""
+    """Give waiting jobs the shared results that now exist."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass

@@ -1,7 +1,6 @@
 """Logs, request ids and metrics.
 
-Metrics are labelled with route templates, never with addresses,
-so that their number does not grow with the data.
+Metrics are labelled with route templates, not with addresses, so that their number does not grow with the data.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ access_log = logging.getLogger("marey_server.access_log")
 
 
 def request_id(given: str | None) -> str:
-    """Return the caller's own request id if it is a sane one, else a new one."""
+    """Return the request id that the client sent if it is valid, else a new one."""
     return given if given is not None and _SANE_ID.fullmatch(given) else secrets.token_hex(12)
 
 
@@ -39,7 +38,7 @@ def _tells_of_an_upgrade(record: logging.LogRecord) -> bool:
 
 
 class Metrics:
-    """The figures that /metrics shows, in a registry of their own."""
+    """Metrics for /metrics, in their own registry."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -57,7 +56,7 @@ class Metrics:
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
 
     def exposition(self) -> tuple[bytes, str]:
-        """Return all figures in the text format of Prometheus, and its media type."""
+        """Return all metrics in the text format of Prometheus, and its media type."""
         return generate_latest(self.registry), CONTENT_TYPE_LATEST
 
     def count_request(self, method: str, route: str, status: int, duration_s: float, bytes_in: int) -> None:

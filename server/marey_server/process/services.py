@@ -28,18 +28,18 @@ NAMES_REMEMBERED = 10_000
 SIGN_INS_AT_ONCE = 2
 """Greatest number of passwords checked at once; each check needs 32 MiB and 0.1 s."""
 LARGEST_ANSWER_SHARE = 8
-"""A body larger than this part of the cache of answers is not kept: it would displace all others."""
+"""Largest part of the cache of answers that one body may take; larger bodies would displace all others."""
 ANSWER_ENTRY_BYTES = 512
-"""Memory of an entry of the cache of answers besides its body."""
+"""Memory in bytes of an entry in the cache of answers, in addition to its body."""
 MODEL_CACHE_BYTES = 64 << 20
 """Greatest size of the cache of parsed models; models with search trees have a cache of the same size."""
 TOKENS_REMEMBERED = 10_000
 
 
 class TryLimit:
-    """So many tries per minute and key: a bucket that fills again steadily.
+    """Limit of tries per minute and key (token bucket).
 
-    Only the latest `NAMES_REMEMBERED` keys are kept, so that guesses at many names do not fill the memory.
+    Only the latest `NAMES_REMEMBERED` keys are stored, so that guesses at many names do not fill the memory.
     """
 
     def __init__(self, per_minute: int, *, clock: Callable[[], float] = time.monotonic) -> None:
@@ -48,7 +48,7 @@ class TryLimit:
         self._buckets: LruCache[str, tuple[float, float]] = LruCache(max_entries=NAMES_REMEMBERED)
 
     def take(self, key: str) -> None:
-        """Count one try. Raises `TooManyRequestsProblem`, saying when the next is allowed."""
+        """Count one try. Raises `TooManyRequestsProblem`, which says when the next try is allowed."""
         now = self._clock()
         left, since = self._buckets.get(key) or (float(self._per_minute), now)
         left = min(float(self._per_minute), left + (now - since) * self._per_minute / 60)
@@ -61,7 +61,7 @@ class TryLimit:
 
 @dataclass(frozen=True)
 class Description:
-    """The API described, as bytes: the OpenAPI document, the page, and a name of this state of both."""
+    """Description of the API as bytes: the OpenAPI document, the HTML page, and the entity tag of both."""
 
     document: bytes
     page: bytes
@@ -102,7 +102,7 @@ class Services:
         self._tries_by_name.take(name)
 
     def note_use(self, principal: Principal) -> None:
-        """Remember that a token was used, at most once in `NOTE_USE_EVERY_S` for each."""
+        """Record the use of a token, at most once in `NOTE_USE_EVERY_S` for each."""
         token_id, now = principal.token_id, time.monotonic()
         if token_id is None:
             return
@@ -113,6 +113,6 @@ class Services:
         self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     def close(self) -> None:
-        """Wait for transactions that run, then let go of everything."""
+        """Wait for running transactions, then close everything."""
         self.compute_threads.close()
         self.database.close()

@@ -1,4 +1,4 @@
-"""Settings of a server: flags, then `MAREY_*` variables, then `marey.toml`, then the defaults here."""
+"""Settings of a server, from flags, `MAREY_*` variables, `marey.toml` and defaults, in this order of precedence."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ MIB = 1024 * 1024
 
 
 PREFIX = "MAREY_"
-"""Of the variables: MAREY_PORT is `port`. The client, the worker and the tests have variables of their own."""
+"""Prefix of the variables: MAREY_PORT sets `port`. Client, worker and tests have other variables with this prefix."""
 
 
 class Settings(BaseSettings):
-    """Every setting, documented. The variable of `data` is MAREY_DATA, and so on."""
+    """Settings of a server. The variable of `data` is MAREY_DATA, and so on."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
 
@@ -111,22 +111,22 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - no .env files
         file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003 - no secret folders
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags win over variables, variables over the file."""
+        """Return the sources in order of precedence: flags, variables, file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
     @property
     def resolved_database_threads(self) -> int:
-        """Return the number of reading threads. On SQLite they never wait, so more of them bring nothing."""
+        """Return the number of reading threads; few on SQLite, because its reads never wait."""
         return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property
     def resolved_database_url(self) -> str:
-        """The database that is used."""
+        """Return the URL of the database, by default an SQLite file in the data folder."""
         return self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
 
 
 def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Variables that are no settings and look like one, with the one that was perhaps meant."""
+    """Return variables that look like a setting but are none, each with the most similar setting."""
     known = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
     unknown = [name for name in environment if name.startswith(PREFIX) and name.upper() not in known]
     own = [name for name in unknown if not name.startswith(f"{PREFIX}TEST_")]

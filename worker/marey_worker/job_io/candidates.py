@@ -1,4 +1,4 @@
-"""Clips that may be added to an evaluated set, as databases by folder and skeleton."""
+"""Candidates: clips that may be added to an evaluated set, as matching databases by folder and skeleton."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 
 class Unusable(NamedTuple):
-    """Clips of a folder that cannot be matched, and why."""
+    """Folder whose clips cannot be used for matching, with the reason."""
 
     folder: str
     clips: int
@@ -35,7 +35,7 @@ class Unusable(NamedTuple):
 
 @dataclass
 class Candidates:
-    """Databases by folder, all with the set's options and normaliser; and folders that make none."""
+    """Matching databases by folder, with the options and normaliser of the set; and the folders that are unusable."""
 
     databases: dict[str, MatchingDatabase] = field(default_factory=dict)
     unusable: list[Unusable] = field(default_factory=list)
@@ -47,7 +47,7 @@ class _Group(NamedTuple):
 
 
 def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
-    """Return the job's input `candidates`, without clips that the set has."""
+    """Return the job's input `candidates`, without clips that the set already contains."""
     database = evaluated.clips.database
     known = {source_of(clip) for clip in database.clips}
     pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]
@@ -67,14 +67,14 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
 
 
 def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[tuple[str, _Group]]:
-    """Each group by its folder, and by its skeleton where a folder has clips of several."""
+    """Yield each group with its folder as name, and the skeleton if the folder has clips of several skeletons."""
     for (folder, skeleton), group in groups.items():
         alone = sum(other == folder for other, _ in groups) == 1
         yield folder if alone else f"{folder} ({context.item(Kind.SKELETON, skeleton).name})", group
 
 
 def _build(context: Context, group: _Group, database: MatchingDatabase) -> MatchingDatabase:
-    """Return the group's database, with the very body of the set where it is of the set's skeleton."""
+    """Return the matching database of a group; if it has the set's skeleton, it shares the set's body object."""
     newest = max(map(_skeleton_of, group.motions), key=lambda ref: ref.revision)
     rigged = read_rigged(context, Rig.as_stored(newest))
     body = database.body

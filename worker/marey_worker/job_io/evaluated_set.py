@@ -1,4 +1,4 @@
-"""Evaluations that jobs start from, the sets of clips behind them, and the files that jobs answer with."""
+"""Evaluations as inputs of jobs, with their sets of clips; and result files of such jobs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """An evaluation with its records, and its clips under its normaliser."""
+    """Evaluation with the records of its trials, and its clips under its normaliser."""
 
     result: EvaluationResult
     clips: MatchingClips
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """The trials that were made."""
+        """The trials of the evaluation."""
         return tuple(one.trial for one in self.result.trials)
 
 
@@ -39,19 +39,19 @@ def read_result(context: Context, pin: PinnedInput) -> tuple[EvaluationResult, M
 
 
 def read_evaluated_set(context: Context) -> EvaluatedSet:
-    """Return the job's input `evaluation`, and its clips. Raises `JobRefused`."""
+    """Return the job's input `evaluation` with its clips. Raises `JobRefused`."""
     (pin,) = context.inputs["evaluation"]
     result, document = read_result(context, pin)
     return EvaluatedSet(result, read_evaluated_clips(context, pin, document, result.options.database))
 
 
 def store_document(context: Context, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Send a document as a file of JSON; what the job's result says of it."""
+    """Send a document as a JSON file; return the entry for the job's result that refers to it."""
     return store_file(context, encode_tree(tree, JSON))
 
 
 def store_file(context: Context, data: bytes) -> dict[str, Any]:
-    """Send a file; what the job's result says of it, by which it is kept."""
+    """Send a file; return the entry for the job's result, which also protects the file from garbage collection."""
     file = context.scratch / "document"
     file.write_bytes(data)
     return StoredFile(blob=context.put_file(file), size_bytes=len(data)).model_dump(mode="json")

@@ -1,4 +1,4 @@
-"""Inputs that were downloaded before: files with a seal, the least recently used go first."""
+"""Cache of downloaded inputs: files with a checksum; the least recently used are removed first."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ TEMPORARY = ".new-"
 
 
 class InputCache:
-    """Bytes by key, in a folder that workers of one machine may share.
+    """Cache of bytes by key, in a folder that the workers of a machine may share.
 
-    What a key names never changes: a digest, or a part of a revision. Every file begins with the SHA-256 of the rest,
-    so that a damaged or half-written file is noticed and fetched again.
+    The content of a key never changes: it is a digest, or a part of a revision. Every file begins with the SHA-256 of
+    the rest, so that a damaged or incomplete file is detected and downloaded again.
     """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:
@@ -32,16 +32,16 @@ class InputCache:
         self._bytes = sum(size for _, size, _ in self._files())
 
     def get(self, key: str, fetch: Callable[[], bytes]) -> bytes:
-        """Return the bytes of `key`: from the folder, or from `fetch`, and then kept."""
+        """Return the bytes of `key` from the folder, or else from `fetch`, and store them."""
         (data,) = self.get_many([key], lambda _missing: [fetch()])
         assert data is not None
         return data
 
     def get_many(self, keys: Sequence[str], fetch: Callable[[list[int]], Sequence[bytes | None]]) -> list[bytes | None]:
-        """Return the bytes of `keys`: from the folder, or from `fetch`, which gets the indices of the others.
+        """Return the bytes of `keys`; those that are not cached come from `fetch`, which gets their indices.
 
-        `fetch` may answer for the first of them only; then the result ends before the first key it left out. None is
-        returned as it is, and not kept.
+        `fetch` may return only the first of them; then the result ends before the first key without an answer. None is
+        returned as it is, and not stored.
         """
         paths = [self.folder / hashlib.sha256(key.encode()).hexdigest() for key in keys]
         held = [self._read(path) for path in paths]
@@ -88,7 +88,7 @@ class InputCache:
                 self._clean()
 
     def _clean(self) -> None:
-        """Remove what was not used for longest, until a fifth of the room is free."""
+        """Remove the least recently used files until a fifth of the limit is free."""
         files = sorted(self._files())
         self._bytes = sum(size for _, size, _ in files)
         for _, size, path in files:
@@ -98,7 +98,7 @@ class InputCache:
             self._bytes -= size
 
     def _files(self) -> list[tuple[float, int, Path]]:
-        """(time of last use, size, path) of every file; another worker may be removing some."""
+        """Return (time of last use, size, path) of every file; another worker may be removing some."""
         found: list[tuple[float, int, Path]] = []
         for entry in os.scandir(self.folder):
             try:

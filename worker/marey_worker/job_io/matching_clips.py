@@ -1,4 +1,4 @@
-"""Clips of a project as a matching database, kept from task to task: tasks of one evaluation share it."""
+"""Matching databases of a project's clips, cached between tasks, because tasks of one evaluation share a database."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ MOST_KEPT = 1
 
 @dataclass(frozen=True)
 class MatchingClips:
-    """A matching database of clips, with its search index."""
+    """Matching database of clips, with its search index."""
 
     database: MatchingDatabase
 
     @cached_property
     def index(self) -> SearchIndex:
-        """Search index of the database's normalised features; built at the first use."""
+        """The search index of the database's normalised features, built at the first use."""
         database = self.database
         return build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
 
@@ -54,7 +54,7 @@ _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 
 @dataclass(frozen=True)
 class ClipSet:
-    """Clips of a database, with their trims and loops: all that decides it beside options and normaliser."""
+    """Clips of a database with their trims and loops, which determine it together with options and normaliser."""
 
     clips: tuple[PinnedInput, ...]
     rig: PinnedInput | None = None
@@ -72,7 +72,7 @@ class ClipSet:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
-        """Read the result of `as_tree`."""
+        """Return the set that `as_tree` encoded."""
         return cls(
             clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
             rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
@@ -82,16 +82,16 @@ class ClipSet:
 
 
 def wanted_clips(context: Context, params: EvaluateParams) -> ClipSet:
-    """Return the clips that the job shall evaluate."""
+    """Return the clips that the job evaluates."""
     (rig,) = context.inputs.get("rig", ()) or (None,)
     return ClipSet(context.inputs["clips"], rig, params.loops, params.trims)
 
 
 def read_clips(context: Context, params: EvaluateParams, options: DatabaseOptions) -> MatchingClips:
-    """Return the job's clips, ready to be matched.
+    """Return the job's clips, prepared for matching.
 
-    Raises `JobRefused` for clips of several skeletons, for trims that do not fit, for a skeleton that lacks joints, and
-    where too little is left to match.
+    Raises `JobRefused` for clips of several skeletons, trims that do not fit, a skeleton that lacks joints, or too few
+    frames.
     """
     pins = {name: [(pin.item, pin.revision) for pin in many] for name, many in context.inputs.items()}
     chosen = params.model_dump(mode="json", include={"database", "loops", "trims"})
@@ -106,7 +106,10 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """The clips of an evaluation as they were, under its normaliser. Raises `JobRefused` for one that names none."""
+    """Return the clips of an evaluation at their revisions, under its normaliser.
+
+    Raises `JobRefused` if the evaluation does not list its clips.
+    """
     if "clip_set" not in document:
         raise JobRefused("clips-unknown", f"{evaluation.path} does not record its clips; evaluate them again")
     wanted = ClipSet.from_tree(document["clip_set"])
@@ -120,7 +123,7 @@ def read_evaluated_clips(
 
 @contextmanager
 def refusing_motion_errors() -> Iterator[None]:
-    """Turn a `MotionError`, or options out of range in a stored document, into a `JobRefused`, which is not retried."""
+    """Turn a `MotionError`, or invalid options in a stored document, into a `JobRefused`, which is not retried."""
     try:
         yield
     except MotionError as error:
@@ -147,7 +150,7 @@ def build_clips(
     options: DatabaseOptions,
     normaliser: Normaliser | None,
 ) -> MatchingDatabase:
-    """Return the database of clips whose motions, one for each with its digest, are at hand."""
+    """Return the database of clips from their motions, each given with its digest."""
     infos = context.documents(wanted.clips, "info", required=False)
     clips = [
         SourceClip(
@@ -166,19 +169,19 @@ def build_clips(
 
 
 def uid_of(pin: PinnedInput) -> str:
-    """Return the name of a clip in a database."""
+    """Return the unique name of a clip in a database."""
     return f"{pin.item}@{pin.revision}"
 
 
 def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, MotionDocument]]:
-    """Each clip's motion and its digest."""
+    """Return each clip's motion and its digest."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
         yield document_digest(tree), MotionDocument.model_validate(tree)
 
 
 def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, MotionDocument]]) -> Rig:
-    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` if there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for _, motion in motions]
     (most, count), *others = Counter(ref.item for ref in used).most_common()
     if others:
@@ -209,7 +212,7 @@ def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[in
 
 
 def _pinned_normaliser(context: Context) -> Normaliser | None:
-    """Return the normaliser of the evaluation that the job names, if it names one."""
+    """Return the normaliser of the evaluation that the job names, if any."""
     for pin in context.inputs.get("normaliser", ()):
         evaluation = context.document(Kind.EVALUATION, pin.item, pin.revision, "evaluation")
         return Normaliser.from_tree(evaluation["normaliser"])

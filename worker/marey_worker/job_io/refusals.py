@@ -1,4 +1,4 @@
-"""Inputs that a job of many could not use, with reasons; the others are processed."""
+"""Refusals: inputs that a job could not use, with reasons; the other inputs are processed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, NoSuchThing
 
 UNUSABLE = (MotionError, ValidationError, NoSuchThing)
-"""Errors that concern a single input, so that the other inputs are still processed."""
+"""Errors that concern a single input; the other inputs are processed."""
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
@@ -22,7 +22,7 @@ def present(pin: PinnedInput, document: Any) -> Any:
 
 
 class Refusals:
-    """The inputs that a job refused, in order; each is also written to the job's log."""
+    """Refused inputs of a job, in order; each is also written to the job's log."""
 
     def __init__(self, context: Context) -> None:
         self.entries: list[dict[str, str]] = []
@@ -39,5 +39,5 @@ class Refusals:
 
     @property
     def first(self) -> str:
-        """Text of the first refusal, for the end of a sentence; empty if there is none."""
+        """The text of the first refusal, for the end of a sentence; empty if there is none."""
         return f"; {self.entries[0]['name']}: {self.entries[0]['detail']}" if self.entries else ""

@@ -1,4 +1,4 @@
-"""Places of a job's results: each has its own, and none replaces an input."""
+"""Places of a job's results: unique, and different from the places of its inputs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_worker.context import Context, JobRefused
 
 
 class ResultPlaces:
-    """The places that the results of one job have taken, and those that its inputs hold."""
+    """Places taken by the results of one job, and by its inputs."""
 
     def __init__(self, context: Context) -> None:
         self._into = context.into
@@ -21,9 +21,9 @@ class ResultPlaces:
         self._taken: set[tuple[Kind, str, str]] = set()
 
     def take(self, kind: Kind, collection: str, *names: str) -> None:
-        """Give these names in a collection below `into` to results that take the place of nothing.
+        """Reserve names in a collection below `into` for results.
 
-        Raises `MotionError`, and gives none of them, where one is too long, taken, or that of an input.
+        Raises `MotionError` and reserves none if one is too long, already taken, or the place of an input.
         """
         for name in names:
             self._require_free(kind, collection, name)
@@ -37,7 +37,7 @@ class ResultPlaces:
         self._taken |= {(kind, collection, name) for name in names}
 
     def keep(self, pin: PinnedInput) -> None:
-        """Let a result take the place of this input. Raises `MotionError` where another one has."""
+        """Reserve the place of an input for its result. Raises `MotionError` if another result has it."""
         self._require_free(pin.kind, pin.collection, pin.name)
         self._taken.add((pin.kind, pin.collection, pin.name))
 
@@ -49,7 +49,7 @@ class ResultPlaces:
 
 
 def require_different(places: Iterable[tuple[str, str]]) -> None:
-    """Raise `JobRefused` unless these results, by folder and name, all differ: before any of them is computed."""
+    """Raise `JobRefused` if two results have the same folder and name; called before any computation."""
     counts = Counter(places)
     for (folder, name), count in counts.most_common(1):
         if count > 1:

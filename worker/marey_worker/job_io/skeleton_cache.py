@@ -1,4 +1,4 @@
-"""Skeletons as retargeting needs them, kept from job to job: a revision never changes, and one process stays warm."""
+"""Cache of skeletons for retargeting, kept between jobs of a process; a revision never changes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_KEPT = 512
 
 
 class Rigged(NamedTuple):
-    """A skeleton, which of its joints are which, and their axes."""
+    """Skeleton with its joint mapping and axes."""
 
     skeleton: Skeleton
     mapping: JointMapping
@@ -27,14 +27,14 @@ class Rigged(NamedTuple):
 
 
 class Rig(NamedTuple):
-    """A revision of a skeleton, and the revision whose mapping to go by."""
+    """Revision of a skeleton, and the revision whose joint mapping is used."""
 
     skeleton: RevisionRef
     mapping: RevisionRef
 
     @classmethod
     def as_stored(cls, ref: RevisionRef) -> Rig:
-        """Return a skeleton with its own mapping."""
+        """Return the rig of a skeleton with its own mapping."""
         return cls(ref, ref)
 
 
@@ -43,9 +43,9 @@ _plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_ent
 
 
 def read_rigged(context: Context, rig: Rig) -> Rigged:
-    """Return a skeleton with its mapping, or a guessed one where it has none.
+    """Return a skeleton with its joint mapping, or a guessed mapping if it has none.
 
-    Raises `MotionError` where the mapping contradicts the skeleton.
+    Raises `MotionError` if the mapping contradicts the skeleton.
     """
     return _skeletons.get_or_make(rig, lambda: _read(context, rig))
 

@@ -1,4 +1,4 @@
-"""Staging of results one by one, so that they are sent while the next ones are computed."""
+"""Staging of results in batches, which are sent while the next results are computed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OUTPUTS_PER_STAGE = 64
 
 
 class StagedResults:
-    """The results of one job, in the order made; `names` are those of all so far."""
+    """Results of one job in the order of staging; `names` are the names of all results so far."""
 
     def __init__(self, context: Context) -> None:
         self.names: set[str] = set()
@@ -29,7 +29,7 @@ class StagedResults:
     def add(self, output: StagedOutput) -> None:
         """Add a result; several results are sent together.
 
-        Raises `JobRefused` for a second one of the same name, which would replace the first without a word.
+        Raises `JobRefused` for a repeated name, because the second result would replace the first.
         """
         if output.name in self.names:
             raise JobRefused("same-name", f"two results of the job would be {output.name}")
@@ -40,7 +40,7 @@ class StagedResults:
             self.flush()
 
     def flush(self) -> None:
-        """Send the results that are ready."""
+        """Send the results that are not yet sent."""
         if self._ready:
             self._context.stage(self._ready)
         self._ready, self._ready_bytes = [], 0

@@ -1,4 +1,4 @@
-"""Reports and their figures as files that a document names."""
+"""Storage of reports and their figures as files that a document names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marey_worker.context import Context
 def store_report(
     context: Context, kind: type[Report], title: str, page: str, figures: Iterable[tuple[str | None, DrawnFigure]]
 ) -> dict[str, Any]:
-    """Return the document of a report, its page and figures stored; a figure comes with the trial it was asked for."""
+    """Store the page and the figures of a report; return its document, in which a figure names the trial it shows."""
     report = kind.model_validate(
         {
             "title": title,
@@ -28,7 +28,7 @@ def store_report(
 
 
 def _scripts(page: str) -> tuple[str, ...]:
-    """The script of the page: its last one. Anything before it that looks like one came with a name of something."""
+    """Return the script of the page, which is the last one; earlier text that looks like a script is a name."""
     _, found, rest = page.rpartition("<script>")
     digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()
     return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()

@@ -1,4 +1,4 @@
-"""Examples of one action, aligned with each other."""
+"""Kind `align`: aligns examples of one action with each other."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MIRRORED_NAME = " mirrored"
 
 
 class _Clip(NamedTuple):
-    """A clip that may become an example."""
+    """Clip that may become an example."""
 
     pin: PinnedInput
     motion: MotionDocument
@@ -44,7 +44,7 @@ class _Clip(NamedTuple):
 
 
 class _ClipAnnotation(NamedTuple):
-    """An annotation of a revision of a clip."""
+    """Annotation of a revision of a clip."""
 
     pin: PinnedInput
     annotation: Annotation
@@ -52,15 +52,15 @@ class _ClipAnnotation(NamedTuple):
 
 
 def run(context: Context, params: AlignParams) -> dict[str, Any]:
-    """Align the clips of the job; those that do not fit are refusals in the result, with code and reason.
+    """Align the clips of the job; unsuitable clips are listed as refusals in the result, with code and reason.
 
-    Raises `JobRefused` where fewer than two are left, and where two results would get one name.
+    Raises `JobRefused` if fewer than two clips are left, or if two results would have the same name.
     """
     return _Job(context, params).run()
 
 
 class _Job:
-    """State of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: AlignParams) -> None:
         self._context = context
@@ -118,7 +118,7 @@ class _Job:
             yield _Clip(pin, motion, document_digest(tree), RevisionRef.model_validate(motion.skeleton.model_dump()))
 
     def _of_one_skeleton(self, clips: Sequence[_Clip]) -> list[_Clip]:
-        """Return the clips of the skeleton that most of them move; the others are refused."""
+        """Return the clips of the most frequent skeleton; the others are refused."""
         counts = Counter(clip.skeleton.item for clip in clips)
         most = min(counts, key=lambda item: (-counts[item], item), default=None)
         others = [clip for clip in clips if clip.skeleton.item != most]
@@ -134,7 +134,7 @@ class _Job:
         return [clip for clip in clips if clip.skeleton.item == most]
 
     def _rig(self, clips: Sequence[_Clip]) -> Rig:
-        """Return the skeleton at its newest revision in use, with the mapping to go by."""
+        """Return the skeleton at its newest revision in use, with its joint mapping."""
         if not clips:
             raise JobRefused("too-few-clips", f"none of {len(self._pins)} clips can be read{self._refusals.first}")
         skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
@@ -171,7 +171,7 @@ class _Job:
     # -- annotations --
 
     def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
-        """Annotations by clip, of the layer that is asked for; None where the job has none."""
+        """Return the annotations of the requested layer by clip; None if the job has none."""
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
@@ -219,7 +219,7 @@ class _Job:
     # -- options --
 
     def _options(self) -> AlignOptions:
-        """Take the options of the alignment, with the newest revision of a reference that is the id of an item."""
+        """Return the options of the alignment; a reference given as the id of an item gets its newest revision."""
         options = AlignOptions.of(self._params)
         if options.reference in (MEDOID, NEAREST_MEAN_LENGTH):
             return options

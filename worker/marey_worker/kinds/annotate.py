@@ -1,4 +1,4 @@
-"""Segments and keyframes of clips, proposed by algorithms."""
+"""Kind `annotate`: proposes segments and keyframes of clips by algorithms."""
 
 from __future__ import annotations
 
@@ -33,9 +33,8 @@ Propose = Callable[[Clip, Rigged], Layer]
 def run(context: Context, params: AnnotateParams) -> dict[str, Any]:
     """Annotate every clip of the job.
 
-    A clip that cannot be annotated is a refusal in the result, with code and reason; the others are annotated all the
-    same. A clip in which nothing is found gets no annotation. Raises `JobRefused` where two annotations would get one
-    name.
+    A clip that cannot be annotated is listed as a refusal in the result, with code and reason. A clip in which nothing
+    is found gets no annotation. Raises `JobRefused` if two annotations would have the same name.
     """
     propose = _proposal(params)
     rigs = {pin.item: pin for pin in context.inputs.get("rigs", ())}
@@ -87,7 +86,7 @@ def _proposal(params: AnnotateParams) -> Propose:
 
 
 def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
-    """Joints by their own name or, where there is no such joint, by their standard name. Raises `UnknownJoint`."""
+    """Return joints by their own name, or else by their standard name. Raises `UnknownJoint`."""
     found = []
     for name in names:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)

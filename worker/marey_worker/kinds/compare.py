@@ -1,4 +1,4 @@
-"""Two evaluations of the same trials: what changed, as a document and as a report."""
+"""Kind `compare`: compares two evaluations of the same trials, as a document and as a report."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ STEPS = 3
 
 
 def run(context: Context, params: CompareParams) -> dict[str, Any]:
-    """Compare; the result counts what changed and names the document and the report.
+    """Compare two evaluations; the result counts the changes and names the document and the report.
 
-    Raises `JobRefused` for evaluations under other normalisers, options or scenarios.
+    Raises `JobRefused` if the evaluations have different normalisers, options or scenarios.
     """
     (first,), (second,) = context.inputs["before"], context.inputs["after"]
     context.progress(0, STEPS, "reading the evaluations")

@@ -1,4 +1,4 @@
-"""Clips cut along the segments of their annotations."""
+"""Kind `cut`: cuts clips along the segments of their annotations."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: CutParams) -> dict[str, Any]:
-    """Make a clip of every segment that is wanted, with an annotation of its own where keyframes are in it.
+    """Create a clip from every selected segment, and an annotation if the segment contains keyframes.
 
-    Raises `JobRefused` where no annotation has such a segment, and where two pieces would get one name.
+    Raises `JobRefused` if no annotation has such a segment, or if two pieces would have the same name.
     """
     return _Cutting(context, params).run()
 
 
 class _AnnotatedClip(NamedTuple):
-    """An annotation, its clip, and the segments to cut out with the names of the pieces."""
+    """Annotation, its clip, and the segments to cut out with the names of the pieces."""
 
     pin: PinnedInput
     annotation: Annotation
@@ -45,7 +45,7 @@ class _AnnotatedClip(NamedTuple):
 
 
 class _Cutting:
-    """State of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: CutParams) -> None:
         self._context = context
@@ -94,10 +94,10 @@ class _Cutting:
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
-        """The annotated clip with its name and place: as it was when the job was submitted, where clips were given.
+        """Return the annotated clip with its name and place, at submission if clips are inputs of the job.
 
-        Only what is pinned may decide the results then, since they are kept for jobs with the same inputs.
-        Raises `MotionError`, `NoSuchThing`.
+        In that case only inputs may determine the results, because the results are cached for jobs with the same
+        inputs. Raises `MotionError`, `NoSuchThing`.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -110,7 +110,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """The wanted segments with their names; what is left out of a label is counted all the same."""
+        """Return the selected segments with their names; numbers count all segments of a label, selected or not."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1
@@ -181,7 +181,7 @@ class _Cutting:
         return max(0, segment.start - before), min(len(motion.poses), segment.end + after)
 
     def _info(self, clip: RevisionRef) -> ClipInfo:
-        """Return the facts about the clip that hold for its pieces."""
+        """Return the part `info` of the pieces: the facts about the clip that hold for them, too."""
         try:
             stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
         except NoSuchThing:
@@ -196,7 +196,7 @@ class _Cutting:
 
 
 def _sliced(motion: MotionDocument, frames: tuple[int, int]) -> dict[str, Any]:
-    """Return the `motion` part of the frames [start, end), bit for bit."""
+    """Return the part `motion` of the frames [start, end), bit for bit."""
     kept = slice(*frames)
     translations = None if motion.translations is None else np.ascontiguousarray(motion.translations[kept])
     poses = np.ascontiguousarray(motion.poses[kept])

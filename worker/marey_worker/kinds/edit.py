@@ -1,4 +1,4 @@
-"""Clips changed by the commands of an edit."""
+"""Kind `edit`: applies the commands of an edit to clips."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from marey_worker.job_io.staged_results import StagedResults
 def run(context: Context, params: EditParams) -> dict[str, Any]:
     """Apply the commands to every clip of the job.
 
-    A clip that cannot be edited is a refusal in the result, with code and reason; the others are made all the same.
-    Raises `JobRefused` where it is open which commands are meant, what sources they name, or where results should go.
+    A clip that cannot be edited is listed as a refusal in the result, with code and reason. Raises `JobRefused` if the
+    commands, the clips that they name, or the places of the results are ambiguous.
     """
     return _Editing(context, params).run()
 
 
 class _Editing:
-    """State of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: EditParams) -> None:
         self._context = context
@@ -92,7 +92,7 @@ class _Editing:
     def _edited(
         self, pin: PinnedInput, motion: MotionDocument, known: dict[str, Any] | None, sources: Mapping[str, Clip]
     ) -> Iterator[StagedOutput]:
-        """The results of one clip. Raises `MotionError`, `NoSuchThing`."""
+        """Return the results of one clip. Raises `MotionError`, `NoSuchThing`."""
         if self._params.in_place:
             self._require_newest(pin)
         body = self._body(motion)
@@ -133,7 +133,7 @@ class _Editing:
         )
 
     def _body(self, motion: MotionDocument) -> EditedBody:
-        """Return the skeleton of a motion; its mapping is looked for when a command asks. Raises `MotionError`."""
+        """Return the skeleton of a motion; its mapping is read only if a command needs it. Raises `MotionError`."""
         used = _skeleton_of(motion)
         if used not in self._bodies:
             tree = self._context.document(Kind.SKELETON, used.item, used.revision, "hierarchy")
@@ -149,7 +149,7 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the facts about the clip that still hold, and the edit that was applied."""
+        """Return the part `info` of a result: the facts about the clip that still hold, and the applied edit."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {
             "clip": pin.as_input().model_dump(),
@@ -168,7 +168,7 @@ class _Editing:
     # -- where results go --
 
     def _require_newest(self, pin: PinnedInput) -> None:
-        """Refuse to take the place of what somebody else made meanwhile. Raises `EditError`."""
+        """Raise `EditError` if the clip to replace has got a newer revision since the job was submitted."""
         now = self._context.item(Kind.CLIP, pin.item)
         if now.revision != pin.revision:
             raise EditError(
@@ -190,7 +190,7 @@ class _Editing:
 
 
 def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | None, EditDocument]:
-    """Return the commands, and the edit item they are from. Raises `JobRefused`."""
+    """Return the commands, and the edit item that contains them, if any. Raises `JobRefused`."""
     (pin,) = context.inputs.get("edit", ()) or (None,)
     if (pin is None) == (not params.commands):
         raise JobRefused("which-commands", "give either an edit or commands, and not both")
@@ -203,7 +203,7 @@ def _wanted_edit(context: Context, params: EditParams) -> tuple[PinnedInput | No
 
 
 def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInput]:
-    """Return the clips that commands name, by id. Raises `JobRefused` where one is missing or given twice."""
+    """Return the clips that commands name, by id. Raises `JobRefused` if one is missing or given twice."""
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):

@@ -1,4 +1,4 @@
-"""Evaluates a set of locomotion clips: trials spread over tasks, then one evaluation of all their records."""
+"""Kind `evaluate`: evaluates a set of locomotion clips by trials, which are split over tasks and then combined."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Let motion matching follow this task's share of the trials; the result names the file of their records."""
+    """Run this task's share of the trials by motion matching; the result names the file of their records."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -54,7 +54,7 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Measure the records of all trials and stage the evaluation, with its report if it is wanted."""
+    """Compute the measures from the records of all trials, and stage the evaluation with its report, if requested."""
     options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
     database = read_clips(context, params, options.database).database
@@ -104,9 +104,9 @@ def _read_records(context: Context, results: Sequence[Mapping[str, Any]]) -> dic
 
 
 def headline_of(result: EvaluationResult) -> Headline:
-    """Return the numbers that lists show; units at the ends of the names, shares from 0 to 1.
+    """Return the numbers shown in lists; names end with the unit, shares are from 0 to 1.
 
-    Clips count once, with or without their mirrored copies.
+    A clip and its mirrored copy count as one.
     """
     sources = sum_by_source(result.clips, result.usage)
     rows = recorded_rows(result.clips, result.usage)
@@ -128,7 +128,7 @@ def headline_of(result: EvaluationResult) -> Headline:
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
-    """Draw every figure and write the page; the document that names them."""
+    """Draw every figure, write the page, and return the document that names them."""
     figures = draw_figures(result)
     page = render_report(result, title=params.name, figures=figures)
     drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
@@ -136,7 +136,7 @@ def write_report(context: Context, result: EvaluationResult, params: EvaluatePar
 
 
 def _trial_figures(result: EvaluationResult, params: EvaluateParams) -> Iterator[tuple[str, DrawnFigure]]:
-    """Figures of the trials that were asked for."""
+    """Return the requested figures of single trials."""
     families = {one.trial.name: one.trial.family for one in result.trials}
     for trial in params.trial_figures:
         for name, kind in FIGURES.items():

@@ -1,4 +1,4 @@
-"""Clips as files of one format, in one archive."""
+"""Kind `export`: writes clips as files of one format to an archive."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import present
 
 EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The earliest time in a ZIP archive; every file gets it, so that the same clips give the same bytes."""
+"""Earliest time of a ZIP archive, used for every file, so that the same clips give the same bytes."""
 
 READABLE_BY_ALL = 0o644 << 16
 
@@ -32,7 +32,7 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the archive; the result names it, which keeps it. A clip that cannot be written is a refusal in there."""
+    """Write the archive; the result names it and lists clips that cannot be written as refusals."""
     exporting = _Exporting(context, params)
     archive = context.scratch / "archive.zip"
     refused: list[dict[str, Any]] = []
@@ -58,7 +58,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
 
 
 class _Exporting:
-    """Export of the clips of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context
@@ -66,9 +66,9 @@ class _Exporting:
         self._skeletons: dict[RevisionRef, tuple[Skeleton, dict[str, Any]]] = {}
 
     def file_of(self, pin: PinnedInput, info: dict[str, Any], tree: Any = None) -> _File:
-        """Write the file of a clip, which its original needs no motion for.
+        """Return the file of a clip; the original file needs no motion.
 
-        Raises `MotionError` or `NoSuchThing` where the clip has no file in this format.
+        Raises `MotionError` or `NoSuchThing` if the clip has no file in this format.
         """
         if self._params.format == "original":
             return self._original(pin, info)
@@ -97,7 +97,7 @@ class _Exporting:
 
 
 def _place(pin: PinnedInput) -> str:
-    """Return a path inside the archive that leads nowhere else."""
+    """Return a path inside the archive that cannot lead outside of the folder it is extracted to."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
 

@@ -1,4 +1,4 @@
-"""Kind `import`: files that the server has already become skeletons, clips, models and graphs."""
+"""Kind `import`: imports stored files as skeletons, clips, models and graphs."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from marey_worker.job_io.staged_results import StagedResults
 
 
 def run(context: Context, params: ImportParams) -> dict[str, Any]:
-    """Import every file of the job. One entry per file; one that is refused harms no other."""
+    """Import every file of the job; the result has an entry for each file, and a faulty file does not affect others."""
     return _Importing(context, params).run()
 
 
 class _Importing:
-    """State of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: ImportParams) -> None:
         self._context = context
@@ -36,12 +36,12 @@ class _Importing:
         self._skeleton = self._read_skeleton()
         self._results = StagedResults(context)
         self._mappings: dict[bytes, Any] = {}
-        """Parts `mapping` of the skeletons so far, by the skeletons' content."""
+        """Parts `mapping` of the skeletons so far, by the digest of the skeleton."""
         self._models: list[tuple[str, str, NamedModel]] = []
-        """Models of this job: collection, name, and how a graph refers to them."""
+        """Models of this job: collection, name, and reference for graphs."""
 
     def run(self) -> dict[str, Any]:
-        """Import all files, in the order given."""
+        """Import all files in order."""
         plan = plan_imports([file.name for file in self._params.files])
         entries = []
         for done, planned in enumerate(plan):
@@ -102,7 +102,7 @@ class _Importing:
         return graph_item(graph, self._find_models)
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        """Find models of this job and of the project; one of this job counts for what it is a new revision of."""
+        """Find models of this job and of the project; a model of this job replaces the one it is a new revision of."""
         stored = self._context.find_items(Kind.MODEL, name, collection)
         found = {one.path: NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in stored}
         for folder, called, model in self._models:

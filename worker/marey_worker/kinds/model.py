@@ -1,4 +1,4 @@
-"""Trains a generative model of one action on aligned clips, and writes its report."""
+"""Kind `model`: trains a generative model of one action on aligned clips, and writes its report."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from marey_worker.job_io.stored_reports import store_report
 def run(context: Context, params: ModelParams) -> dict[str, Any]:
     """Train a model on the aligned clips of the job and stage it.
 
-    Raises `JobRefused` where the clips were not aligned together, or no model can be made of them.
+    Raises `JobRefused` if the clips were not aligned together, or if no model can be trained on them.
     """
     started = time.monotonic()
     pins = context.inputs["aligned"]
@@ -83,7 +83,7 @@ def _read(context: Context, pins: Sequence[PinnedInput]) -> tuple[list[MotionDoc
 
 
 def _common_skeleton(pins: Sequence[PinnedInput], motions: Sequence[MotionDocument]) -> RevisionRef:
-    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` where there are several."""
+    """Return the skeleton of all clips, at the newest revision in use. Raises `JobRefused` if there are several."""
     used = [RevisionRef.model_validate(motion.skeleton.model_dump()) for motion in motions]
     for pin, ref in zip(pins, used, strict=True):
         if ref.item != used[0].item:
@@ -114,7 +114,7 @@ def _aligned(
 def _provenance(
     context: Context, pins: Sequence[PinnedInput], aligned: AlignedSet, infos: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return the origin of the examples."""
+    """Return the sources of the examples, for the part `model`."""
     return {
         "aligned": [{"item": pin.item, "revision": pin.revision, "name": pin.path} for pin in pins],
         "set": infos[0].get("set"),
@@ -126,7 +126,7 @@ def _provenance(
 def write_model_report(
     context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any], params: ModelParams
 ) -> dict[str, Any]:
-    """Draw every figure of a model and of its alignment, and write the page; the document that names them.
+    """Draw every figure of a model and of its alignment, write the page, and return the document that names them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A set of clips made better step by step, with a line in the log for every step."""
+"""Kind `optimise`: improves a set of clips step by step, and logs each step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
-    """Remove and add clips while that helps; the result names the document with every step."""
+    """Remove and add clips as long as that improves the set; the result names the document with every step."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():
@@ -54,7 +54,7 @@ def run(context: Context, params: OptimiseParams) -> dict[str, Any]:
 
 
 def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> MatchingDatabase:
-    """The set and everything that may be added. Raises `JobRefused` for candidates that cannot be mixed with it."""
+    """Return the set and its candidates. Raises `JobRefused` if their clips cannot be in one database."""
     unusable = [f"{one.folder} ({one.detail})" for one in candidates.unusable]
     strangers = [name for name, other in candidates.databases.items() if not same_skeleton(database, other)]
     if unusable or strangers:

@@ -1,4 +1,4 @@
-"""Clips of any skeleton onto one skeleton."""
+"""Kind `retarget`: transfers clips of any skeleton to one skeleton."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from marey_worker.job_io.staged_results import StagedResults
 def run(context: Context, params: RetargetParams) -> dict[str, Any]:
     """Retarget every clip of the job.
 
-    A clip that cannot be retargeted is a refusal in the result, with code and reason; the others are made all the same.
+    A clip that cannot be retargeted is listed as a refusal in the result, with code and reason.
     """
     return _Retargeting(context, params).run()
 
 
 class _Retargeting:
-    """State of one job."""
+    """State of the job."""
 
     def __init__(self, context: Context, params: RetargetParams) -> None:
         self._context = context
@@ -95,7 +95,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """Return the facts about the source that hold for the result, and how it was made."""
+        """Return the part `info` of a result: the facts about the source that still hold, and its origin."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

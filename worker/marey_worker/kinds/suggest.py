@@ -1,4 +1,4 @@
-"""Suggests clips to remove from an evaluated set, and candidates that fill its holes."""
+"""Kind `suggest`: suggests clips to remove from an evaluated set, and candidates that fill its gaps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_worker.job_io.matching_clips import refusing_motion_errors
 
 
 def run(context: Context, params: SuggestParams) -> dict[str, Any]:
-    """Look for suggestions; the result counts them and names the document that has them all."""
+    """Compute suggestions; the result counts them and names the document that contains them."""
     evaluated = read_evaluated_set(context)
     candidates = read_candidates(context, evaluated)
     with refusing_motion_errors():

@@ -1,4 +1,4 @@
-"""The trials of an evaluation under other weights of the features: a task for each setting."""
+"""Kind `sweep`: runs the trials of an evaluation with other weights of the features, one task for each setting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tree over samples of a model, for searches."""
+"""Kind `tree`: builds a tree over samples of a model, for searches."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 
 
 def run(context: Context, params: TreeParams) -> dict[str, Any]:
-    """Make a tree of a model and stage it as a part of that model, whose other parts stay.
+    """Build a tree of a model and stage it as a part of that model, whose other parts are unchanged.
 
-    Raises `JobRefused` where the tree has no place to go to, and where no tree can be made of the model.
+    Raises `JobRefused` if the tree cannot be a part of that model, or cannot be built.
     """
     started = time.monotonic()
     (pin,) = context.inputs["model"]
@@ -62,7 +62,7 @@ def run(context: Context, params: TreeParams) -> dict[str, Any]:
 
 
 def _require_same_place(context: Context, pin: PinnedInput) -> None:
-    """Raise `JobRefused` unless what is published under the model's name becomes a part of this model."""
+    """Raise `JobRefused` unless an output with the model's name becomes a revision of this model."""
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
         raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; try again")
