@@ -10,14 +10,17 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from marey_motion import quaternions
 from marey_motion.errors import SkeletonError, UnknownJoint
 
 UNIT_TOLERANCE = 1e-3
+
+_Vector: TypeAlias = tuple[float, float, float]
+_Rotation: TypeAlias = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,21 +186,25 @@ class Skeleton:
     @cached_property
     def rest_global_rotations(self) -> NDArray[np.float64]:
         """Global rotations (J, 4) of the joints in the rest pose, as (w, x, y, z)."""
-        result = self.rest_rotations.copy()
+        turns: list[_Rotation] = self.rest_rotations.tolist()
         for joint, parent in enumerate(self.parents.tolist()):
             if parent >= 0:
-                result[joint] = quaternions.multiply(result[parent], result[joint])
+                turns[joint] = _product(turns[parent], turns[joint])
+        result = np.array(turns)
         result.setflags(write=False)
         return result
 
     @cached_property
     def rest_global_positions(self) -> NDArray[np.float64]:
         """Global positions (J, 3) of the joints in the rest pose, in metres."""
-        result = self.offsets.copy()
-        rotations = self.rest_global_rotations
+        points: list[_Vector] = self.offsets.tolist()
+        turns: list[_Rotation] = self.rest_global_rotations.tolist()
         for joint, parent in enumerate(self.parents.tolist()):
             if parent >= 0:
-                result[joint] = result[parent] + quaternions.rotate_vectors(rotations[parent], result[joint])
+                x, y, z = _rotated(turns[parent], points[joint])
+                px, py, pz = points[parent]
+                points[joint] = px + x, py + y, pz + z
+        result = np.array(points)
         result.setflags(write=False)
         return result
 
@@ -233,6 +240,32 @@ def same_hierarchy(a: Skeleton, b: Skeleton, *, tolerance_m: float = 0.0) -> boo
         return False
     aligned = np.abs(np.sum(a.rest_rotations * b.rest_rotations, axis=1))
     return bool(np.all(aligned >= 1.0 - 1e-9))
+
+
+# Plain numbers: for a few dozen joints, one after the other, they take a tenth of the time of `quaternions`, and the
+# same operations in the same order give the same bits.
+
+
+def _product(a: _Rotation, b: _Rotation) -> _Rotation:
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def _rotated(q: _Rotation, v: _Vector) -> _Vector:
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
+    return (
+        vx + w * tx + (y * tz - z * ty),
+        vy + w * ty + (z * tx - x * tz),
+        vz + w * tz + (x * ty - y * tx),
+    )
 
 
 def _checked_names(names: Sequence[str]) -> tuple[str, ...]:

@@ -165,31 +165,33 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
     rotations = np.empty((len(values), len(source.parents), 4), np.float32)
     rotations_from_euler(values, columns.turns, columns.axes, rotations)
     source.rotations = rotations
-    source.root_positions = _positions_of(0, values, columns, source.offsets)
-    moved = [joint for joint in range(1, len(source.parents)) if (columns.positions[joint] != NO_COLUMN).any()]
+    source.root_positions = _positions_of([0], values, columns, source.offsets)[:, 0]
+    moved = (1 + np.flatnonzero((columns.positions[1:] != NO_COLUMN).any(axis=1))).tolist()
     if moved:
         source.translated_joints = tuple(moved)
-        source.translations = np.stack([_positions_of(j, values, columns, source.offsets) for j in moved], axis=1)
+        source.translations = _positions_of(moved, values, columns, source.offsets)
         _take_bones_from_positions(source, source.translations)
         _resolve_displacements(source, source.translations)
         _drop_redundant_translations(source, source.translations)
 
 
 def _positions_of(
-    joint: int, values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
+    joints: list[int], values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Read local positions (F, 3) of one joint: its position channels, and its OFFSET on the axes without one."""
-    positions = np.tile(offsets[joint], (len(values), 1))
-    for axis, column in enumerate(columns.positions[joint].tolist()):
-        if column != NO_COLUMN:
-            positions[:, axis] = values[:, column]
+    """Read local positions (F, k, 3) of k joints: position channels, and OFFSET on the axes without one."""
+    wanted = columns.positions[joints]
+    positions = values[:, wanted]
+    absent = wanted == NO_COLUMN
+    positions[:, absent] = offsets[joints][absent]
     return positions
 
 
 def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.float64]) -> None:
     """Fill in offsets where a file has none at all below the root, and leaves its bones to the position channels."""
+    if source.offsets[1:].any():
+        return
     bones = np.median(translations, axis=0)
-    if source.offsets[1:].any() or not bones.any():
+    if not bones.any():
         return
     source.offsets[list(source.translated_joints)] = bones
     source.warnings.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -10,11 +11,12 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, FormatError, SkeletonError
 from marey_motion.importing import checks
-from marey_motion.importing.anatomy import anatomy_of
+from marey_motion.importing.anatomy import KEPT_SKELETONS, Anatomy, anatomy_of
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.source import ImportedMotion, SourceInfo, SourceMotion
 from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions, UpAxis
 
 Real = TypeVar("Real", np.float32, np.float64)
@@ -30,6 +32,11 @@ _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
+
+_CONVERTED: LruCache[tuple[Anatomy, tuple[tuple[int, bytes], ...], bytes, float], Skeleton] = LruCache(
+    max_entries=KEPT_SKELETONS
+)
+"""Skeletons by everything that they follow from: those of their files with end sites, axes and unit."""
 
 
 def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
@@ -51,12 +58,16 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     """
     _check_range(source, file)
     try:
-        landmarks = anatomy_of(source.skeleton).landmarks
-        found = infer_conversion(source, landmarks, file, options)
+        anatomy = anatomy_of(source.skeleton)
+        found = infer_conversion(source, anatomy, file, options)
         axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
         if found.handedness == "left":
             axes[0] = -axes[0]
-        skeleton = anatomy_of(_converted_skeleton(source, axes, found.unit_scale_m)).skeleton
+        tips = tuple((joint, offset.tobytes()) for joint, offset in source.end_sites)
+        skeleton = _CONVERTED.get_or_make(
+            (anatomy, tips, axes.tobytes(), found.unit_scale_m),
+            lambda: anatomy_of(_converted_skeleton(source, axes, found.unit_scale_m)).skeleton,
+        )
         warnings = [*source.warnings, *found.warnings, *_notices(source, found.up_axis)]
         clip = _converted_clip(source, skeleton, axes, found.unit_scale_m)
     except (SkeletonError, ClipError) as error:
@@ -67,7 +78,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
             clip, trimmed = checks.without_rest_pose(clip)
         if options.align_floor:
             clip, floor_shift_m = checks.on_the_floor(clip)
-        warnings += checks.check_clip(clip, landmarks)  # last: frames and heights are those of the clip that is kept
+        warnings += checks.check_clip(clip, anatomy.landmarks)  # last: of the clip that is kept
     info = SourceInfo(
         format=source.format,
         file=file,
@@ -144,14 +155,19 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"
         notices.append(CheckWarning("up-axis-converted", message, values={"up_axis": up_axis}))
-    orders = {"".join(name[0] for name in names if name.endswith("rotation")) for names in source.channels}
-    orders = {order for order in orders if len(order) > 1}
-    if len(orders) > 1:
-        listed = sorted(orders)
+    listed = _rotation_orders(source.channels)
+    if len(listed) > 1:
         message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own"
-        notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": listed}))
+        notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": list(listed)}))
     repeated = [name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown]
     if repeated:
         message = f"{len(repeated)} joint names repeat in the file; each gets the name of its parent before its own"
         notices.append(CheckWarning("duplicate-joint-names", message, joints=tuple(repeated)))
     return notices
+
+
+@lru_cache(maxsize=KEPT_SKELETONS)
+def _rotation_orders(channels: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+    """List the orders in which joints of more than one turn take them."""
+    orders = {"".join(name[0] for name in names if name.endswith("rotation")) for names in channels}
+    return tuple(sorted(order for order in orders if len(order) > 1))

@@ -7,6 +7,7 @@ from marey_motion.formats.numeric_text import excerpt
 from marey_schemas.formats import FORMATS, IMPORTED, FileFormat
 
 _START = 4096
+_BLANK = b"\0\r\n\t "
 _ARCHIVES = {
     b"\x1f\x8b": "gzip",
     b"\xfd7zXZ": "xz",
@@ -41,7 +42,8 @@ def detect_format(data: bytes, name: str) -> FileFormat:
     ------
     UnknownFormat    for empty files, archives and formats without a row in `marey_schemas.formats`
     """
-    if not data.strip(b"\0\r\n\t "):
+    start = data[:_START]
+    if not start.strip(_BLANK) and not data.strip(_BLANK):
         raise UnknownFormat("the file is empty", code="file-empty", file=name)
     named = next((one for one in IMPORTED if one.names(name)), None)
     archive = next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
@@ -58,7 +60,6 @@ def detect_format(data: bytes, name: str) -> FileFormat:
         raise UnknownFormat(
             f"{foreign}, for which there is no reader; export the motion as BVH", code="reader-absent", file=name
         )
-    start = data[:_START]
     found = next((one for one in FORMATS if one.begins is not None and one.begins.search(start)), named)
     if found is None:
         endings = sorted({ending for one in IMPORTED for ending in one.endings + one.other_endings})

@@ -17,7 +17,7 @@ from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_do
 from marey_motion.skeleton import Skeleton
 from marey_schemas.lru import LruCache
 
-KEPT_SKELETONS = 64
+KEPT_SKELETONS = 256
 
 
 class Anatomy:

@@ -6,6 +6,7 @@ The checks never change anything; `without_rest_pose` and `on_the_floor` make a 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -107,13 +108,16 @@ class _Tracks:
     def of(self, *joints: int) -> NDArray[np.float32]:
         return self.positions[:, [self.column[joint] for joint in joints]]
 
-    def sole_heights(self) -> NDArray[np.float32]:
-        """Compute the height (F, 2) of the lowest point of each foot."""
-        return np.stack([self.positions[:, sole, 1].min(axis=1) for sole in self.soles], axis=1)
+    @cached_property
+    def lowest(self) -> NDArray[np.float32]:
+        """Heights (F,) of the lowest point of both feet."""
+        lowest: NDArray[np.float32] = self.positions[:, np.concatenate(self.soles), 1].min(axis=1)
+        return lowest
 
+    @cached_property
     def floor_height(self) -> float:
-        """Measure the height at which the lower foot rests."""
-        return float(np.quantile(self.sole_heights().min(axis=1), 0.05))
+        """The height at which the lower foot rests."""
+        return float(np.quantile(self.lowest, 0.05))
 
 
 def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWarning, ...]:
@@ -169,7 +173,7 @@ def on_the_floor(clip: Clip) -> tuple[Clip, float]:
     tracks = _track(clip)
     if not tracks.soles:
         return clip, 0.0
-    shift_m = -tracks.floor_height()
+    shift_m = -tracks.floor_height
     poses = clip.poses.copy()
     poses[:, 1] += np.float32(shift_m)
     return replace(clip, poses=poses), shift_m
@@ -286,7 +290,7 @@ def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
 
 
 def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
-    height = tracks.floor_height()
+    height = tracks.floor_height
     if abs(height) <= FLOOR_TOLERANCE_M:
         return None
     return CheckWarning(
@@ -297,7 +301,7 @@ def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
 
 
 def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
-    depths = tracks.floor_height() - tracks.sole_heights().min(axis=1)
+    depths = tracks.floor_height - tracks.lowest
     below = np.flatnonzero(depths > PENETRATION_M)
     if below.size == 0:
         return None
@@ -319,7 +323,7 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     if clip.frame_count < 3:
         return []
     soles = tracks.positions[:, np.concatenate(tracks.soles)]
-    heights = soles[1:, :, 1] - tracks.floor_height()
+    heights = soles[1:, :, 1] - tracks.floor_height
     weights = 2.0 - 2.0 ** (np.clip(heights, 0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
     standing = float(weights.sum())
     if standing < 2:

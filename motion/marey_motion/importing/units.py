@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.errors import AmbiguousUnits, MotionError
+from marey_motion.importing.anatomy import Anatomy
 from marey_motion.importing.checks import CheckWarning
 from marey_motion.importing.landmarks import Landmarks, path_length
 from marey_motion.importing.source import SourceMotion
@@ -86,13 +87,13 @@ class _Measurements:
     warnings: list[CheckWarning] = field(default_factory=list)
 
 
-def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, options: ImportOptions) -> Conversion:
+def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions) -> Conversion:
     """Decide the unit and the upward axis: from the options, else from the format, else from the body.
 
     Parameters
     ----------
     source : SourceMotion    the file in its own unit and axes
-    landmarks : Landmarks    those of the source's skeleton
+    anatomy : Anatomy    that of the source's skeleton
     file : str    its name, for messages
     options : ImportOptions    facts given by the user
 
@@ -104,15 +105,15 @@ def infer_conversion(source: SourceMotion, landmarks: Landmarks, file: str, opti
     ------
     AmbiguousUnits    naming the option to set and the candidates, when the body does not decide
     """
-    body = _measure(source, landmarks, file)
+    body = _measure(source, anatomy, file)
     up_axis = _choose_up_axis(source, body, options)
     unit_scale_m = _choose_unit(source, body, options, up_axis)
     _look_for_mirroring(source, body, options, up_axis)
     return Conversion(unit_scale_m, up_axis, options.handedness, tuple(body.evidence), tuple(body.warnings))
 
 
-def _measure(source: SourceMotion, landmarks: Landmarks, file: str) -> _Measurements:
-    skeleton = source.skeleton
+def _measure(source: SourceMotion, anatomy: Anatomy, file: str) -> _Measurements:
+    skeleton, landmarks = anatomy.skeleton, anatomy.landmarks
     rest = skeleton.rest_global_positions
     positions: NDArray[np.floating[Any]] = rest[None]
     if source.rotations is not None and source.root_positions is not None:
@@ -379,7 +380,8 @@ def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: Impo
     feet, toes = body.positions[:, list(landmarks.feet)], body.positions[:, list(landmarks.toes)]
     standing = _heights(feet, up_axis).argmin(axis=1)
     frames = np.arange(len(feet))
-    expected = np.cross(up, (toes - feet)[frames, standing])
+    x, y, z = (toes - feet)[frames, standing].T
+    expected = np.stack((up[1] * z - up[2] * y, up[2] * x - up[0] * z, up[0] * y - up[1] * x), axis=1)
     scale = float(np.sum(np.linalg.norm(expected, axis=1) * np.linalg.norm(leftwards, axis=1)))
     cosine = float(np.sum(expected * leftwards)) / scale if scale > 0 else 0.0
     if cosine < _MIRRORED_COSINE:

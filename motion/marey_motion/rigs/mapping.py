@@ -211,7 +211,8 @@ def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
 def _animal_signs(skeleton: Skeleton, joints: Mapping[str, int]) -> str:
     """Describe the evidence for four legs, in words; empty for a human."""
     for index, name in enumerate(skeleton.display_names):
-        is_animal = any(word in parse_name(name).base for word in _ANIMAL_WORDS)
+        base = parse_name(name).base
+        is_animal = any(word in base for word in _ANIMAL_WORDS)
         # Hair in a pony tail grows on heads.
         if is_animal and joints.get("head") not in skeleton.path_to_root(index):
             return f"a joint such as {name} belongs to an animal"

@@ -15,13 +15,14 @@ from tests.support.motion_files import ARM, bvh
 from marey_motion import formats
 from marey_motion.documents import clip_to_document, clip_to_tree
 from marey_motion.exporting import write_clip_file
-from marey_motion.formats import write_bvh, write_predecessor_skeleton
+from marey_motion.formats import read_motion, write_bvh, write_predecessor_skeleton
 from marey_motion.formats.predecessor import clips, documents
 from marey_motion.gait import generate_gait
 from marey_motion.importing import anatomy
 from marey_motion.importing.files import import_file, mapping_part
 from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
+from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import OutputRef
 from marey_schemas.options.imports import ImportOptions
 
@@ -98,6 +99,23 @@ def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pyt
     monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
     documents_of(takes[0])
     assert documents_of(takes[1]) == alone
+
+
+def test_skeletons_are_converted_once_for_equal_joints_tips_units_and_axes() -> None:
+    bent = ARM.replace("OFFSET 0 10 0", "OFFSET 3 10 0")
+
+    def skeleton_of(hierarchy: str = bent, **options: Any) -> Skeleton:
+        given = ImportOptions(**{"unit": "cm", "up_axis": "y", **options})
+        return read_motion(bvh(hierarchy=hierarchy), "arm.bvh", options=given).skeleton
+
+    first = skeleton_of()
+    assert skeleton_of() is first
+    assert first.offsets[1].tolist() == pytest.approx([0.03, 0.1, 0.0])
+    assert skeleton_of(handedness="left").offsets[1].tolist() == pytest.approx([-0.03, 0.1, 0.0])
+    assert skeleton_of(up_axis="z").offsets[1].tolist() == pytest.approx([0.03, 0.0, -0.1])
+    assert skeleton_of(unit="m").offsets[1].tolist() == pytest.approx([3.0, 10.0, 0.0])
+    longer = skeleton_of(bent.replace("OFFSET 0 5 0", "OFFSET 0 7 0"))
+    assert [one.end_sites[0].offset[1] for one in (first, longer)] == pytest.approx([0.05, 0.07])
 
 
 def test_a_clip_becomes_the_same_document_without_the_schemas_objects() -> None:

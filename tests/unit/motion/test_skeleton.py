@@ -83,6 +83,21 @@ def test_the_rest_pose_turns_with_the_rest_rotations():
     np.testing.assert_allclose(skeleton.rest_global_positions, [[0, 1, 0], [-0.5, 1, 0], [-0.5, 0.6, 0]], atol=1e-15)
 
 
+def test_the_rest_pose_is_to_the_bit_that_of_the_arithmetic_of_quaternions():
+    rng = np.random.default_rng(5)
+    parents = [-1, *(int(rng.integers(joint)) for joint in range(1, 40))]
+    rest = quaternions.normalise(rng.normal(size=(40, 4)))
+    skeleton = Skeleton(tuple(map(str, range(40))), parents, rng.normal(size=(40, 3)), rest)
+
+    turns, points = rest.copy(), skeleton.offsets.copy()
+    for joint, parent in enumerate(parents[1:], start=1):
+        turns[joint] = quaternions.multiply(turns[parent], turns[joint])
+        points[joint] = points[parent] + quaternions.rotate_vectors(turns[parent], points[joint])
+
+    assert skeleton.rest_global_rotations.tobytes() == turns.tobytes()
+    assert skeleton.rest_global_positions.tobytes() == points.tobytes()
+
+
 def test_the_same_content_is_the_same_hierarchy_whatever_the_display_names_or_the_quaternion_signs():
     skeleton = chain()
 
