@@ -88,8 +88,8 @@ class BlobBackingContract:
         assert store.read(blobs.read_blob, digest_of(b"never")) == b"never"
 
     def test_a_full_disk_refuses_the_bytes_and_leaves_nothing(self, store, backing, monkeypatch):
-        def fill_up(self, connection, digest, chunks):
-            next(iter(chunks))
+        def fill_up(self, connection, contents):
+            next(iter(next(iter(contents.values()))))
             raise OSError(28, "No space left on device")
 
         with monkeypatch.context() as full:
@@ -182,7 +182,7 @@ class TestDirectoryBlobs(BlobBackingContract):
             raise RuntimeError("cut off")
 
         with pytest.raises(RuntimeError):
-            store.write(lambda tx: tx.blobs.write(tx.connection, digest_of(b"x"), broken()))
+            store.write(lambda tx: tx.blobs.write(tx.connection, {digest_of(b"x"): broken()}))
         assert list(backing.stray_digests(older_than_s=-10)) == []
         assert list((backing.root / "incoming").iterdir()) == []
 

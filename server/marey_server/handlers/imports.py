@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import BadRequestProblem, InvalidProblem, TooLargeProblem
+from marey_server.errors import BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
 from marey_server.http.declarations import MIB, Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
@@ -190,7 +190,9 @@ class ProjectImports(Resource):
     async def _with_bytes(self, file: SourceFile) -> SourceFile:
         if file.content is not None:
             return file
-        data = await self.look_up(blobs.read_range, file.digest, 0, file.size_bytes)
+        data = await self.look_up(blobs.read_blob, file.digest, 0, file.size_bytes)  # allowed when it was looked up
+        if len(data) != file.size_bytes:
+            raise NotFoundProblem(f"The blob {file.digest} is no longer stored; send it again.")
         return SourceFile(file.name, file.digest, file.size_bytes, data)
 
     def on_finish(self) -> None:
@@ -218,7 +220,8 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
 
 def _stored_files(tx: Transaction, request: ImportRequest) -> list[SourceFile]:
     """Return files named by digest. Raises `NotFoundProblem` if the caller may not read one."""
-    return [SourceFile(file.name, file.blob, blobs.require_readable(tx, file.blob), None) for file in request.files]
+    sizes = blobs.sizes_of_readable(tx, [file.blob for file in request.files])
+    return [SourceFile(file.name, file.blob, sizes[file.blob], None) for file in request.files]
 
 
 RESOURCES: tuple[type[Resource], ...] = (ProjectImports,)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -167,27 +168,49 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
     A file that cannot be stored is refused and does not affect others.
     """
     row = projects.require(tx, project)
-    entries = []
-    for file in files:
-        if file.entry is not None:
-            entries.append(file.entry)
-            continue
+    entries: list[ImportEntry] = []
+    for together in _runs(files):
         try:
             with tx.connection.begin_nested():
-                entries.append(_entry(file, _publish(tx, row, project, file)))
+                entries += _publish(tx, row, together)
         except ApiProblem as error:
             if error.status in REFUSED_ALTOGETHER:
                 raise
-            entries.append(_refused(file.name, error))
+            entries += [_publish_alone(tx, row, file) for file in together]
     return entries
 
 
-def _publish(tx: Transaction, row: ProjectRow, project: str, file: PreparedImport) -> list[Published]:
-    drafts = file.drafts if file.graph is None else (graph_draft(tx, project, file.graph),)
-    for source in file.sources:
-        if source.content is not None:
-            blobs.put_blob(tx, source.content, expected=source.digest)
-    return items.publish(tx, row, drafts, author_id=tx.principal.user_id)
+def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
+    """Split files into runs that are published together; a graph is one by itself, since it names models before it."""
+    for is_graph, run in itertools.groupby(files, lambda file: file.graph is not None):
+        if is_graph:
+            yield from ([file] for file in run)
+        else:
+            yield list(run)
+
+
+def _publish_alone(tx: Transaction, row: ProjectRow, file: PreparedImport) -> ImportEntry:
+    try:
+        with tx.connection.begin_nested():
+            return _publish(tx, row, [file])[0]
+    except ApiProblem as error:
+        if error.status in REFUSED_ALTOGETHER:
+            raise
+        return _refused(file.name, error)
+
+
+def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) -> list[ImportEntry]:
+    drafts: dict[str, tuple[Draft, ...]] = {}
+    for file in files:
+        if file.entry is None:
+            drafts[file.name] = file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),)
+            for source in file.sources:
+                if source.content is not None:
+                    blobs.put_blob(tx, source.content, expected=source.digest)
+    every = [draft for some in drafts.values() for draft in some]
+    published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id))
+    made = {name: [next(published) for _ in some] for name, some in drafts.items()}
+    return [file.entry or _entry(file, made[file.name]) for file in files]
 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:

@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from sqlalchemy import Connection, bindparam, delete, insert, select
 
@@ -20,13 +20,15 @@ from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import blob_chunk
 
 CHUNK_BYTES = 2**20
+BYTES_PER_STATEMENT = 4 * CHUNK_BYTES
+"""Size in bytes of the rows that are inserted with one statement."""
 
 
 class BlobBacking(Protocol):
     """Interface of a place that stores the bytes of blobs."""
 
-    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
-        """Store the bytes of a blob, given in pieces of `CHUNK_BYTES` of which the last may be shorter."""
+    def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
+        """Store the bytes of blobs, given by digest in pieces of `CHUNK_BYTES` of which the last may be shorter."""
         ...
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
@@ -57,13 +59,22 @@ _CHUNK = Prepared(
 )
 
 
+_INSERT_CHUNK = Prepared(insert(blob_chunk))
+
+
 class DatabaseBlobs:
     """Blobs stored in the database, in rows of 1 MiB."""
 
-    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:
-        """Store the bytes of a blob in rows of 1 MiB."""
-        for position, chunk in enumerate(chunks):
-            connection.execute(insert(blob_chunk), {"digest": digest, "position": position, "data": chunk})
+    def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
+        """Store the bytes of blobs in rows of 1 MiB, several rows with one statement."""
+        rows: list[dict[str, Any]] = []
+        for digest, chunks in contents.items():
+            for position, chunk in enumerate(chunks):
+                rows.append({"digest": digest, "position": position, "data": chunk})
+                if sum(len(row["data"]) for row in rows) >= BYTES_PER_STATEMENT:
+                    _INSERT_CHUNK.run_each(connection, rows)
+                    rows = []
+        _INSERT_CHUNK.run_each(connection, rows)
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield bytes `start` to `stop` of a blob."""
@@ -102,8 +113,12 @@ class DirectoryBlobs:
         digits = digest.removeprefix("sha256:")
         return self.root / digits[:2] / digits[2:]
 
-    def write(self, connection: Connection, digest: str, chunks: Iterable[bytes]) -> None:  # noqa: ARG002
+    def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:  # noqa: ARG002
         """Write the file of a blob, and replace a file that a rolled-back transaction left under its name."""
+        for digest, chunks in contents.items():
+            self._write(digest, chunks)
+
+    def _write(self, digest: str, chunks: Iterable[bytes]) -> None:
         path = self._path(digest)
         path.parent.mkdir(exist_ok=True)
         handle, name = tempfile.mkstemp(dir=self._incoming)

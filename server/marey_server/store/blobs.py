@@ -7,8 +7,9 @@ from __future__ import annotations
 import hashlib
 import itertools
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from types import TracebackType
 from typing import Any, Self
 
@@ -111,7 +112,7 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
         raise InvalidProblem(
             f"The bytes are {digest}, not {expected}: they were changed in transit.", code="digest-mismatch"
         )
-    store_blob(tx, digest, content)
+    store_blobs(tx, {digest: content})
     add_holder(tx, digest)
     faults.point("blob.put.before_commit")
     tx.after_commit(lambda: faults.point("blob.put.after_commit"))
@@ -126,12 +127,18 @@ def require_sender(principal: Principal) -> None:
         raise ForbiddenProblem("This token may not write.", code="insufficient-scope")
 
 
-def store_blob(tx: Transaction, digest: str, content: bytes | Spool | Pieces) -> None:
-    """Store bytes under their digest; if they are stored already, only renew their age."""
-    size_bytes = len(content) if isinstance(content, bytes) else content.size_bytes
-    row = {"digest": digest, "size_bytes": size_bytes, "created_us": tx.now_us}
-    if insert_new(tx, blob, row):
-        tx.blobs.write(tx.connection, digest, _chunks(content))
+def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool | Pieces]) -> None:
+    """Store bytes under their digests, once; bytes that are there already count as new again."""
+    rows = [
+        {"digest": digest, "size_bytes": _size_bytes(content), "created_us": tx.now_us}
+        for digest, content in contents.items()
+    ]
+    new = insert_new(tx, blob, rows)
+    tx.blobs.write(tx.connection, {digest: _chunks(contents[digest]) for digest in contents if digest in new})
+
+
+def _size_bytes(content: bytes | Spool | Pieces) -> int:
+    return len(content) if isinstance(content, bytes) else content.size_bytes
 
 
 def _chunks(content: bytes | Spool | Pieces) -> Iterable[bytes]:
@@ -142,18 +149,34 @@ def _chunks(content: bytes | Spool | Pieces) -> Iterable[bytes]:
     return (content[start : start + CHUNK_BYTES] for start in range(0, len(content), CHUNK_BYTES))
 
 
-def insert_new(tx: Transaction, table: Table, row: dict[str, Any]) -> bool:
-    """Insert a row keyed by `digest`, or renew the age of the existing row; return whether the row is new.
+def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) -> set[str]:
+    """Insert rows keyed by `digest`, or renew the age of existing rows; return the digests of the new ones.
 
-    Either way the row is locked until the transaction ends, so that garbage collection cannot delete it.
+    Either way the rows are locked until the transaction ends, so that garbage collection cannot take them.
     """
-    added = tx.insert_or_ignore(table, row).returning(table.c.digest)
-    renew = update(table).where(table.c.digest == row["digest"]).values(created_us=tx.now_us)
-    while True:
-        if tx.execute(added).first() is not None:
-            return True
-        if tx.execute(renew).rowcount:
-            return False
+    new: set[str] = set()
+    added = tx.insert_or_ignore(table).returning(table.c.digest)
+    waiting = {row["digest"]: row for row in sorted(rows, key=itemgetter("digest"))}
+    while waiting:
+        for some in _batched(list(waiting)):
+            made = set(tx.execute(added, [waiting[digest] for digest in some]).scalars())
+            new |= made
+            for digest in made | _renew(tx, table, set(some) - made):
+                del waiting[digest]
+    return new
+
+
+def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
+    """Renew the age of rows and lock them; return the digests of the rows that exist."""
+    there: set[str] = set()
+    for some in _batched(sorted(digests)):
+        chosen = table.c.digest.in_(some)
+        if tx.is_postgres:  # in one order, so that no two writes wait for each other
+            rows = select(table.c.digest).where(chosen).order_by(table.c.digest)
+            tx.execute(rows.with_for_update(key_share=True))
+        renewed = update(table).where(chosen).values(created_us=tx.now_us).returning(table.c.digest)
+        there.update(tx.execute(renewed).scalars())
+    return there
 
 
 def add_holder(tx: Transaction, digest: str) -> None:
@@ -166,9 +189,7 @@ def add_holder(tx: Transaction, digest: str) -> None:
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
     """Return those of `digests` that the caller may refer to, locked against deletion until the end of this write."""
-    allowed = sorted(readable(tx, digests))
-    renew = update(blob).values(created_us=tx.now_us).returning(blob.c.digest)
-    return {digest for digest in allowed if tx.execute(renew.where(blob.c.digest == digest)).first() is not None}
+    return _renew(tx, blob, readable(tx, digests))
 
 
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
@@ -194,7 +215,9 @@ def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> 
 
 def readable(tx: Transaction, digests: Iterable[str]) -> set[str]:
     """Return those of `digests` that are stored and that the caller may read or refer to."""
-    return _held(tx, digests, since_us=0) | _referenced(tx, digests)
+    wanted = set(digests)
+    held = _held(tx, wanted, since_us=0)
+    return held | _referenced(tx, wanted - held)
 
 
 def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
@@ -207,10 +230,20 @@ def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
 
 def require_readable(tx: Transaction, digest: str) -> int:
     """Return the size of a blob in bytes. Raises `NotFoundProblem` if the caller may not read such a blob."""
-    size = tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar()
-    if size is None or not readable(tx, [digest]):
-        raise NotFoundProblem(f"There is no blob {digest} that you may read.")
-    return int(size)
+    return sizes_of_readable(tx, [digest])[digest]
+
+
+def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, int]:
+    """Sizes of blobs in bytes, by digest. Raises `NotFoundProblem` where there is one that the caller may not read."""
+    allowed = readable(tx, digests)
+    sizes: dict[str, int] = {}
+    for some in _batched(allowed):
+        rows = tx.execute(select(blob.c.digest, blob.c.size_bytes).where(blob.c.digest.in_(some)))
+        sizes.update((row.digest, row.size_bytes) for row in rows)
+    for digest in digests:
+        if digest not in sizes:
+            raise NotFoundProblem(f"There is no blob {digest} that you may read.")
+    return sizes
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:

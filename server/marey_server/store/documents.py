@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -93,8 +93,12 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
 
 def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
     """Return the document with another body and the same arrays and files."""
-    canonical = canonical_json(body)
-    return replace(content, digest=blobs.digest_of(canonical), body=body)
+    return replace(content, digest=digest_of_body(body), body=body)
+
+
+def digest_of_body(body: Tree) -> str:
+    """Return the digest of the document with this text, which has references in place of arrays."""
+    return blobs.digest_of(canonical_json(body))
 
 
 def _check(tree: Any, schema: str | None) -> str:
@@ -171,54 +175,78 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
     Raises `ConflictProblem` (`missing-blobs`) if it names blobs that the caller has not sent and may not read.
     """
     ready = prepared(content, schema=schema)
-    if ready.files:
-        _require_files(tx, ready.files)
-    row = {
-        "digest": ready.digest,
-        "schema": ready.schema,
-        "body": ready.body,
-        "size_bytes": ready.size_bytes,
-        "created_us": tx.now_us,
-    }
-    if blobs.insert_new(tx, document, row):
-        held = {pointer: digest for pointer, (digest, _data) in ready.arrays.items()}
-        for digest, data in sorted(dict(ready.arrays.values()).items()):
-            blobs.store_blob(tx, digest, data)
-        _refer(tx, ready.digest, held | ready.files)
+    store_documents(tx, [ready])
     return ready.digest
 
 
-def store_variant(tx: Transaction, digest: str, body: Tree) -> str:
-    """Store a document with the arrays and files of another one and the text `body`; return its digest."""
-    original = tx.execute(select(document.c.schema, document.c.size_bytes).where(document.c.digest == digest)).one()
-    row = {
-        "digest": blobs.digest_of(canonical_json(body)),
-        "schema": original.schema,
-        "body": body,
-        "size_bytes": original.size_bytes,
-        "created_us": tx.now_us,
-    }
-    if blobs.insert_new(tx, document, row):
-        statement = select(document_blob.c.pointer, document_blob.c.blob_digest)
-        held = tx.execute(statement.where(document_blob.c.document_digest == digest)).all()
-        _refer(tx, row["digest"], {found.pointer: found.blob_digest for found in held})
-    return str(row["digest"])
+def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> None:
+    """Store documents as `store_document` does, all with the same few statements."""
+    by_digest = {one.digest: one for one in contents}
+    _require_files(tx, by_digest.values())
+    rows = [
+        {
+            "digest": one.digest,
+            "schema": one.schema,
+            "body": one.body,
+            "size_bytes": one.size_bytes,
+            "created_us": tx.now_us,
+        }
+        for one in by_digest.values()
+    ]
+    new = blobs.insert_new(tx, document, rows)
+    added = [one for one in by_digest.values() if one.digest in new]
+    blobs.store_blobs(tx, {digest: data for one in added for digest, data in one.arrays.values()})
+    _refer(
+        tx,
+        [
+            (one.digest, pointer, digest)
+            for one in added
+            for pointer, digest in [*((at, digest) for at, (digest, _data) in one.arrays.items()), *one.files.items()]
+        ],
+    )
 
 
-def _require_files(tx: Transaction, files: Mapping[str, str]) -> None:
-    held = blobs.hold(tx, files.values())
-    lacking = {pointer: digest for pointer, digest in files.items() if digest not in held}
-    if lacking:
-        errors = [FieldError(pointer=at, code="missing-blob", detail=digest) for at, digest in lacking.items()]
-        raise blobs.missing_blobs(lacking.values(), errors)
+def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
+    """Store documents with the arrays and files of others, given by digest, and other text."""
+    if not variants:
+        return
+    digests = [digest_of_body(body) for _, body in variants]
+    of_originals = sorted({original for original, _ in variants})
+    columns = (document.c.digest, document.c.schema, document.c.size_bytes)
+    originals = {row.digest: row for row in tx.execute(select(*columns).where(document.c.digest.in_(of_originals)))}
+    rows = [
+        {
+            "digest": digest,
+            "schema": originals[original].schema,
+            "body": body,
+            "size_bytes": originals[original].size_bytes,
+            "created_us": tx.now_us,
+        }
+        for digest, (original, body) in zip(digests, variants, strict=True)
+    ]
+    new = blobs.insert_new(tx, document, rows)
+    added = {digest: original for digest, (original, _) in zip(digests, variants, strict=True) if digest in new}
+    held: dict[str, list[tuple[str, str]]] = {}
+    for row in tx.execute(select(document_blob).where(document_blob.c.document_digest.in_(sorted(added.values())))):
+        held.setdefault(row.document_digest, []).append((row.pointer, row.blob_digest))
+    _refer(tx, [(digest, *place) for digest, original in added.items() for place in held.get(original, ())])
 
 
-def _refer(tx: Transaction, digest: str, held: Mapping[str, str]) -> None:
-    if held:
-        rows = [
-            {"document_digest": digest, "pointer": pointer, "blob_digest": blob_digest}
-            for pointer, blob_digest in held.items()
-        ]
+def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> None:
+    naming = [one.files for one in contents if one.files]
+    held = blobs.hold(tx, {digest for files in naming for digest in files.values()}) if naming else set()
+    for files in naming:
+        lacking = {pointer: digest for pointer, digest in files.items() if digest not in held}
+        if lacking:
+            errors = [FieldError(pointer=at, code="missing-blob", detail=digest) for at, digest in lacking.items()]
+            raise blobs.missing_blobs(lacking.values(), errors)
+
+
+def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
+    """Record which blobs documents hold: digest of the document, JSON Pointer, digest of the blob."""
+    columns = ("document_digest", "pointer", "blob_digest")
+    rows = [dict(zip(columns, one, strict=True)) for one in references]
+    if rows:
         tx.execute(insert(document_blob), rows)
 
 
@@ -257,9 +285,12 @@ def load_body(tx: Transaction, digest: str) -> Tree:
 
 def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
     """Load documents by digest, with references in place of their arrays."""
-    if not digests:
-        return {}
-    bodies = {row.digest: dict(row.body) for row in tx.run(_BODIES, {"digests": padded(digests)})}
+    wanted = list(digests)
+    bodies = {
+        row.digest: dict(row.body)
+        for start in range(0, len(wanted), blobs.IN_LIST)
+        for row in tx.run(_BODIES, {"digests": padded(wanted[start : start + blobs.IN_LIST])})
+    }
     if missing := [digest for digest in digests if digest not in bodies]:
         raise NotFoundProblem(f"There is no document {missing[0]}.")
     return bodies

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import sqlalchemy
@@ -15,6 +15,14 @@ from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.database.clock import Clock
 from marey_server.store.database.prepared import Prepared
+
+Event = tuple[str, str | None, str, dict[str, Any]]
+"""Kind of an event, project id, id of its subject, and body."""
+
+_INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
+_INSERT_EVENT_WITH_XID = Prepared(
+    sqlalchemy.insert(tables.event).values(xid=sqlalchemy.text("pg_current_xact_id()::text::bigint"))
+)
 
 
 class Transaction:
@@ -85,19 +93,16 @@ class Transaction:
 
     def emit(self, kind: str, subject: str, *, project_id: str | None = None, **body: Any) -> None:
         """Record an event, which becomes visible when the transaction commits."""
-        row: dict[str, Any] = {
-            "at_us": self.now_us,
-            "project_id": project_id,
-            "kind": kind,
-            "subject": subject,
-            "actor": self.principal.actor,
-            "body": body,
-        }
-        if self.is_postgres:
-            row["xid"] = sqlalchemy.text("pg_current_xact_id()::text::bigint")
-            self.execute(sqlalchemy.insert(tables.event).values(**row))
-        else:
-            self.execute(sqlalchemy.insert(tables.event), row)
+        self.emit_each([(kind, project_id, subject, body)])
+
+    def emit_each(self, events: Iterable[Event]) -> None:
+        """Record events in this order, visible when the transaction commits."""
+        common = {"at_us": self.now_us, "actor": self.principal.actor}
+        rows = [
+            {**common, "kind": kind, "project_id": project_id, "subject": subject, "body": body}
+            for kind, project_id, subject, body in events
+        ]
+        self.run_each(_INSERT_EVENT_WITH_XID if self.is_postgres else _INSERT_EVENT, rows)
 
     def after_commit(self, action: Callable[[], None]) -> None:
         """Run `action` after the transaction has committed, but not if it rolls back."""

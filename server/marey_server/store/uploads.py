@@ -108,7 +108,7 @@ def finish(tx: Transaction, upload_id: str) -> str:
     claimed = update(upload).where(upload.c.id == upload_id, upload.c.finished_digest.is_(None))
     if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount == 0:
         return digest
-    blobs.store_blob(tx, digest, blobs.Pieces(found.length, lambda: _even(_pieces(tx, upload_id))))
+    blobs.store_blobs(tx, {digest: blobs.Pieces(found.length, lambda: _even(_pieces(tx, upload_id)))})
     blobs.add_holder(tx, digest)
     tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id == upload_id))
     return digest

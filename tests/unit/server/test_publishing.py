@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sqlalchemy import event
 from tests.support.predecessor_models import imported
 from tests.support.store_fixtures import motion_tree, skeleton_tree
 from tests.support.tiers import examples
@@ -12,7 +13,8 @@ from tests.support.tiers import examples
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import documents, items, projects
-from marey_server.store.items import Draft, StoredDocument, references
+from marey_server.store.database import prepared
+from marey_server.store.items import Draft, StoredDocument, publishing, references
 
 
 def publish(lab, *drafts, **kwargs):
@@ -100,6 +102,108 @@ def test_names_within_a_batch_are_unique(lab):
 def test_drafts_with_one_target_become_its_revisions_in_order(lab):
     drafts = [Draft(f"d{i}", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree(bone_m=i + 1)}) for i in range(3)]
     assert [(one.revision, one.created) for one in publish(lab, *drafts)] == [(1, True), (2, True), (3, True)]
+
+
+def test_drafts_of_one_name_keep_their_order_where_they_refer_to_others(lab):
+    later = Draft("later", Kind.CLIP, "walk", {"motion": motion_tree({"output": "rig"}, frames=9)}, collection="raw")
+    clip, _, second = publish(lab, clip_draft(), rig_draft(), later)
+    assert (clip.revision, second.revision, second.item) == (1, 2, clip.item)
+
+
+def test_equal_content_within_a_batch_is_one_item(lab):
+    rigs = publish(lab, rig_draft("a"), rig_draft("b", bone_m=0.7), rig_draft("c"))
+    assert rigs[0].item == rigs[2].item != rigs[1].item
+    assert [one.created for one in rigs] == [True, True, False]
+    assert [one.name for one in listed(lab, Kind.SKELETON)] == ["a", "b"]
+
+
+def test_other_content_under_one_name_within_a_batch_is_numbered_in_order(lab):
+    rigs = [replace(rig_draft(f"file {i}", bone_m=0.5 + i % 3), item_name="rig") for i in range(5)]
+    made = publish(lab, *rigs)
+    assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig-2", "rig-3"]
+    assert [one.id for one in listed(lab, Kind.SKELETON)] == [one.item for one in made[:3]]
+    assert [one.item for one in made[3:]] == [one.item for one in made[:2]]
+
+
+def test_ids_of_a_batch_are_in_the_order_of_its_drafts(lab):
+    made = publish(lab, rig_draft(), *(clip_draft(f"walk {number}", seed=number) for number in range(20)))
+    assert sorted(one.item for one in made[1:]) == [one.item for one in made[1:]]
+
+
+@pytest.fixture
+def statements(lab, monkeypatch):
+    """The statements that were run, those with many sets of values once."""
+    run: list[str] = []
+    event.listen(lab.database.engine, "before_cursor_execute", lambda *given: run.append(given[2]))
+    straight = prepared._run
+
+    def recorded(connection, text, *args, **kwargs):
+        run.append(text)
+        return straight(connection, text, *args, **kwargs)
+
+    monkeypatch.setattr(prepared, "_run", recorded)
+    return run
+
+
+def batch_of(count, *, start=0, name="walk"):
+    """Drafts of a skeleton, and of clips with a source each."""
+    drafts = [replace(rig_draft(), item_name=f"rig of {name}")]
+    for number in range(start, start + count):
+        drafts += [clip_draft(f"{name} {number}", seed=number)]
+    return drafts
+
+
+def count_statements(lab, statements, *drafts, **kwargs):
+    statements.clear()
+    publish(lab, *drafts, **kwargs)
+    return len(statements)
+
+
+def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab, statements):
+    publish(lab, *batch_of(1))
+    few = count_statements(lab, statements, *batch_of(2, start=10))
+    many = count_statements(lab, statements, *batch_of(60, start=20))
+    assert many == few
+    assert len(listed(lab, Kind.CLIP)) == 50  # a page
+
+
+def test_staged_documents_of_a_large_batch_are_published_with_the_statements_of_a_small_one(lab, statements):
+    rig, *_ = publish(lab, rig_draft())
+
+    def staged(start, count):
+        def store(tx):
+            trees = [motion_tree({"output": "rig"}, seed=number) for number in range(start, start + count)]
+            return [documents.store_document(tx, tree) for tree in trees]
+
+        digests = lab.write(store)
+        source = {"skeleton": [(rig.item, 1)]}
+        return [
+            Draft(digest, Kind.CLIP, f"walk {start} {place}", {"motion": StoredDocument(digest)}, sources=source)
+            for place, digest in enumerate(digests)
+        ]
+
+    few = count_statements(lab, statements, rig_draft(), *staged(0, 2))
+    many = count_statements(lab, statements, rig_draft(), *staged(100, 40))
+    assert many == few
+
+
+def test_a_failure_in_the_middle_of_a_batch_leaves_nothing(lab, monkeypatch):
+    def fail(*_args, **_kwargs):
+        raise RuntimeError("cut off")
+
+    monkeypatch.setattr(publishing, "write_revisions", fail)
+    with pytest.raises(RuntimeError, match="cut off"):
+        publish(lab, *batch_of(5))
+    with lab.database.engine.connect() as connection:
+        for table in ("document", "blob", "blob_chunk", "collection", "item", "revision"):
+            assert connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar() == 0
+
+
+def test_a_batch_larger_than_one_statement_takes_is_published_whole(lab, monkeypatch):
+    monkeypatch.setattr(publishing, "DRAFTS_TOGETHER", 3)
+    made = publish(lab, *batch_of(10))
+    assert [one.created for one in made] == [True] * 11
+    assert len({one.item for one in made}) == 11
 
 
 def test_staged_documents_with_references_keep_their_arrays(lab):

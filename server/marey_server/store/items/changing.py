@@ -17,7 +17,13 @@ from marey_server.store.items.drafts import Draft
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import find_item, no_item, shown_items
 from marey_server.store.items.references import ReferenceCheck
-from marey_server.store.items.revisions import emit_item, read_part_digests, write_head, write_revision
+from marey_server.store.items.revisions import (
+    NewRevision,
+    emit_item,
+    read_part_digests,
+    write_head,
+    write_revisions,
+)
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
@@ -80,12 +86,13 @@ def put_part(
     digest = documents.store_document(tx, prepared)
     ReferenceCheck(tx, project_row).require(kind, {part: prepared.body})
     while is_expected(found.rev, expected_rev):
-        parts = read_part_digests(tx, item_id, found.head)
+        parts = read_part_digests(tx, [(item_id, found.head)])[item_id, found.head]
         if parts.get(part) == digest:
             return _shown(tx, project_row, kind, item_id)
         parts[part] = digest
         if write_head(tx, kind, item_id, parts, {part: prepared.body}, item.c.rev == found.rev):
-            write_revision(tx, item_id, found.head + 1, parts, tx.principal.user_id, message, None)
+            made = NewRevision(item_id, found.head + 1, parts, message)
+            write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
             shown = _shown(tx, project_row, kind, item_id)
             emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
             return shown

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import and_, insert, select
+from sqlalchemy import Row, and_, insert, select
 
 from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
@@ -17,13 +18,16 @@ from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
-from marey_server.store.items.revisions import read_part_digests, write_head, write_revision
+from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
 
 Tree = dict[str, Any]
+
+DRAFTS_TOGETHER = 256
+"""Greatest number of drafts that are published with the same statements."""
 
 _RACES = 20
 """Number of attempts to publish while concurrent writes are faster."""
@@ -48,39 +52,94 @@ def publish(
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
         raise InvalidProblem("Two results of the request have the same name.", code="duplicate-output")
-    loaded = {name: _load_parts(tx, draft) for name, draft in by_name.items()}
-    refers = {
-        name: [found for part in parts.values() for found in references.outputs_in(part.body)]
-        for name, parts in loaded.items()
-    }
     publication = _Publication(tx, project_row, author_id, job_id)
-    for name in references.in_order(refers):
-        publication.add(by_name[name], loaded[name], resolve=bool(refers[name]))
+    for together in _in_turns(_load_parts(tx, drafts)):
+        publication.add(together)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts]
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Part of a draft: its body, and the source of its document."""
+class _Loaded:
+    """A draft with the bodies of its parts, in the order of its kind's parts, and the drafts that these refer to."""
 
-    body: Tree
-    content: PreparedDocument | StoredDocument
+    draft: Draft
+    bodies: Mapping[str, Tree]
+    contents: Mapping[str, PreparedDocument | StoredDocument]
+    refers: Sequence[str]
 
 
-def _load_parts(tx: Transaction, draft: Draft) -> dict[str, _Part]:
+def _load_parts(tx: Transaction, drafts: Sequence[Draft]) -> list[_Loaded]:
+    contents = [_contents(draft) for draft in drafts]
+    stored = {one.digest for parts in contents for one in parts.values() if isinstance(one, StoredDocument)}
+    loaded = documents.load_bodies(tx, stored)
+
+    def body(content: PreparedDocument | StoredDocument) -> Tree:
+        return content.body if isinstance(content, PreparedDocument) else loaded[content.digest]
+
+    answer = []
+    for draft, parts in zip(drafts, contents, strict=True):
+        bodies = {
+            part: loaded[one.digest] if isinstance(one, StoredDocument) else one.body for part, one in parts.items()
+        }
+        refers = [name for tree in bodies.values() for name in references.outputs_in(tree)]
+        answer.append(_Loaded(draft, bodies, parts, refers))
+    return answer
+
+
+def _contents(draft: Draft) -> dict[str, PreparedDocument | StoredDocument]:
     specs = PARTS[draft.kind]
-    loaded = {}
-    for part, content in draft.parts.items():
-        if part not in specs:
-            raise InvalidProblem(f"A {draft.kind} has no part {part!r}; it has {', '.join(specs)}.", code="no-part")
-        if isinstance(content, StoredDocument):
-            loaded[part] = _Part(documents.load_body(tx, content.digest), content)
-        else:
-            prepared = documents.prepared(content, schema=specs[part].schema)
-            loaded[part] = _Part(prepared.body, prepared)
-    return loaded
+    if unknown := [part for part in draft.parts if part not in specs]:
+        raise InvalidProblem(f"A {draft.kind} has no part {unknown[0]!r}; it has {', '.join(specs)}.", code="no-part")
+    given = {part: draft.parts[part] for part in specs if part in draft.parts}
+    return {
+        part: content if isinstance(content, StoredDocument) else documents.prepared(content, schema=specs[part].schema)
+        for part, content in given.items()
+    }
+
+
+def _in_turns(loaded: Sequence[_Loaded]) -> Iterator[list[_Loaded]]:
+    """Split drafts into groups that can be published together: of one kind, found in one way, at different places, and
+    after all that they refer to. Drafts with the same place keep their order.
+    """
+    by_name = {one.draft.name_in_batch: one for one in loaded}
+    turns: dict[str, int] = {}
+    next_turns: dict[Hashable, int] = {}
+    groups: defaultdict[tuple[int, Kind, str], list[_Loaded]] = defaultdict(list)
+    for name in references.in_order({name: one.refers for name, one in by_name.items()}):
+        one = by_name[name]
+        draft = one.draft
+        place = (draft.kind, draft.collection, draft.item_name, name if draft.reuse == "by_content" else None)
+        turn = max([turns[other] + 1 for other in one.refers if other in turns], default=0)
+        turns[name] = turn = max(turn, next_turns.get(place, 0))
+        next_turns[place] = turn + 1
+        groups[turn, draft.kind, draft.reuse].append(one)
+    for _, group in sorted(groups.items(), key=lambda named: named[0][0]):
+        for start in range(0, len(group), DRAFTS_TOGETHER):
+            yield group[start : start + DRAFTS_TOGETHER]
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A draft whose documents are stored."""
+
+    draft: Draft
+    digests: Mapping[str, str]
+    bodies: Mapping[str, Tree]
+
+    @property
+    def required(self) -> tuple[str | None, ...]:
+        """Digests of the parts that every item of the kind has."""
+        return tuple(self.digests.get(part) for part in _required(self.draft.kind))
+
+    def published(self, item_id: str, number: int, *, created: bool) -> Published:
+        """Return the revision that the draft has become."""
+        return Published(self.draft.name_in_batch, item_id, self.draft.kind, number, created)
+
+
+def _required(kind: Kind) -> list[str]:
+    return [part for part, spec in PARTS[kind].items() if spec.required]
 
 
 @dataclass(frozen=True)
@@ -89,12 +148,12 @@ class _Head:
 
     id: str
     number: int
-    parts: dict[str, str]
+    parts: Mapping[str, str]
 
 
 @dataclass
 class _Publication:
-    """Publication of several drafts in one transaction, one after another."""
+    """Publication of groups of drafts, one group after another, each with the same few statements."""
 
     tx: Transaction
     project: ProjectRow
@@ -106,59 +165,100 @@ class _Publication:
     def __post_init__(self) -> None:
         self._references = references.ReferenceCheck(self.tx, self.project)
 
-    def add(self, draft: Draft, loaded: Mapping[str, _Part], *, resolve: bool) -> None:
-        digests: dict[str, str] = {}
-        bodies: dict[str, Tree] = {}
-        for part in (part for part in PARTS[draft.kind] if part in loaded):
-            held = loaded[part]
-            body = references.resolved(held.body, self.done) if resolve else held.body
-            if draft.kind is Kind.MODEL and part == "tree":
-                body = references.with_model_digest(body, digests.get("model"))
-            digests[part] = self._store(held, body)
-            bodies[part] = body
-        self._references.require(draft.kind, bodies)
+    def add(self, group: Sequence[_Loaded]) -> None:
+        """Publish drafts of one kind that are found in one way and have different places."""
+        kind, reuse = group[0].draft.kind, group[0].draft.reuse
+        waiting = self._store(group)
+        for one in waiting:
+            self._references.require(kind, one.bodies)
         for _ in range(_RACES):
-            head = self._find(draft, digests)
-            if head is None:
-                published = self._create(draft, digests, bodies)
-            elif draft.reuse == "by_content" or digests.items() <= head.parts.items():
-                published = Published(draft.name_in_batch, head.id, draft.kind, head.number, False)
-            else:
-                published = self._revise(draft, head, digests, bodies)
-            if published is not None:
-                self.done[draft.name_in_batch] = published
+            heads = self._find(waiting, kind, reuse)
+            new = [one for one in waiting if one.draft.name_in_batch not in heads]
+            self._create(self._first_of_equals(new) if reuse == "by_content" else new, kind)
+            for one in waiting:
+                head = heads.get(one.draft.name_in_batch)
+                if head is not None:
+                    self._reuse(one, head)
+            waiting = [one for one in waiting if one.draft.name_in_batch not in self.done]
+            if not waiting:
                 return
-        raise ConflictProblem(f"{draft.item_name!r} is being changed by other requests; try again.", code="contended")
+        name = waiting[0].draft.item_name
+        raise ConflictProblem(f"{name!r} is being changed by other requests; try again.", code="contended")
 
-    def _store(self, held: _Part, body: Tree) -> str:
-        changed = body != held.body
-        if isinstance(held.content, StoredDocument):
-            digest = held.content.digest
-            return documents.store_variant(self.tx, digest, body) if changed else digest
-        return documents.store_document(self.tx, documents.with_body(held.content, body) if changed else held.content)
+    def _store(self, group: Sequence[_Loaded]) -> list[_Ready]:
+        """Store the documents of drafts, with references to earlier drafts replaced by their revisions."""
+        fresh: list[PreparedDocument] = []
+        variants: list[tuple[str, Tree]] = []
+        ready = []
+        for one in group:
+            digests: dict[str, str] = {}
+            bodies: dict[str, Tree] = {}
+            for part, content in one.contents.items():
+                body = references.resolved(one.bodies[part], self.done) if one.refers else one.bodies[part]
+                if one.draft.kind is Kind.MODEL and part == "tree":
+                    body = references.with_model_digest(body, digests.get("model"))
+                changed = body != one.bodies[part]
+                digest = content.digest
+                if isinstance(content, PreparedDocument):
+                    fresh.append(documents.with_body(content, body) if changed else content)
+                    digest = fresh[-1].digest
+                elif changed:
+                    variants.append((content.digest, body))
+                    digest = documents.digest_of_body(body)
+                digests[part], bodies[part] = digest, body
+            ready.append(_Ready(one.draft, digests, bodies))
+        documents.store_documents(self.tx, fresh)
+        documents.store_variants(self.tx, variants)
+        return ready
 
     # -- finding -------------------------------------------------------------------------------------------------------
 
-    def _find(self, draft: Draft, digests: Mapping[str, str]) -> _Head | None:
-        if draft.reuse == "new":
-            return None
-        statement = select(item.c.id, item.c.head).where(
-            item.c.project_id == self.project.id, item.c.kind == draft.kind.value, item.c.deleted_us.is_(None)
-        )
-        if draft.reuse == "by_name":
-            statement = statement.where(
-                item.c.collection_id == self._collection_id(draft.collection), item.c.name == draft.item_name
+    def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
+        """Return the items that drafts add to or stand for, by the drafts' names."""
+        if reuse == "new":
+            return {}
+        found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
+        parts = read_part_digests(self.tx, {(row.id, row.head) for row in found.values()})
+        return {name: _Head(row.id, row.head, parts[row.id, row.head]) for name, row in found.items()}
+
+    def _find_places(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
+        folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
+        for one in waiting:
+            folders[self._collection_id(one.draft.collection)][one.draft.item_name] = one.draft.name_in_batch
+        found = {}
+        for collection_id, names in folders.items():
+            statement = select(item.c.id, item.c.head, item.c.name).where(
+                item.c.collection_id == collection_id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
             )
-        else:
-            self.tx.lock(f"content:{self.project.id}:{draft.kind}")
-            for part, spec in PARTS[draft.kind].items():
-                if spec.required:
-                    named = revision_part.alias(f"part_{part}")
-                    statement = statement.join(
-                        named, and_(named.c.item_id == item.c.id, named.c.number == item.c.head, named.c.part == part)
-                    ).where(named.c.document_digest == digests.get(part))
-        row = self.tx.execute(statement.order_by(item.c.id).limit(1)).first()
-        return None if row is None else _Head(row.id, row.head, read_part_digests(self.tx, row.id, row.head))
+            for row in self.tx.execute(statement.where(item.c.name.in_(list(names)))):
+                found[names[row.name]] = row
+        return found
+
+    def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
+        """Find the first item whose required parts are equal, for each draft."""
+        self.tx.lock(f"content:{self.project.id}:{kind}")
+        statement = select(item.c.id, item.c.head).where(
+            item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
+        )
+        named = []
+        for place, part in enumerate(_required(kind)):
+            held = revision_part.alias(f"part_{part}")
+            at_head = and_(held.c.item_id == item.c.id, held.c.number == item.c.head, held.c.part == part)
+            wanted = {one.required[place] for one in waiting if one.required[place] is not None}
+            statement = statement.join(held, at_head).where(held.c.document_digest.in_(sorted(wanted)))
+            named.append(held.c.document_digest.label(f"digest_{place}"))
+        rows: dict[tuple[str | None, ...], Row[Any]] = {}
+        for row in self.tx.execute(statement.add_columns(*named).order_by(item.c.id)):
+            rows.setdefault(tuple(row[2:]), row)
+        return {one.draft.name_in_batch: rows[one.required] for one in waiting if one.required in rows}
+
+    @staticmethod
+    def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
+        """Return the first of the drafts with equal content: the others find the item that it makes."""
+        firsts: dict[tuple[str | None, ...], _Ready] = {}
+        for one in new:
+            firsts.setdefault(one.required, one)
+        return list(firsts.values())
 
     def _collection_id(self, path: str) -> str:
         if path not in self._collection_ids:
@@ -167,60 +267,77 @@ class _Publication:
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
-    def _create(self, draft: Draft, digests: Mapping[str, str], bodies: Mapping[str, Tree]) -> Published | None:
-        lacking = [part for part, spec in PARTS[draft.kind].items() if spec.required and part not in digests]
-        if lacking:
-            raise InvalidProblem(f"A {draft.kind} needs the part {lacking[0]!r}.", code="part-required")
-        summary = summarise(draft.kind, bodies)
-        row = {
-            "id": new_id(draft.kind.value), "project_id": self.project.id, "kind": draft.kind.value, "head": 1,
-            "collection_id": self._collection_id(draft.collection), "created_us": self.tx.now_us,
+    def _create(self, new: Sequence[_Ready], kind: Kind) -> None:
+        """Make items; leave out those whose place was taken meanwhile. Raises where a draft asks for a new one."""
+        if not new:
+            return
+        for one in new:
+            if None in one.required:
+                lacking = _required(kind)[one.required.index(None)]
+                raise InvalidProblem(f"A {kind} needs the part {lacking!r}.", code="part-required")
+        ids = sorted(new_id(kind.value) for _ in new)  # in the order of the drafts
+        rows = {item_id: self._row(one, item_id) for item_id, one in zip(ids, new, strict=True)}
+        names = {item_id: _names(one.draft) for item_id, one in zip(ids, new, strict=True)}
+        made: set[str] = set()
+        insertion = self.tx.insert_or_ignore(item).returning(item.c.id)
+        while named := {at: name for at in ids if at not in made and (name := next(names[at], None)) is not None}:
+            given = [rows[at] | {"name": name, "name_folded": name.casefold()} for at, name in named.items()]
+            made.update(self.tx.execute(insertion, given).scalars())
+        self._write(
+            "item.created", [(one, _Head(at, 1, one.digests)) for at, one in zip(ids, new, strict=True) if at in made]
+        )
+        for one in new:
+            if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
+                place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
+                raise ConflictProblem(f"There is a {kind} {place!r} already.", code="name-taken")
+
+    def _row(self, one: _Ready, item_id: str) -> dict[str, Any]:
+        summary = summarise(one.draft.kind, one.bodies)
+        return {
+            "id": item_id, "project_id": self.project.id, "kind": one.draft.kind.value, "head": 1,
+            "collection_id": self._collection_id(one.draft.collection), "created_us": self.tx.now_us,
             "updated_us": self.tx.now_us, "summary": summary.shown, "frames": summary.frames,
             "skeleton_id": summary.skeleton_id,
         }  # fmt: skip
-        for name in _names(draft):
-            named = row | {"name": name, "name_folded": name.casefold()}
-            made = self.tx.execute(self.tx.insert_or_ignore(item, named).returning(item.c.id)).scalar()
-            if made is not None:
-                self._write_revision(draft, made, 1, digests)
-                self._emit("item.created", draft, made, 1)
-                return Published(draft.name_in_batch, made, draft.kind, 1, True)
-        if draft.reuse == "new":
-            place = f"{draft.collection}/{draft.item_name}" if draft.collection else draft.item_name
-            raise ConflictProblem(f"There is a {draft.kind} {place!r} already.", code="name-taken")
-        return None
 
-    def _revise(
-        self, draft: Draft, head: _Head, digests: Mapping[str, str], bodies: Mapping[str, Tree]
-    ) -> Published | None:
-        parts = {**head.parts, **digests}
-        if not write_head(self.tx, draft.kind, head.id, parts, bodies, item.c.head == head.number):
-            return None
-        self._write_revision(draft, head.id, head.number + 1, parts)
-        self._emit("item.revised", draft, head.id, head.number + 1)
-        return Published(draft.name_in_batch, head.id, draft.kind, head.number + 1, True)
+    def _reuse(self, one: _Ready, head: _Head) -> None:
+        """Take an item as it is where it has the content of the draft, and add a revision where it has other."""
+        if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
+            self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
+            return
+        parts = {**head.parts, **one.digests}
+        if write_head(self.tx, one.draft.kind, head.id, parts, one.bodies, item.c.head == head.number):
+            self._write("item.revised", [(one, _Head(head.id, head.number + 1, parts))])
 
-    def _write_revision(self, draft: Draft, item_id: str, number: int, parts: Mapping[str, str]) -> None:
-        write_revision(self.tx, item_id, number, parts, self.author_id, draft.message, self.job_id)
-        tags = [{"item_id": item_id, "tag": tag} for tag in dict.fromkeys(draft.tags)]
+    def _write(self, event: str, made: Sequence[tuple[_Ready, _Head]]) -> None:
+        """Insert the newest revisions of items, with their tags, sources and events."""
+        if not made:
+            return
+        revisions = [NewRevision(head.id, head.number, head.parts, one.draft.message) for one, head in made]
+        write_revisions(self.tx, revisions, author_id=self.author_id, job_id=self.job_id)
+        tags = [{"item_id": head.id, "tag": tag} for one, head in made for tag in dict.fromkeys(one.draft.tags)]
         if tags:
             self.tx.execute(self.tx.insert_or_ignore(item_tag), tags)
         sources = [
             {
-                "item_id": item_id, "number": number, "role": role, "position": position,
+                "item_id": head.id, "number": head.number, "role": role, "position": position,
                 "input_item_id": source, "input_number": source_number, "job_id": self.job_id,
             }
-            for role, pinned in draft.sources.items()
+            for one, head in made
+            for role, pinned in one.draft.sources.items()
             for position, (source, source_number) in enumerate(pinned)
         ]  # fmt: skip
         if sources:
             self.tx.execute(insert(lineage), sources)
+        self.tx.emit_each((event, self.project.id, head.id, self._event(one.draft, head)) for one, head in made)
+        for one, head in made:
+            self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=True)
 
-    def _emit(self, kind: str, draft: Draft, item_id: str, number: int) -> None:
-        self.tx.emit(
-            kind, item_id, project_id=self.project.id, item_kind=draft.kind.value, name=draft.item_name,
-            collection=draft.collection, revision=number, job=self.job_id,
-        )  # fmt: skip
+    def _event(self, draft: Draft, head: _Head) -> dict[str, Any]:
+        return {
+            "item_kind": draft.kind.value, "name": draft.item_name, "collection": draft.collection,
+            "revision": head.number, "job": self.job_id,
+        }  # fmt: skip
 
 
 def _names(draft: Draft) -> Iterator[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, insert, select, update
@@ -16,12 +17,16 @@ from marey_server.store.tables import item, revision, revision_part
 from marey_server.store.transaction import Transaction
 
 
-def read_part_digests(tx: Transaction, item_id: str, number: int) -> dict[str, str]:
-    """Return the digest of the document of each part of a revision."""
-    statement = select(revision_part.c.part, revision_part.c.document_digest).where(
-        revision_part.c.item_id == item_id, revision_part.c.number == number
-    )
-    return {row.part: row.document_digest for row in tx.execute(statement)}
+def read_part_digests(tx: Transaction, revisions: Collection[tuple[str, int]]) -> dict[tuple[str, int], dict[str, str]]:
+    """Return the digest of the document of each part of revisions, which are given by item id and number."""
+    found: dict[tuple[str, int], dict[str, str]] = {one: {} for one in revisions}
+    ids, numbers = {item_id for item_id, _ in found}, {number for _, number in found}
+    # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
+    chosen = (revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers)))
+    for row in tx.execute(select(revision_part).where(*chosen)) if found else ():
+        if (row.item_id, row.number) in found:
+            found[row.item_id, row.number][row.part] = row.document_digest
+    return found
 
 
 def write_head(
@@ -52,23 +57,29 @@ def write_head(
     return tx.execute(statement).rowcount == 1
 
 
-def write_revision(
-    tx: Transaction,
-    item_id: str,
-    number: int,
-    parts: Mapping[str, str],
-    author_id: str | None,
-    message: str,
-    job_id: str | None,
+@dataclass(frozen=True, slots=True)
+class NewRevision:
+    """A revision to insert, with its parts by digest of the document."""
+
+    item_id: str
+    number: int
+    parts: Mapping[str, str]
+    message: str
+
+
+def write_revisions(
+    tx: Transaction, revisions: Sequence[NewRevision], *, author_id: str | None, job_id: str | None
 ) -> None:
-    """Insert a revision and its parts."""
-    row = {"item_id": item_id, "number": number, "author_id": author_id, "message": message, "job_id": job_id}
-    tx.execute(insert(revision), row | {"created_us": tx.now_us})
+    """Insert revisions and their parts."""
+    common = {"author_id": author_id, "job_id": job_id, "created_us": tx.now_us}
+    rows = [{"item_id": one.item_id, "number": one.number, "message": one.message, **common} for one in revisions]
+    tx.execute(insert(revision), rows)
     tx.execute(
         insert(revision_part),
         [
-            {"item_id": item_id, "number": number, "part": part, "document_digest": digest}
-            for part, digest in parts.items()
+            {"item_id": one.item_id, "number": one.number, "part": part, "document_digest": digest}
+            for one in revisions
+            for part, digest in one.parts.items()
         ],
     )
 

@@ -175,8 +175,10 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]:
     """Return the attempts that were claimed with the caller's own token."""
+    wanted = list(places)
     statement = select(attempt.c.job_id, attempt.c.fence).where(
-        tuple_(attempt.c.job_id, attempt.c.fence).in_(list(places))
+        attempt.c.job_id.in_([job_id for job_id, _ in wanted]),  # for pairs alone SQLite would scan the table
+        tuple_(attempt.c.job_id, attempt.c.fence).in_(wanted),
     )
     if tx.principal.kind != "system":
         statement = statement.where(attempt.c.claimed_by == (tx.principal.token_id or ""))
@@ -186,7 +188,8 @@ def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]
 def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
     """Return the attempts that have staged something."""
     columns = (staged_output.c.job_id, staged_output.c.fence)
-    rows = tx.execute(select(*columns).where(tuple_(*columns).in_(list(places))).distinct())
+    of_jobs = staged_output.c.job_id.in_([job_id for job_id, _ in places])
+    rows = tx.execute(select(*columns).where(of_jobs, tuple_(*columns).in_(list(places))).distinct())
     return {(row.job_id, row.fence) for row in rows}
 
 

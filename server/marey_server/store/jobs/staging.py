@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import bindparam, delete, func, insert, select, tuple_, update
+from sqlalchemy import and_, bindparam, delete, func, insert, select, tuple_, update
 
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import PARTS, Kind
@@ -86,17 +86,18 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
                 "fence": fence,
                 "name": one.output.name,
                 "position": places[one.output.name],
-                "draft": _staged_draft(tx, one, pins),
+                "draft": _staged_draft(one, pins),
             }
         )
     if position >= MOST_STAGED:
         raise InvalidProblem(f"An attempt can stage at most {MOST_STAGED} results.", code="too-many")
+    documents.store_documents(tx, (content for one in outputs for content in one.parts.values()))
     tx.execute(insert(staged_output), rows)
     faults.point("stage.before_commit")
     return position + 1
 
 
-def _staged_draft(tx: Transaction, prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
+def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
     output = prepared.output
     return {
         "kind": output.kind.value,
@@ -105,7 +106,7 @@ def _staged_draft(tx: Transaction, prepared: PreparedOutput, pins: PinnedInputs)
         "tags": list(output.tags),
         "reuse": output.reuse,
         "sources": _pinned_sources(output, pins),
-        "parts": {part: documents.store_document(tx, content) for part, content in prepared.parts.items()},
+        "parts": {part: content.digest for part, content in prepared.parts.items()},
     }
 
 
@@ -130,7 +131,10 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
 # -- publishing -------------------------------------------------------------------------------------------------------
 
 
-_BY_ATTEMPTS = tuple_(staged_output.c.job_id, staged_output.c.fence).in_(bindparam("attempts", expanding=True))
+_BY_ATTEMPTS = and_(
+    staged_output.c.job_id.in_(bindparam("jobs", expanding=True)),  # for pairs alone SQLite would scan the table
+    tuple_(staged_output.c.job_id, staged_output.c.fence).in_(bindparam("attempts", expanding=True)),
+)
 _STAGED = Prepared(select(staged_output).where(_BY_ATTEMPTS).order_by(staged_output.c.job_id, staged_output.c.position))
 _DROP_STAGED = Prepared(delete(staged_output).where(_BY_ATTEMPTS))
 
@@ -140,7 +144,7 @@ def staged_drafts(
 ) -> dict[tuple[str, int], dict[str, StagedDraft]]:
     """Return the drafts that attempts (job id and fence) staged, by name, in the order of staging."""
     drafts: dict[tuple[str, int], dict[str, StagedDraft]] = {}
-    for row in tx.run(_STAGED, {"attempts": list(attempts)}):
+    for row in tx.run(_STAGED, _of_attempts(attempts)):
         drafts.setdefault((row.job_id, row.fence), {})[row.name] = row.draft
     return drafts
 
@@ -157,7 +161,12 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
     """Delete the drafts of attempts (job id and fence) that failed or whose results no other job can share."""
-    tx.run(_DROP_STAGED, {"attempts": list(attempts)})
+    tx.run(_DROP_STAGED, _of_attempts(attempts))
+
+
+def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
+    """Return the parameters of `_BY_ATTEMPTS`."""
+    return {"jobs": [job_id for job_id, _ in attempts], "attempts": list(attempts)}
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:

@@ -1,0 +1,62 @@
+"""Files of an import are stored together; one that cannot be stored harms no other."""
+
+import pytest
+from tests.support.store_fixtures import motion_tree, skeleton_tree
+
+from marey_schemas.imports import Refusal, refused_entry
+from marey_schemas.kinds import Kind
+from marey_server.errors import UnavailableProblem
+from marey_server.motions import importing
+from marey_server.motions.importing import PreparedImport
+from marey_server.store import blobs, items
+from marey_server.store.items import Draft
+
+
+def read_file(name, *, joints=3, seed=0):
+    """A file that was read: a skeleton and a clip on it; the clip has `joints` of the skeleton's three."""
+    rig = f"{name}#skeleton"
+    motion = motion_tree({"output": rig}, joints=joints, seed=seed)
+    drafts = (
+        Draft(rig, Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}, "skeletons", reuse="by_content"),
+        Draft(name, Kind.CLIP, name.partition(".")[0], {"motion": motion}, "takes"),
+    )
+    return PreparedImport(name, drafts=drafts, frames=5)
+
+
+def store(lab, *files):
+    return lab.write(importing.publish, "lab", files)
+
+
+def test_files_become_items_in_their_order_with_one_skeleton(lab):
+    entries = store(lab, *(read_file(f"walk{number}.bvh", seed=number) for number in range(6)))
+    assert [entry.name for entry in entries] == [f"walk{number}.bvh" for number in range(6)]
+    assert {entry.status for entry in entries} == {"created"}
+    assert len({entry.skeleton for entry in entries}) == 1
+    clips = lab.read(items.list_items, "lab", Kind.CLIP, sort="id").items
+    assert [clip.id for clip in clips] == [entry.item for entry in entries]
+
+
+def test_a_file_that_cannot_be_stored_harms_no_other(lab):
+    refused = PreparedImport("c.bvh", entry=refused_entry("c.bvh", Refusal(code="empty", detail="no frames")))
+    entries = store(lab, read_file("a.bvh"), read_file("b.bvh", joints=2), refused, read_file("d.bvh", seed=1))
+    assert [(entry.name, entry.status) for entry in entries] == [
+        ("a.bvh", "created"), ("b.bvh", "failed"), ("c.bvh", "failed"), ("d.bvh", "created"),
+    ]  # fmt: skip
+    assert [entry.error.code for entry in entries[1:3]] == ["wrong-joints", "empty"]
+    assert [clip.name for clip in lab.read(items.list_items, "lab", Kind.CLIP, sort="name").items] == ["a", "d"]
+
+
+def test_the_same_take_twice_in_one_request_is_one_revision(lab):
+    first, again = store(lab, read_file("walk.bvh"), read_file("walk.npz"))
+    assert (first.status, again.status) == ("created", "unchanged")
+    assert (first.item, first.revision) == (again.item, again.revision)
+
+
+def test_a_failure_of_the_database_is_none_of_a_file(lab, monkeypatch):
+    def fail(*_args, **_kwargs):
+        raise UnavailableProblem("The database does not answer.")
+
+    monkeypatch.setattr(blobs, "store_blobs", fail)
+    with pytest.raises(UnavailableProblem):
+        store(lab, read_file("a.bvh"), read_file("b.bvh", seed=1))
+    assert lab.read(items.list_items, "lab", Kind.CLIP).items == ()
