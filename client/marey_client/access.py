@@ -20,12 +20,12 @@ from marey_schemas.access import (
 )
 
 ANY_STATE = {"If-Match": "*"}
-"""The header of a change that replaces any state."""
+"""Header of a change that replaces any state."""
 
 
 @dataclass(frozen=True)
 class Users:
-    """The users of a server; for administrators."""
+    """Users of a server; for administrators."""
 
     transport: Transport
 
@@ -38,27 +38,27 @@ class Users:
         return self.transport.get(User, f"/users/{name}")
 
     def create(self, user: UserCreate) -> User:
-        """Make a user."""
+        """Create a user."""
         return self.transport.post(User, "/users", user, repeatable=False)
 
     def change(self, name: str, change: UserChange) -> User:
-        """Change a user; one's own password needs the current one."""
+        """Change a user; users who change their own password give the current one."""
         return read_model(
             User, self.transport.send("PATCH", f"/users/{name}", content=as_json(change), headers=ANY_STATE)
         )
 
     def disable(self, name: str) -> None:
-        """Disable a user; the data that they made stays."""
+        """Disable a user; the user's data stays."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def enable(self, name: str) -> User:
-        """Enable a disabled user again, with their password and tokens."""
+        """Enable a disabled user again, with the same password and tokens."""
         return self.change(name, UserChange(disabled=False))
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """The caller's tokens."""
+    """Tokens of the caller."""
 
     transport: Transport
 
@@ -67,7 +67,7 @@ class Tokens:
         return pages(self.transport, Token, "/tokens")
 
     def create(self, token: TokenCreate) -> NewToken:
-        """Make a token; its secret is in the answer and never shown again."""
+        """Create a token; its secret is in the answer and never shown again."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def revoke(self, token_id: str) -> None:
@@ -77,7 +77,7 @@ class Tokens:
 
 @dataclass(frozen=True)
 class Members:
-    """The members of a project and their roles."""
+    """Members of a project and their roles."""
 
     transport: Transport
     project: str
@@ -87,7 +87,7 @@ class Members:
         return pages(self.transport, Member, f"/projects/{self.project}/members")
 
     def put(self, user: str, role: Role) -> Member:
-        """Give a user a role, whatever they had before."""
+        """Add a user to the project, or change the user's role."""
         return read_model(
             Member,
             self.transport.send(

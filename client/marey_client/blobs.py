@@ -24,19 +24,19 @@ TRIES_PER_PIECE = 5
 
 
 def digest_of(data: bytes) -> str:
-    """Return the name of bytes: `sha256:` and 64 hexadecimal digits."""
+    """Return the digest of bytes: `sha256:` and 64 hexadecimal digits."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
 def digest_of_file(path: Path) -> str:
-    """Return the name of a file's bytes, without holding them in memory."""
+    """Return the digest of a file's bytes, read in pieces."""
     with path.open("rb") as file:
         return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
 @dataclass(frozen=True)
 class Blobs:
-    """The blobs that the token's user may read or has sent."""
+    """Blobs that the token's user may read or has sent."""
 
     transport: Transport
 
@@ -57,9 +57,9 @@ class Blobs:
         return name
 
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
-        """Stream a file to the server and return its digest; a large file in pieces, each piece once.
+        """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` where its length changes meanwhile.
+        Raises `FileChanged` if its length changes meanwhile.
         """
         name = digest or digest_of_file(path)
         size_bytes = path.stat().st_size
@@ -82,7 +82,7 @@ class Blobs:
         return data
 
     def fetch_to(self, digest: str, target: Path) -> Path:
-        """Write a blob to `target`, which appears only when it is whole; a lost connection costs no byte twice."""
+        """Download a blob to `target`, which is created only when complete; an interrupted download is resumed."""
         with saved_atomically(target) as file:
 
             def once() -> None:
@@ -118,8 +118,8 @@ def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
 def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
     """Send a file as a resumable upload; return the digest of its blob.
 
-    Raises `Unreachable` where the server stays away, `FileChanged` where the file becomes shorter, `Invalid` where the
-    bytes that arrived are not what `digest` says.
+    Raises `Unreachable` if the server cannot be reached for long, `FileChanged` if the file becomes shorter, and
+    `Invalid` if the received bytes do not have `digest`.
     """
     announced = UploadCreate(length=path.stat().st_size, digest=digest)
     upload = read_model(Upload, transport.send("POST", "/uploads", content=as_json(announced)))
@@ -138,7 +138,7 @@ def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
 
 
 def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
-    """Send one more piece and return the state of the upload; the last piece, perhaps empty, completes the blob."""
+    """Send the next piece and return the state of the upload; the last piece (maybe empty) completes the blob."""
     file.seek(upload.offset)
     piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
     if not piece and upload.offset < upload.length:

@@ -1,7 +1,7 @@
-"""Finds the server's address and the token to use.
+"""Lookup of the server's address and the token.
 
-A token is looked for in this order: a file named on the command line, `MAREY_TOKEN`, the file `marey login` writes, and
-`admin.token` in the data folder of a server on this machine.
+A token is searched in this order: a file named on the command line, `MAREY_TOKEN`, the file written by `marey login`,
+and `admin.token` in the data folder of a server on this machine.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
 @dataclass(frozen=True)
 class Credential:
-    """A server and the token for it."""
+    """Server and the token for it."""
 
     url: str
     token: str | None = field(repr=False)
     origin: str = ""
-    """The place where the token was found, for people."""
+    """Place where the token was found, for messages."""
 
 
 def resolve(
     url: str | None = None, token_file: Path | None = None, environment: Mapping[str, str] | None = None
 ) -> Credential:
-    """Return the server and token that flags, environment and stored logins name."""
+    """Return the server and token given by flags, environment or stored logins."""
     environment = os.environ if environment is None else environment
     stored = read_logins(logins_path(environment))
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
@@ -55,7 +55,7 @@ def resolve(
 
 
 def require_address(url: str) -> None:
-    """Raises `BadAddress` where `url` is no address of a server."""
+    """Raise `BadAddress` if `url` is not the address of a server."""
     try:
         parts, _ = urlsplit(url), httpx.URL(url)
         fits = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
@@ -74,7 +74,7 @@ def as_token(text: str) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """Return the token in a file. Raises `BadCredentialFile` where it holds none, or other users may read it."""
+    """Return the token in a file. Raises `BadCredentialFile` if there is none, or other users may read the file."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()
@@ -94,20 +94,20 @@ def read_secret(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Logins:
-    """Tokens by server, and the server used when none is named."""
+    """Tokens by server, and the default server."""
 
     default: str | None = None
     tokens: Mapping[str, str] = field(default_factory=dict, repr=False)
 
 
 def logins_path(environment: Mapping[str, str]) -> Path:
-    """Return the file of stored logins: below `XDG_CONFIG_HOME`, or `~/.config`."""
+    """Return the path of the file of stored logins, below `XDG_CONFIG_HOME` or `~/.config`."""
     base = environment.get("XDG_CONFIG_HOME") or str(Path(environment.get("HOME") or Path.home()) / ".config")
     return Path(base) / "marey" / "credentials.json"
 
 
 def read_logins(path: Path) -> Logins:
-    """Return the stored logins; none where nobody logged in. Raises `BadCredentialFile` where the file is damaged."""
+    """Return the stored logins, empty without a file. Raises `BadCredentialFile` if the file is damaged."""
     if not path.exists():
         return Logins()
     try:
@@ -118,13 +118,13 @@ def read_logins(path: Path) -> Logins:
 
 
 def store_login(path: Path, url: str, token: str) -> None:
-    """Remember a token for a server, and the server as the default. Only this user can read the file."""
+    """Store a token for a server, and the server as the default. Only this user can read the file."""
     tokens = {**read_logins(path).tokens, url: token}
     _write_logins(path, Logins(url, tokens))
 
 
 def forget_login(path: Path, url: str) -> bool:
-    """Forget the token for a server; whether there was one."""
+    """Delete the token for a server; return whether there was one."""
     stored = read_logins(path)
     if url not in stored.tokens:
         return False
@@ -146,7 +146,7 @@ def _write_logins(path: Path, logins: Logins) -> None:
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
-    """Return the administrator's token of a server on this machine, where its data folder is known and readable."""
+    """Return the path of the administrator's token of a local server, if its data folder is known and readable."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
     path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN
@@ -154,7 +154,7 @@ def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
 
 
 def _configured_data() -> str | None:
-    """The data folder that `marey.toml` in the working directory names, as a server started here would read it."""
+    """Return the data folder in `marey.toml` of the working directory, as a server started here would."""
     try:
         data = tomllib.loads(Path(SETTINGS_FILE).read_text(encoding="utf-8")).get("data")
     except (OSError, ValueError):  # a server would tell what is wrong with it

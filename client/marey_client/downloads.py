@@ -1,4 +1,4 @@
-"""Files that arrive: written under a temporary name, renamed when they are whole."""
+"""Downloads of files: written under a temporary name, renamed when complete."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from marey_client.transport import Params, Transport
 
 _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
 LONGEST_NAME_BYTES = 240
-"""File systems take 255; the rest is for a number."""
+"""Greatest length of a file name; file systems allow 255, the rest is for a number."""
 LONGEST_ENDING = 16
 
 
 @contextmanager
 def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
-    """A file to write and read that becomes `target` at the end, and vanishes if the block fails."""
+    """Yield a file to write, which is renamed to `target` at the end, or deleted if the block fails."""
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name[:32]}.{uuid.uuid4().hex}")
@@ -42,7 +42,7 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
 
 
 def safe_file_name(name: str) -> str:
-    """`name` without anything that a file system could take for a path or refuse; its ending stays where it is long."""
+    """Return `name` without characters that file systems refuse or treat as a path; long names keep their ending."""
     clean = _NOT_IN_A_NAME.sub("_", name).strip(". ") or "unnamed"
     if len(clean.encode()) <= LONGEST_NAME_BYTES:
         return clean
@@ -52,14 +52,14 @@ def safe_file_name(name: str) -> str:
 
 
 class TakenPaths:
-    """The paths of the files of one download: of two files with one name, the later gets a number."""
+    """Paths of the files of one download; of two files with the same name, the later one gets a number."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
         self._lock = threading.Lock()
 
     def take(self, target: Path) -> Path:
-        """`target`, or the next like it that is free; case makes no difference, as on many file systems."""
+        """Return `target`, or a free path like it; letter case is ignored, as on many file systems."""
         with self._lock:
             free, number = target, 1
             while (key := unicodedata.normalize("NFC", str(free)).casefold()) in self._taken:
@@ -78,9 +78,9 @@ def download(
     name: str,
     beside: TakenPaths | None = None,
 ) -> Path:
-    """Fetch a file into `folder` under the name the server gives it, or `name`; answer where it is.
+    """Download a file to `folder` under the server's name for it, or `name`; return its path.
 
-    A file of that name is replaced, unless it is one of those `beside` which this one was asked for.
+    An existing file of that name is replaced, unless it is one of `beside`, the files of the same download.
     """
     places = TakenPaths() if beside is None else beside
     target: Path | None = None

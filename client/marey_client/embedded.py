@@ -1,7 +1,6 @@
-"""The rooms that the commands `serve`, `worker`, `demo` and `db` open on this machine.
+"""Access to the server, worker and motion packages for the commands `serve`, `worker`, `demo` and `db`.
 
-Nothing else of the client reaches the server, the worker or the motion package, and these load only when such a command
-runs: a machine with the client alone stays a client.
+Only this module imports them, and only when such a command runs, so that the client can be installed alone.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def work(credential: Credential, **options: Any) -> None:
 
 @contextmanager
 def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
-    """A server with workers on a free port of this machine while the block runs; its address."""
+    """Run a server with workers on a free local port inside the block; yield its address."""
     app = room("marey_server.app", "all")
     settings = room("marey_server.process.settings", "all").Settings(
         data=data, host="127.0.0.1", port=0, local_workers=workers, log_form="text"
@@ -77,7 +76,7 @@ def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
 
 @contextmanager
 def _refusals_of(commands: ModuleType) -> Iterator[None]:
-    """Turn the refusals of a room's commands into the client's own errors."""
+    """Convert errors of a package's commands into errors of the client."""
     try:
         yield
     except commands.CommandFailed as refusal:
@@ -89,7 +88,7 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def room(module: str, extra: str) -> ModuleType:
-    """Return a module of another part of Marey. Raises `NotInstalled`, naming the extra that brings it."""
+    """Return a module of another part of Marey. Raises `NotInstalled`, which names the extra to install."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Every error of the SDK. `RequestFailed` and its subclasses are answers of the server; the rest happened here."""
+"""Errors of the SDK. `RequestFailed` and its subclasses are answers of the server; the others arise in the client."""
 
 from __future__ import annotations
 

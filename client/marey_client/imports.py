@@ -1,4 +1,4 @@
-"""Folders of motion files in: digests in threads, one question which bytes are missing, uploads side by side."""
+"""Import of folders of motion files: digests are computed in threads, and missing bytes are sent concurrently."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ UPLOADS_AT_ONCE = 8
 _FILE_NAME: TypeAdapter[str] = TypeAdapter(FileName)
 
 Notice = Callable[[str, int, int], None]
-"""Called with the stage `hashing`, `sending` or `importing`, the number of files done, and their total number."""
+"""Function called with the stage (`hashing`, `sending`, `importing`), the number of files done, and their total."""
 
 
 @dataclass(frozen=True)
 class LocalFile:
-    """A file to import and the name it gets: its path below the folder it was found in."""
+    """File to import and its name: its path below the folder in which it was found."""
 
     name: str
     path: Path
@@ -50,17 +50,17 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class FoundFiles:
-    """The files in the given places: those to import, and those that are left out."""
+    """Files in the given places: those to import, and those that are left out."""
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
-    """Find motion files in folders and below, without hidden ones; files that are named directly are always taken.
+    """Find motion files in folders and below, without hidden ones; files that are given directly are always included.
 
-    Raises `NothingToUpload` where a place does not exist or none holds a motion file, `SameName` where files of two
-    places would get one name, `OSError` where a folder cannot be read.
+    Raises `NothingToUpload` if a place does not exist or no motion file is found, `SameName` if files of two places
+    would get the same name, `OSError` if a folder cannot be read.
     """
     searched = [Path(place) for place in several(places)]
     files: dict[str, LocalFile] = {}
@@ -83,7 +83,7 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """Files in a folder and below, in order; hidden ones and what lies in hidden folders left out."""
+    """Yield the files in a folder and below, sorted, without hidden files and folders."""
     found: list[Path] = []
     for parent, folders, names in os.walk(folder, onerror=_raise):
         folders[:] = (name for name in folders if not name.startswith("."))
@@ -105,7 +105,7 @@ def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
 
 
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
-    """Split files into portions that one request can import.
+    """Split files into batches that one request can import.
 
     A file that needs a companion comes with all companions of its folder, an AMC with every ASF; and files that differ
     in their ending alone stay together, because the names of clips depend on the other files of a request.
@@ -154,7 +154,7 @@ def _needs_companion(file: LocalFile) -> bool:
 
 @dataclass(frozen=True)
 class Imports:
-    """Imports into one project."""
+    """Imports into a project."""
 
     transport: Transport
     project: str
@@ -164,7 +164,7 @@ class Imports:
     def upload(
         self, files: Sequence[LocalFile], options: ImportOptions | None = None, *, notice: Notice | None = None
     ) -> list[ImportEntry]:
-        """Import files; one entry per file, in order. A file that is refused keeps no other from going in."""
+        """Import files; return one entry for each file, in order. A refused file does not affect others."""
         tell = notice or _say_nothing
         named = [file for file in files if _may_travel(file.name)]
         entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
@@ -176,7 +176,7 @@ class Imports:
         return list(entries.values())
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; waits where the server makes a job of it."""
+        """Import up to 1000 files whose bytes the server has; if the server makes it a job, wait for that."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(
@@ -189,9 +189,9 @@ class Imports:
         return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
-        """Send what the server lacks of the files' bytes; the files as an import names them, in order.
+        """Send the bytes that the server lacks; return the files in the form that an import names them.
 
-        Raises `BadFileName` where one has a name that cannot be sent.
+        Raises `BadFileName` if a name cannot be sent.
         """
         for file in files:
             if not _may_travel(file.name):
@@ -212,7 +212,7 @@ class Imports:
 
 
 def _may_travel(name: str) -> bool:
-    """Return whether a request can hold a file's name; file systems allow more."""
+    """Return whether a file name can be sent in a request; file systems allow more names."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:
@@ -221,14 +221,14 @@ def _may_travel(name: str) -> bool:
 
 
 def _refused_name(name: str) -> ImportEntry:
-    """Return the entry of a file that is not sent because of its name."""
+    """Return the entry of a file that is refused because of its name."""
     shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
     detail = "its name is too long, no UTF-8, or holds line breaks or other control characters; rename it"
     return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
-    """Return a job's entry with the items that were made of its file when the job was published."""
+    """Return the entry of a job with the items that were published for its file."""
     skeleton = outputs.get(skeleton_output(entry.name))
     made = outputs.get(entry.name) or skeleton
     if made is None:
@@ -238,7 +238,7 @@ def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEn
 
 
 def refusal_text(entry: ImportEntry) -> str:
-    """Write the reason why a file was refused, in a line that begins with its name."""
+    """Return the reason for a refusal as a line that begins with the file's name."""
     assert entry.error is not None
     detail = entry.error.detail
     if detail.startswith(entry.name):
@@ -249,7 +249,7 @@ def refusal_text(entry: ImportEntry) -> str:
 
 
 def left_out_text(paths: Sequence[Path]) -> str:
-    """Write a line about files in folders that are not motion files."""
+    """Return a line about files in folders that are not motion files."""
     others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     return f"left out what is no motion: {paths[0].name}{others}"
 

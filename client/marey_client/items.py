@@ -1,4 +1,4 @@
-"""Items of every kind: find, make, change, read their parts and history."""
+"""Items of every kind: lookup, creation, changes, parts and history."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.kinds import Kind
 
 
 class ItemHandle:
-    """One item as it was when it was read; its methods ask the server."""
+    """Handle of an item in the state in which it was read; its methods send requests."""
 
     def __init__(self, transport: Transport, project: str, item: Item) -> None:
         self.transport = transport
@@ -52,19 +52,19 @@ class ItemHandle:
         return ItemInput(item=self.id, revision=self.item.revision)
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
-        """Return the document of a part; arrays are numpy arrays."""
+        """Return the document of a part, with numpy arrays."""
         tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
         return dict(tree)
 
     def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
-        """Make a new revision in which `part` is `document`; `PreconditionFailed` if the item was changed since."""
+        """Create a revision with `document` as `part`. Raises `PreconditionFailed` if the item was changed since."""
         response = self.transport.send_tree(
             "PUT", f"{self.url}/parts/{part}", document, params={"message": message}, headers=self._if_match()
         )
         return self._renewed(read_model(Item, response))
 
     def change(self, change: ItemChange) -> Item:
-        """Rename, move or tag; `PreconditionFailed` if somebody changed the item since it was read."""
+        """Rename, move or tag the item. Raises `PreconditionFailed` if it was changed since it was read."""
         response = self.transport.send("PATCH", self.url, content=as_json(change), headers=self._if_match())
         return self._renewed(read_model(Item, response))
 
@@ -73,7 +73,7 @@ class ItemHandle:
         self.transport.send("DELETE", self.url, headers=self._if_match())
 
     def restore(self) -> Item:
-        """Bring a deleted item back."""
+        """Restore a deleted item."""
         return self._renewed(self.transport.post(Item, f"{self.url}/restore"))
 
     def revisions(self) -> Iterator[Revision]:
@@ -85,11 +85,11 @@ class ItemHandle:
         return self.transport.get(Revision, f"{self.url}/revisions/{number}")
 
     def lineage(self) -> Lineage:
-        """Return the inputs of the newest revision, and the results that were made from it."""
+        """Return the inputs of the newest revision, and the results computed from it."""
         return self.transport.get(Lineage, f"{self.url}/lineage")
 
     def staleness(self) -> Staleness:
-        """Return whether an input that it was made from has changed."""
+        """Return whether an input of the item has a newer revision."""
         return self.transport.get(Staleness, f"{self.url}/stale")
 
     def export(
@@ -100,7 +100,7 @@ class ItemHandle:
         beside: TakenPaths | None = None,
         **options: str | None,
     ) -> Path:
-        """Write the item to `folder` as a file of `format`; answer where it is.
+        """Write the item to `folder` as a file of `format`; return its path.
 
         Exports of several items with the same `beside` do not replace each other's files.
         """
@@ -126,7 +126,7 @@ Handle = TypeVar("Handle", bound=ItemHandle)
 
 @dataclass(frozen=True)
 class Items(Generic[Handle]):
-    """The items of one kind in a project."""
+    """Items of one kind in a project."""
 
     transport: Transport
     project: str
@@ -149,11 +149,11 @@ class Items(Generic[Handle]):
         filters: Params | None = None,
         page_size: int = 500,
     ) -> Iterator[Handle]:
-        """List items in order, fetched page by page.
+        """Yield items in order, requested page by page.
 
-        `collection` names a folder, with everything below it; `directly_in` one without, of which "" is the root;
-        `path` one item; `deleted` those that `restore` brings back; `filters` are the server's, such as
-        `{"frames.gte": 120, "tag.in": "walk,run"}`.
+        `collection` selects a folder and everything below it, `directly_in` a folder alone ("" is the root), `path` one
+        item, `deleted` the items that `restore` can bring back; `filters` are those of the API, such as `{"frames.gte":
+        120, "tag.in": "walk,run"}`.
         """
         params = {
             "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort,
@@ -171,7 +171,7 @@ class Items(Generic[Handle]):
         return self.transport.get(Page, self.url, params).count or 0
 
     def restore(self, item_id: str) -> Handle:
-        """Bring a deleted item back by its id."""
+        """Restore a deleted item by its id."""
         return self._handle(self.transport.post(Item, f"{self.url}/{item_id}/restore"))
 
     def create(
@@ -183,7 +183,7 @@ class Items(Generic[Handle]):
         tags: str | Sequence[str] = (),
         message: str = "",
     ) -> Handle:
-        """Make an item from its parts; numpy arrays are taken as they are. `Conflict` if the name is taken."""
+        """Create an item from its parts, which may contain numpy arrays. Raises `Conflict` if the name is taken."""
         wanted = ItemCreate(name=name, collection=collection, tags=several(tags), parts=dict(parts), message=message)
         response = self.transport.send_tree("POST", self.url, wanted.model_dump(by_alias=True))
         return self._handle(read_model(Item, response))

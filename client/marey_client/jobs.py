@@ -15,21 +15,21 @@ from marey_schemas.jobs import Attempt, Job, JobCreate, JobInput, JobKind, JobOu
 OnProgress = Callable[[Job], None]
 
 LONGEST_WAIT_S = 20.0
-"""Longest time that the server holds one request open."""
+"""Longest time in seconds that one request waits for the end of a job."""
 
 SHORTEST_PAUSE_S = 0.05
 FOLLOW_EVERY_S = 0.5
 
 
 def job_request(kind: str, inputs: Mapping[str, JobInput | Sequence[JobInput]], params: Request) -> JobCreate:
-    """Ask for a job with these parameters; those that were not given stay open for the server's defaults."""
+    """Return the request for a job; parameters that are not given get the server's defaults."""
     given = {name: tuple(one) if isinstance(one, Sequence) else one for name, one in inputs.items()}
     return JobCreate(kind=kind, inputs=given, params=params.model_dump(mode="json", exclude_unset=True))
 
 
 @dataclass(frozen=True)
 class Jobs:
-    """Every job the caller may see, by id."""
+    """Jobs that the caller may read, by id."""
 
     transport: Transport
 
@@ -51,7 +51,7 @@ class Jobs:
         return pages(self.transport, Job, f"/projects/{project}/jobs", params)
 
     def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
-        """Return a job as it is now; with `wait_s` the server answers when the job ends, or after that time."""
+        """Return the current state of a job; with `wait_s`, when the job ends, or after that time."""
         if wait_s <= 0:
             return self.transport.get(Job, f"/jobs/{job_id}")
         return self.transport.get(
@@ -66,9 +66,9 @@ class Jobs:
         on_progress: OnProgress | None = None,
         require_success: bool = True,
     ) -> Job:
-        """Wait until a job has ended; `on_progress` sees it about once a second.
+        """Wait until a job has ended; `on_progress` is called with the job about once a second.
 
-        Raises `JobUnsuccessful` where it failed or was cancelled and success is required, `WaitedTooLong` after
+        Raises `JobUnsuccessful` if it failed or was cancelled and success is required, `WaitedTooLong` after
         `timeout_s`.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
@@ -102,7 +102,7 @@ class Jobs:
         return pages(self.transport, Attempt, f"/jobs/{job_id}/attempts")
 
     def outputs(self, job_id: str) -> Iterator[JobOutput]:
-        """List the revisions that a job made."""
+        """List the revisions that a job created."""
         return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
 
     def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:

@@ -1,4 +1,4 @@
-"""The session with one server, for one token."""
+"""Client of one server, for one token."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Marey:
         return pages(self.transport, Project, "/projects")
 
     def create_project(self, project: ProjectCreate) -> ProjectHandle:
-        """Make a project; the caller becomes its owner."""
+        """Create a project; the caller becomes its owner."""
         return self.project(self.transport.post(Project, "/projects", project).name)
 
     @cached_property

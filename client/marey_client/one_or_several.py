@@ -1,4 +1,4 @@
-"""Arguments that are one thing or several: a text is one name, not its letters; a document is one, not its keys."""
+"""Arguments that accept one value or several: a text is one name, and a dict is one document."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ from pydantic import BaseModel
 
 
 def several(given: str | Path | Mapping[str, Any] | BaseModel | Iterable[Any]) -> tuple[Any, ...]:
-    """Return what was given as a tuple; a text, a path, a document or a model is one thing."""
+    """Return one value or several as a tuple; a text, a path, a document or a model is one value."""
     return (given,) if isinstance(given, str | Path | Mapping | BaseModel) else tuple(given)

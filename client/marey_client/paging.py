@@ -1,4 +1,4 @@
-"""Lists that come in pages."""
+"""Lists that are requested page by page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marey_schemas.items import Page
 
 
 def pages(transport: Transport, entry: type[Model], path: str, params: Params | None = None) -> Iterator[Model]:
-    """Yield every entry of a list, fetched page by page as the caller goes on."""
+    """Yield every entry of a list; the next page is requested when it is needed."""
     query: dict[str, Any] = dict(params or {})
     while True:
         page = transport.get(Page, path, query)

@@ -1,4 +1,4 @@
-"""The inputs of jobs as callers write them: folders by their paths, items as handles, or several of these."""
+"""Inputs of jobs as callers give them: folders by path, items as handles, or several of these."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from marey_schemas.jobs import CollectionInput, ItemInput
 Handle = TypeVar("Handle", bound=ItemHandle)
 
 Place: TypeAlias = str | CollectionInput | ItemInput | Handle
-"""A folder by its path, an item, or either as an input of jobs."""
+"""Folder given by its path, item given by its handle, or an input of jobs."""
 
 Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[CollectionInput | ItemInput, ...]:
-    """Return one place or several as inputs of jobs; handles at the revision that was read."""
+    """Return one place or several as inputs of jobs; a handle stands for the revision that was read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items at one place or several, as they are now or at the revision that a place names."""
+    """Yield the items at one place or several, at the newest revision or the one that a place names."""
     for place in _as_list(places):
         if isinstance(place, ItemHandle):
             yield place.item

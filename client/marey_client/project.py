@@ -1,4 +1,4 @@
-"""One project: its items, collections, members, imports and jobs."""
+"""Handle of a project: its items, collections, members, imports and jobs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Cache: TypeAlias = Literal["use", "refresh", "off"]
 
 
 class ProjectHandle(ProjectItems):
-    """A project by its name; nothing is asked until a method is called."""
+    """Handle of a project, given by name; requests are sent only by its methods."""
 
     def __repr__(self) -> str:
         return f"<project {self.name!r} at {self.transport.url}>"
@@ -50,7 +50,7 @@ class ProjectHandle(ProjectItems):
         return f"/projects/{self.name}"
 
     def read(self) -> Project:
-        """Return title, visibility and the caller's role."""
+        """Return the project's title, visibility and the caller's role."""
         return self.transport.get(Project, self.url)
 
     def change(self, change: ProjectChange) -> Project:
@@ -64,7 +64,7 @@ class ProjectHandle(ProjectItems):
         self.transport.send("DELETE", self.url, headers={"If-Match": "*"})
 
     def restore(self) -> Project:
-        """Bring a deleted project back."""
+        """Restore the deleted project."""
         return self.transport.post(Project, f"{self.url}/restore")
 
     # -- what it holds -------------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class ProjectHandle(ProjectItems):
         return Jobs(self.transport).submit(self.name, job)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
-        """Submit jobs that work on the results of others: all of them, or none."""
+        """Submit jobs that read outputs of others, all or none."""
         return submit_pipeline(self.transport, self.name, pipeline)
 
     def build_model(
@@ -209,7 +209,7 @@ class ProjectHandle(ProjectItems):
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
-        """Return the evaluation that a job makes, when the job has ended. Raises `JobUnsuccessful`."""
+        """Return the evaluation created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
         return self.evaluations.get(self._made_by(job, on_progress))
 
     def train_model(
@@ -231,15 +231,15 @@ class ProjectHandle(ProjectItems):
         return self.submit(request.model_copy(update=update))
 
     def model(self, job: Job, *, on_progress: OnProgress | None = None) -> ModelHandle:
-        """Return the model that a job makes, when the job has ended. Raises `JobUnsuccessful`."""
+        """Return the model created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
         return self.models.get(self._made_by(job, on_progress))
 
     def jobs(self, *, filters: Params | None = None) -> Iterator[Job]:
-        """List its jobs, newest first."""
+        """List the project's jobs, newest first."""
         return Jobs(self.transport).list(self.name, filters=filters)
 
     def _made_by(self, job: Job, on_progress: OnProgress | None) -> str:
-        """Wait for a job and return the id of the one item it makes."""
+        """Wait for a job and return the id of its only output."""
         jobs = Jobs(self.transport)
         jobs.wait(job.id, on_progress=on_progress)
         (made,) = jobs.outputs(job.id)

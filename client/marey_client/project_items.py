@@ -1,4 +1,4 @@
-"""The items of one project, by kind, and the folders that they are in."""
+"""Items of a project by kind, and its folders."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from marey_schemas.kinds import Kind
 
 
 class ProjectItems:
-    """The items of a project, by its name; nothing is asked until a method is called."""
+    """Items of a project, given by name; requests are sent only by its methods."""
 
     def __init__(self, transport: Transport, name: str) -> None:
         self.transport = transport
@@ -93,7 +93,7 @@ class ProjectItems:
 
 @dataclass(frozen=True)
 class Collections:
-    """The tree of folders of a project."""
+    """Folders of a project."""
 
     transport: Transport
     project: str
@@ -106,21 +106,21 @@ class Collections:
     def list(
         self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
     ) -> Iterator[Collection]:
-        """List the folders by path: all, those at and below `path`, or with `deleted` those that can be restored."""
+        """List the folders by path: all of them, those at and below `path`, or with `deleted` the deleted ones."""
         params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
         return pages(self.transport, Collection, self.url, params)
 
     def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """Return the folder with this path, or None; of several deleted ones, the one that was deleted last."""
+        """Return the folder with this path, or None; of several deleted ones, the last deleted."""
         found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
         return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
 
     def create(self, path: str) -> Collection:
-        """Make a folder and those above it."""
+        """Create a folder, with its parents if they are missing."""
         return self.transport.post(Collection, self.url, CollectionCreate(path=path))
 
     def move(self, collection: Collection, path: str) -> Collection:
-        """Move or rename a folder with all it holds."""
+        """Move or rename a folder with its contents."""
         state = {"If-Match": f'"{collection.rev}.json"'}
         body = as_json(CollectionChange(path=path))
         return read_model(
@@ -128,10 +128,10 @@ class Collections:
         )
 
     def delete(self, collection: Collection) -> None:
-        """Hide a folder with all it holds."""
+        """Delete a folder with its contents; it can be restored."""
         state = {"If-Match": f'"{collection.rev}.json"'}
         self.transport.send("DELETE", f"{self.url}/{collection.id}", headers=state)
 
     def restore(self, collection: Collection) -> Collection:
-        """Bring a deleted folder back with all it held."""
+        """Restore a deleted folder with its contents."""
         return self.transport.post(Collection, f"{self.url}/{collection.id}/restore")

@@ -1,4 +1,4 @@
-"""Requests for the jobs of each kind: parameters, and inputs together with what the server knows of them.
+"""Job requests of each kind: parameters, and inputs completed by queries to the server.
 
 Every request uses the newest joint mapping of each skeleton.
 """
@@ -35,17 +35,17 @@ from marey_schemas.options.imports import ImportOptions
 LOOP_TAG = "loop"
 
 Clips: TypeAlias = Places[ClipHandle]
-"""Clips, folders of clips by their paths, or several of these."""
+"""Clips, folders of clips given by their paths, or several of these."""
 
 Annotations: TypeAlias = Places[AnnotationHandle]
 AlignedClips: TypeAlias = Places[ProcessedHandle]
 
 Takes: TypeAlias = Clips | Sequence[LocalFile]
-"""Clips and folders of clips that are there, or files on this machine, as `find_files` finds them."""
+"""Clips and folders of clips on the server, or local files as returned by `find_files`."""
 
 
 def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params: RetargetParams) -> JobCreate:
-    """Ask for clips on the skeleton with this id."""
+    """Return the job request to retarget clips to the skeleton with this id."""
     inputs: dict[str, Any] = {"clips": as_inputs(clips), "skeleton": ItemInput(item=skeleton)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
@@ -53,7 +53,7 @@ def retarget_request(project: ProjectItems, clips: Clips, skeleton: str, params:
 
 
 def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams) -> JobCreate:
-    """Ask for annotations of clips."""
+    """Return the job request to annotate clips."""
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if edited := project.edited_rigs(items_at(project.clips, clips)):
         inputs["rigs"] = edited
@@ -61,7 +61,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
 
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
-    """Ask for the pieces of clips that annotations mark; the clips are those that the annotations name."""
+    """Return the job request to cut clips along annotations; the clips are those of the annotations."""
     found = {
         one.id: one
         for one in items_at(project.annotations, annotations, sort="id")
@@ -78,9 +78,9 @@ def cut_request(project: ProjectItems, annotations: Annotations, params: CutPara
 def align_request(
     project: ProjectItems, clips: Clips, annotations: Annotations | None, params: AlignParams
 ) -> JobCreate:
-    """Ask for clips aligned with each other.
+    """Return the job request to align clips with each other.
 
-    Without annotations, but with a layer or labels: by the annotations of that layer over these clips.
+    If a layer or labels are given without annotations, it uses the annotations of that layer for these clips.
     """
     found = {item.id: item for item in items_at(project.clips, clips)}
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
@@ -94,7 +94,7 @@ def align_request(
 
 
 def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
-    """Ask for edited clips; the clips that the commands name become inputs. `options` are those of `EditParams`."""
+    """Return the job request to edit clips; clips named by the commands become inputs. `options`: see `EditParams`."""
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if isinstance(commands, EditHandle):
         edit = commands.document(revision=commands.item.revision)

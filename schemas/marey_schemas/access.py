@@ -39,7 +39,7 @@ class Scope(StrEnum):
 DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
 ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
-"""A scope, optionally bound to one project: `write!project=walk`."""
+"""Scope, optionally bound to one project, as in `write!project=walk`."""
 
 
 class UserCreate(Request):
@@ -106,13 +106,13 @@ class Token(Answer):
 
 
 class NewToken(Token):
-    """The answer that shows a token's secret, once."""
+    """New token with its secret, which is shown only once."""
 
     secret: str
 
 
 class Login(Request):
-    """Sign in with a name and a password."""
+    """Request to sign in with a name and a password."""
 
     name: UserName
     password: SecretStr

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 MOST_STEPS = 64
-"""Greatest number of doublings, which bounds the exponent; any longest delay is reached before."""
+"""Greatest exponent of the growth, so that numbers do not overflow; the longest delay is reached before."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Backoff:
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, failures: int) -> float:
-        """Return the seconds to wait after so many failures, of which the first is 1."""
+        """Return the seconds to wait after the given number of failures; the first failure is 1."""
         steps = min(failures - 1, MOST_STEPS)
         return spread(min(self.longest_s, self.first_s * self.factor**steps), self.jitter, self.random_unit)
 

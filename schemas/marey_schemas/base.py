@@ -22,15 +22,15 @@ class Answer(BaseModel):
 
 
 class Options(Request):
-    """Choices that a computation takes: each with its type, range, default and meaning, declared here alone.
+    """Base of the options of a computation: each option has its type, range, default and description here only.
 
     Parameters of jobs embed or extend them, and `marey_motion` takes them as they are. A value out of range raises
-    `pydantic.ValidationError`, which names the field. Instances are frozen, and hashable where their values are.
+    `pydantic.ValidationError`, which names the field. Instances are frozen, and hashable if their values are.
     """
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Return only these options of a model that extends them."""
+        """Return these options from a model that extends them, without its other fields."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:

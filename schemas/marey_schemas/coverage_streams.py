@@ -1,4 +1,4 @@
-"""Coverage while a performer records: a stream of frames in, what is still missing out.
+"""Coverage streams: frames sent during a recording, and answers with the motions that are still missing.
 
 Ground positions are metres, headings radians about +Y, 0 towards +z and growing to the left.
 """
@@ -79,7 +79,7 @@ class CoverageStreamCreate(Request):
 
 
 class CoverageFrames(Request):
-    """The next frames of a performance, of type <f4 or <f8."""
+    """Next frames of a performance, of type <f4 or <f8."""
 
     offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before these.")
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
@@ -117,7 +117,7 @@ class CoverageFrames(Request):
 
     @property
     def frame_count(self) -> int:
-        """Number of these frames."""
+        """The number of frames."""
         return sum(len(frames) for frames in (self.poses, self.roots) if frames is not None)
 
 

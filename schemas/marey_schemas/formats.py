@@ -1,7 +1,7 @@
-"""The table of file formats. Every choice, file ending, media type and answer type of a format derives from a row here.
+"""Table of file formats, from which all choices, file endings, media types and answer types are derived.
 
-A new format is one row and one module: `marey_motion.formats.<name>` has `read_<name>` where the row reads something,
-and `write_<name>` where it writes motion.
+A new format is one row and one module: `marey_motion.formats.<name>` has `read_<name>` if the row can be read, and
+`write_<name>` if it can be written as motion.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 ORIGINAL = "original"
-"""The choice of an export that gives back the imported file itself, whatever its format."""
+"""Export format that returns the imported file itself, independent of its format."""
 OCTETS = "application/octet-stream"
 
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
@@ -30,7 +30,7 @@ UNITS_M = {
 
 @dataclass(frozen=True, slots=True)
 class FileFormat:
-    """A file format.
+    """Row of the table of file formats.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def _text(beginning: bytes) -> re.Pattern[bytes]:
 
 
 def _line_of(*keywords: bytes) -> re.Pattern[bytes]:
-    """Matches where a line begins with one of the keywords."""
+    """Return a pattern that matches a line which begins with one of the keywords."""
     return re.compile(rb"(?:\A(?:\xef\xbb\xbf)?|[\r\n])\s*:(?:" + b"|".join(keywords) + rb")(?:\s|\Z)", re.IGNORECASE)
 
 
@@ -132,7 +132,7 @@ FORMATS = (
     ),
     FileFormat(name="json", endings=(".json",), media_type="application/json", writes=("item",)),
 )
-"""The formats, in the order in which the beginning of a file is compared with them."""
+"""All formats, in the order in which the beginning of a file is compared with their patterns."""
 
 _BY_NAME = {one.name: one for one in FORMATS}
 

@@ -12,18 +12,18 @@ from marey_schemas.names import Digest
 from marey_schemas.options.imports import ImportOptions
 
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
-"""May hold folders: they become collections below the target."""
+"""Name of a file; its folders become collections below the target."""
 
 
 class ImportFile(Request):
-    """A file whose bytes the server has already."""
+    """File to import whose bytes the server has already."""
 
     name: FileName
     blob: Digest
 
 
 class ImportRequest(ImportOptions):
-    """Import files by digest. More than the server's synchronous limit becomes a job (202)."""
+    """Request to import files by digest. More than the server's synchronous limit becomes a job (202)."""
 
     files: tuple[ImportFile, ...] = Field(min_length=1, max_length=1000)
 
@@ -51,12 +51,12 @@ class ImportEntry(Answer):
 
 
 def refused_entry(name: str, refusal: Refusal) -> ImportEntry:
-    """Make the entry of a file that was refused."""
+    """Return the entry of a file that was refused."""
     return ImportEntry(name=name, status="failed", error=refusal)
 
 
 def skeleton_output(file_name: str) -> str:
-    """Name the output of an import job for a file's skeleton; the clip has the file's own name."""
+    """Return the name of an import job's output for a file's skeleton; the clip has the file's own name."""
     return f"{file_name}#skeleton"
 
 

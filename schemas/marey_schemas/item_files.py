@@ -1,4 +1,4 @@
-"""Parts of an export that need no numeric code: an item as one JSON document, and the file a clip was imported from."""
+"""Exports that need no numeric code: an item as one JSON document, and the file that a clip was imported from."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from marey_schemas.kinds import Kind
 
 @dataclass(frozen=True, slots=True)
 class ItemToExport:
-    """An item's documents at one revision.
+    """Documents of an item at one revision.
 
-    `hierarchy` is of the skeleton that its motion or model moves. `tags` None leaves them out of the file: a job does
-    not read them, since they may change while its inputs are pinned.
+    `hierarchy` is that of the skeleton of its motion or model. `tags` None leaves them out of the file: a job does not
+    read them, because they may change although its inputs are pinned.
     """
 
     item: str
@@ -30,14 +30,14 @@ class ItemToExport:
 
 @dataclass(frozen=True, slots=True)
 class OriginalFile:
-    """The file that an item was imported from, as it came."""
+    """Original file that an item was imported from."""
 
     name: str
     digest: str
 
 
 def item_as_json(source: ItemToExport) -> bytes:
-    """Write an item with all its parts, and its skeleton's hierarchy, as one JSON document."""
+    """Return an item with all its parts, and its skeleton's hierarchy, as one JSON document."""
     tree: dict[str, Any] = {
         "schema": "marey/item@1",
         "item": source.item,
@@ -55,7 +55,7 @@ def item_as_json(source: ItemToExport) -> bytes:
 
 
 def original_of_clip(item: str, info: Mapping[str, Any] | None) -> OriginalFile | None:
-    """Find the file that a clip was imported from in its part `info`; None where it was made otherwise."""
+    """Return the file that a clip was imported from, according to its part `info`; None if it was not imported."""
     source = (info or {}).get("source") or {}
     if not source.get("file"):
         return None

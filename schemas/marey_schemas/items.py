@@ -1,4 +1,4 @@
-"""Collections, items, revisions and lineage as they travel."""
+"""Collections, items, revisions and lineage in requests and answers."""
 
 from datetime import datetime
 from typing import Any
@@ -11,13 +11,13 @@ from marey_schemas.names import CollectionPath, Digest, ItemName, Message, Tag
 
 
 class CollectionCreate(Request):
-    """A new folder; missing folders above it are made too."""
+    """Request to create a folder; missing parents are created, too."""
 
     path: CollectionPath = Field(min_length=1)
 
 
 class CollectionChange(Request):
-    """Move or rename a folder with all it holds."""
+    """Request to move or rename a folder with its contents."""
 
     path: CollectionPath = Field(min_length=1)
 
@@ -34,7 +34,7 @@ class Collection(Answer):
 
 
 class ItemCreate(Request):
-    """A new item with its first revision; each part is a document."""
+    """Request to create an item with its first revision; each part is a document."""
 
     name: ItemName
     collection: CollectionPath = ""
@@ -44,7 +44,7 @@ class ItemCreate(Request):
 
 
 class ItemChange(Request):
-    """Rename, move or tag an item; absent fields stay."""
+    """Request to rename, move or tag an item; absent fields are unchanged."""
 
     name: ItemName | None = None
     collection: CollectionPath | None = None
@@ -69,7 +69,7 @@ class PartPlace(Request):
 
 
 class PartsRequest(Request):
-    """Read several documents at once."""
+    """Request for several documents."""
 
     parts: tuple[PartPlace, ...] = Field(min_length=1, max_length=256)
 

@@ -1,4 +1,4 @@
-"""Parameters of the built-in kinds of jobs: the options of what they do, and names and tags of the results."""
+"""Parameters of the built-in kinds of jobs: the options of each, and names and tags of the results."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from marey_schemas.options.modelling import ModelOptions, TreeOptions
 
 
 class TaggedResults(Request):
-    """Tags of what a job makes."""
+    """Base of parameters with tags for the results."""
 
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that the results get.")
 
 
 class SuffixedResults(TaggedResults):
-    """Names and tags of what a job makes of the items that it takes."""
+    """Base of parameters with a suffix for the names of the results, and tags."""
 
     suffix: NameSuffix = Field("", description="Suffix of the results' names.")
 
@@ -123,7 +123,7 @@ class CutParams(TaggedResults):
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
-"""All trials together; the default suite simulates 5,346 s."""
+"""Greatest duration of all trials together in seconds; that of the default suite is 5,346 s."""
 TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
@@ -148,7 +148,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
     @property
     def trial_count(self) -> int:
-        """Number of trajectories."""
+        """The number of trajectories."""
         return len(self.families) * len(self.speeds_m_s) * len(self.turn_rates_deg_s)
 
     @model_validator(mode="after")
@@ -200,7 +200,7 @@ class SweepParams(SweepOptions):
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
-    """Return a task for each setting of the weights."""
+    """Return the number of tasks of a sweep: one for each setting of the weights."""
     return 1 + WEIGHT_GROUPS * len(params.factors)
 
 

@@ -1,4 +1,4 @@
-"""Job kinds, jobs, and what workers and the server say to each other."""
+"""Job kinds, jobs, and their inputs and results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_schemas.names import CollectionPath, Message
 
 
 class JobState(StrEnum):
-    """waiting -> queued -> running -> succeeded, failed or cancelled; the last three never change."""
+    """State of a job: waiting -> queued -> running -> succeeded, failed or cancelled; the last three never change."""
 
     WAITING = "waiting"
     QUEUED = "queued"
@@ -40,7 +40,7 @@ class FailureReason(StrEnum):
 
 
 class InputSpec(Answer):
-    """One named input of a kind."""
+    """Named input of a kind."""
 
     kind: Kind
     many: bool = False
@@ -70,20 +70,20 @@ class JobKind(Answer):
 
 
 class ItemInput(Request):
-    """An item, pinned to a revision; without one, its newest at the moment of submission."""
+    """Item as an input, at the given revision or the newest at submission."""
 
     item: str
     revision: int | None = Field(None, ge=1)
 
 
 class CollectionInput(Request):
-    """Every item of the input's kind in a collection and below it, pinned at the moment of submission."""
+    """All items of the input's kind in a collection and below it, at their newest revisions at submission."""
 
     collection: CollectionPath
 
 
 class JobOutputsInput(Request):
-    """Everything of the input's kind that another job of the project makes, pinned when that job has succeeded.
+    """All outputs of another job of the project that have the input's kind, pinned when that job has succeeded.
 
     The job waits for the other one, as for those in `after`.
     """
@@ -92,7 +92,7 @@ class JobOutputsInput(Request):
 
 
 JobInput = ItemInput | CollectionInput | JobOutputsInput
-"""Forms of an input of a job."""
+"""Input of a job, in any of its forms."""
 
 
 class Resources(Request):
@@ -103,7 +103,7 @@ class Resources(Request):
 
 
 class JobCreate(Request):
-    """Submit a job."""
+    """Request to submit a job."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
@@ -146,7 +146,7 @@ class JobFailure(Answer):
 
 
 class JobOutput(Answer):
-    """A revision that a job made."""
+    """Revision created by a job."""
 
     name: str
     item: str
@@ -156,7 +156,7 @@ class JobOutput(Answer):
 
 
 class Job(Answer):
-    """A job and how it stands."""
+    """Job with its state."""
 
     id: str
     project: str
@@ -203,7 +203,7 @@ class TaskResult(Answer):
 
 
 class Attempt(Answer):
-    """One try at a job."""
+    """Attempt to run a job."""
 
     job: str
     fence: int
@@ -215,12 +215,12 @@ class Attempt(Answer):
 
 
 class JobBatch(Request):
-    """Submit many jobs, all or none."""
+    """Request to submit many jobs, all or none."""
 
     jobs: tuple[JobCreate, ...] = Field(min_length=1, max_length=1000)
 
 
 class JobList(Answer):
-    """Jobs in the order submitted."""
+    """Jobs in the order of submission."""
 
     jobs: tuple[Job, ...]

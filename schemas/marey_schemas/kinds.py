@@ -1,4 +1,4 @@
-"""The kinds of item a project holds, and the parts each is made of."""
+"""Kinds of items, and their parts."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,12 +21,12 @@ class Kind(StrEnum):
 
     @property
     def plural(self) -> str:
-        """The collection name in URLs, for example `clips`."""
+        """The name of the kind in URLs, for example `clips`."""
         return "processed" if self is Kind.PROCESSED else ("studies" if self is Kind.STUDY else f"{self.value}s")
 
     @classmethod
     def from_plural(cls, plural: str) -> "Kind":
-        """Return the kind a URL segment names; `KeyError` if none."""
+        """Return the kind with the given name in URLs. Raises `KeyError`."""
         return _BY_PLURAL[plural]
 
 
@@ -35,7 +35,7 @@ _BY_PLURAL = {kind.plural: kind for kind in Kind}
 
 @dataclass(frozen=True)
 class PartSpec:
-    """One part of a kind: the schema its documents have, and whether a revision must hold it."""
+    """Part of a kind: the schema of its documents, and whether a revision must have it."""
 
     schema: str
     required: bool

@@ -1,4 +1,4 @@
-"""Lines of logs, of one form from the server and its workers: JSON for collectors, text for people."""
+"""Format of log lines of the server and its workers: JSON for collectors, text for people."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FIELDS = (
 
 
 class JsonFormatter(logging.Formatter):
-    """A log record as one line of JSON."""
+    """Formatter of a log record as one line of JSON."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line of a record."""
@@ -33,7 +33,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """A log record as one line for people."""
+    """Formatter of a log record as one line of text."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(levelname)-7s %(name)s: %(message)s", datefmt="%H:%M:%S")
@@ -46,7 +46,7 @@ class TextFormatter(logging.Formatter):
 
 
 def usual_form() -> LogForm:
-    """Text where somebody sits at a terminal and reads the standard error, else JSON."""
+    """Return the default form: text if standard error is a terminal, else JSON."""
     return "text" if sys.stderr is not None and sys.stderr.isatty() else "json"
 
 

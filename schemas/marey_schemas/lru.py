@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Key, Value]):
-    """The most recently used values, bounded by number, by bytes, or by both. Any thread may use it.
+    """Cache of the most recently used values, limited by number, by bytes, or by both. It is thread-safe.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class LruCache(Generic[Key, Value]):
             return entry[0]
 
     def put(self, key: Key, value: Value) -> None:
-        """Keep a value under `key`, in place of the one that it had."""
+        """Store a value under `key`, replacing an earlier one."""
         size = self._size_of(value)
         if self._largest_bytes is not None and size > self._largest_bytes:
             return
@@ -65,10 +65,10 @@ class LruCache(Generic[Key, Value]):
                 self._drop_oldest()
 
     def get_or_make(self, key: Key, make: Callable[[], Value]) -> Value:
-        """Return the value of `key`; call `make` and keep what it returns if there is none.
+        """Return the value of `key`; if there is none, call `make` and store its result.
 
-        `make` runs without the lock: two threads that miss at the same time both make the value. Room for one entry is
-        freed before `make` runs, since values may be large.
+        `make` runs without the lock: two threads that miss at the same time both call it. Room for one entry is freed
+        before `make` runs, because values may be large.
         """
         found = self.get(key)
         if found is not None:

@@ -1,4 +1,4 @@
-"""From takes to a model of an action, as a pipeline: import, retarget, annotate, cut, align, model, tree."""
+"""Pipeline from takes to a model of an action: import, retarget, annotate, cut, align, model, tree."""
 
 from typing import Any, Self
 
@@ -16,9 +16,8 @@ Inputs = tuple[ItemInput | CollectionInput, ...]
 class ModelPlan(Request):
     """Inputs and options of a model.
 
-    Takes are files to import or clips that are there. They are carried over to a skeleton where one is named, cut into
-    examples along annotations, which are proposed or there already, and aligned; a model is learned of them, and a tree
-    made for searches.
+    Takes are files to import or existing clips. They are retargeted if a skeleton is given, cut into examples along
+    proposed or existing annotations, and aligned; a model is trained on the examples, and a tree is built for searches.
     """
 
     name: ItemName = Field(description="Name of the model and of the action.")
@@ -63,13 +62,13 @@ class ModelPlan(Request):
 
 
 def model_pipeline(plan: ModelPlan, **shared: Any) -> PipelineCreate:
-    """Return the pipeline that carries out a plan. `shared` are further fields of it, such as `seed` and `priority`."""
+    """Return the pipeline for a plan. `shared` are further fields of the pipeline, such as `seed` and `priority`."""
     steps: dict[str, PipelineStep] = {}
     clips: Any = plan.clips
     annotations: Any = plan.annotations
 
     def add(name: str, folder: str, params: Request, **inputs: Any) -> Any:
-        """Add a step; what it makes, as the input of others."""
+        """Add a step; return its outputs as the input of other steps."""
         into = f"{plan.into}/{folder}".rstrip("/")
         given = {role: value for role, value in inputs.items() if value not in ((), None)}
         steps[name] = PipelineStep(kind=name, inputs=given, params=_plain(params), into=into)

@@ -1,4 +1,4 @@
-"""Constrained strings used in many documents."""
+"""Types of constrained strings for documents."""
 
 from typing import Annotated
 
@@ -25,7 +25,7 @@ CollectionPath = Annotated[
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
 
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
-"""The name of bytes: `sha256:` and 64 hexadecimal digits."""
+"""Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
 Message = Annotated[str, StringConstraints(max_length=2000)]
 

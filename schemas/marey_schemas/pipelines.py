@@ -16,7 +16,7 @@ StepName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]
 
 
 class StepOutputsInput(Request):
-    """Everything of the input's kind that another step makes. The step waits for that one."""
+    """All outputs of another step that have the input's kind. The step waits for that one."""
 
     step: StepName
 
@@ -25,7 +25,7 @@ StepInput = JobInput | StepOutputsInput
 
 
 class PipelineStep(Request):
-    """One job of a pipeline. What is left out of the second group is as the pipeline says."""
+    """Job of a pipeline. Fields of the second group that are absent are those of the pipeline."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)
@@ -47,7 +47,7 @@ class PipelineStep(Request):
 
 
 class PipelineCreate(Request):
-    """Submit jobs that depend on each other, all or none."""
+    """Request to submit jobs that depend on each other, all or none."""
 
     steps: dict[StepName, PipelineStep] = Field(min_length=1, max_length=MOST_STEPS)
     into: CollectionPath = Field("", description="The collection that receives the results.")
@@ -61,13 +61,13 @@ class PipelineCreate(Request):
 
 
 class Pipeline(Answer):
-    """The jobs of a pipeline by the names of its steps, each after those it needs."""
+    """Jobs of a pipeline by the names of its steps, each after those it depends on."""
 
     jobs: dict[str, Job]
 
 
 class PipelineError(ValueError):
-    """The steps make no sense together. `pointer` is the place in the pipeline, `code` a stable slug."""
+    """The steps of a pipeline are not valid together. `pointer` is the place in the pipeline, `code` a stable slug."""
 
     def __init__(self, pointer: str, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -76,14 +76,14 @@ class PipelineError(ValueError):
 
     @classmethod
     def unknown_step(cls, pointer: str, name: str, pipeline: PipelineCreate) -> Self:
-        """Return a step that is named and not there."""
+        """Return the error for a reference to a step that does not exist."""
         return cls(pointer, "unknown-step", f"There is no step {name!r}; there are {', '.join(pipeline.steps)}.")
 
 
 def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
-    """Return the names of the steps, each after those it needs, else as they were given.
+    """Sort the names of the steps so that each comes after those it depends on, otherwise in the given order.
 
-    Raises `PipelineError` for a step that is not there, and for steps that wait for each other.
+    Raises `PipelineError` for a step that does not exist, and for circular dependencies.
     """
     places = {name: dict(_needed(name, step)) for name, step in pipeline.steps.items()}
     for needed in places.values():
@@ -108,7 +108,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """Return the job that a step stands for; `ids` are those of the jobs of the steps it needs."""
+    """Return the job request of a step; `ids` are those of the jobs of the steps it depends on."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:
@@ -125,7 +125,7 @@ def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> 
 
 
 def _needed(name: str, step: PipelineStep) -> Iterator[tuple[str, str]]:
-    """List the references of a step to others: place in the document, and name of the other step."""
+    """Return the references of a step to others: place in the document, and name of the other step."""
     for index, other in enumerate(step.after):
         yield f"/steps/{name}/after/{index}", other
     for role, choices in step.inputs.items():

@@ -1,4 +1,4 @@
-"""Motions of models that meet constraints: what can be asked for, and what was found."""
+"""Searches for motions of models that meet constraints: requests and answers."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
 MOST_CANDIDATE_CONSTRAINTS = 4096
-"""Candidates times constraints: some seconds of one thread."""
+"""Greatest product of the numbers of candidates and constraints, which takes some seconds of one thread."""
 
 
 Moment = Annotated[str, StringConstraints(min_length=1, max_length=255)] | Annotated[float, Field(allow_inf_nan=False)]
-"""The label of a keyframe, `start`, `end`, or a canonical frame."""
+"""Label of a keyframe, `start`, `end`, or a canonical frame."""
 
 JointLabel = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
-"""The least value is below the accuracy of any motion capture, and squared errors over it stay finite."""
+"""Tolerance; its minimum is below the accuracy of any motion capture, and squared errors divided by it stay finite."""
 Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 def _in_centimetres(name: str) -> Any:
-    """Declare the field of release 0.1 that says in centimetres what `name` says in metres."""
+    """Declare the field of release 0.1 that gives in centimetres the value that `name` gives in metres."""
     return Field(
         None,
         exclude=True,
@@ -53,7 +53,7 @@ def _in_centimetres(name: str) -> Any:
 
 
 def _read_old_unit(model: Request, name: str, old: str) -> None:
-    """Move a value in centimetres to the field in metres. Raises `ValueError` where both are given."""
+    """Convert a value in centimetres to the field in metres. Raises `ValueError` if both are given."""
     centimetres = getattr(model, old)
     if centimetres is None:
         return
@@ -86,7 +86,7 @@ class _PlaceConstraint(_SearchConstraint):
 
 
 class JointPositionConstraint(_PlaceConstraint):
-    """A joint is at a position."""
+    """Constraint that a joint is at a position."""
 
     type: Literal["joint_position"]
     joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
@@ -96,7 +96,7 @@ class JointPositionConstraint(_PlaceConstraint):
 
 
 class JointOrientationConstraint(_SearchConstraint):
-    """A joint has a rotation in the world."""
+    """Constraint that a joint has a rotation in the world."""
 
     type: Literal["joint_orientation"]
     joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
@@ -107,7 +107,7 @@ class JointOrientationConstraint(_SearchConstraint):
 
 
 class LookDirectionConstraint(_SearchConstraint):
-    """An axis of a joint points in a direction, or at a point."""
+    """Constraint that an axis of a joint points in a direction, or at a point."""
 
     type: Literal["look_direction"]
     joint: JointLabel = Field(description="Name of the joint, its own or its standard name.")
@@ -124,7 +124,7 @@ class LookDirectionConstraint(_SearchConstraint):
 
 
 class RootPositionConstraint(_PlaceConstraint):
-    """The body is at a position on the ground."""
+    """Constraint that the body is at a position on the ground."""
 
     type: Literal["root_position"]
     target_m: tuple[Coordinate | None, Coordinate | None] = Field(
@@ -133,7 +133,7 @@ class RootPositionConstraint(_PlaceConstraint):
 
 
 class RootHeadingConstraint(_SearchConstraint):
-    """The body faces a heading on the ground."""
+    """Constraint that the body faces a heading on the ground."""
 
     type: Literal["root_heading"]
     heading_deg: Degrees = Field(description="Target heading in degrees: 0 along +z, positive to the left.")
@@ -141,7 +141,7 @@ class RootHeadingConstraint(_SearchConstraint):
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
-    """A keyframe is reached at a time after the motion's beginning."""
+    """Constraint that a keyframe is reached at a time after the beginning of the motion."""
 
     type: Literal["keyframe_time"]
     seconds: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
@@ -172,7 +172,7 @@ class StartPlacement(Request):
 
 
 class SearchStep(Request):
-    """One motion of several."""
+    """Motion in a sequence, with its constraints."""
 
     model: ItemId | None = Field(
         None, description="Id of a model of the project; absent: the model in the request's path."
@@ -233,7 +233,7 @@ class SearchRequest(RefineOptions):
 
     @property
     def asked_steps(self) -> tuple[SearchStep, ...]:
-        """The steps; a single one if only `constraints` are given."""
+        """The steps of the request; a single one if only `constraints` are given."""
         return self.steps or (SearchStep(constraints=self.constraints),)
 
 
@@ -253,7 +253,7 @@ class ConstraintError(Answer):
 
 
 class FoundStep(Answer):
-    """One motion that was found."""
+    """Motion found for a step."""
 
     model: RevisionRef
     tree: Literal["stored", "drawn"] = Field(

@@ -1,4 +1,4 @@
-"""Numbers of things, and lists of them, in sentences for people."""
+"""Numbers with nouns, and lists of names, for sentences."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless there is exactly one: "1 frame", "103,568 trajectories"."""
+    """Return a number with its noun, in the plural unless it is 1: "1 frame", "103,568 trajectories"."""
     if number == 1:
         return f"1 {noun}"
     plural = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeou" else f"{noun}s"
@@ -14,5 +14,5 @@ def counted(number: int, noun: str) -> str:
 
 
 def one_of(names: Sequence[str]) -> str:
-    """List the names of a choice: "bvh, npz or json"."""
+    """Return the names of a choice as text: "bvh, npz or json"."""
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))

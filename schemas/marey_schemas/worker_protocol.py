@@ -29,7 +29,7 @@ class ClaimRequest(Request):
 
 
 class PinnedInput(Answer):
-    """An input as the worker reads it."""
+    """Input of a job at a fixed revision."""
 
     item: str
     revision: int
@@ -42,12 +42,12 @@ class PinnedInput(Answer):
 
     @property
     def folder(self) -> str:
-        """Path below the job's `into` for results that keep the place of this input."""
+        """The path below the job's `into` for results with the same relative folder as this input."""
         return self.collection if self.below is None else self.below
 
     @property
     def path(self) -> str:
-        """Collection and name."""
+        """The collection and name of the input."""
         return f"{self.collection}/{self.name}".lstrip("/")
 
     @property
@@ -61,7 +61,7 @@ class PinnedInput(Answer):
 
 
 class Lease(Answer):
-    """The right to work on a job until the lease ends."""
+    """Right to work on a job until the lease ends."""
 
     job: str
     project: str
@@ -84,13 +84,13 @@ class Lease(Answer):
 
 
 class LeaseList(Answer):
-    """The leases a claim got; empty if there was no work."""
+    """Leases granted by a claim; empty if there was no work."""
 
     leases: tuple[Lease, ...] = ()
 
 
 class Heartbeat(Request):
-    """Report that the worker is alive, with the job's progress."""
+    """Renewal of a lease, with the job's progress."""
 
     progress: Progress | None = None
 
@@ -104,7 +104,7 @@ class HeartbeatAnswer(Answer):
 
 
 class StagedOutput(Request):
-    """One result, staged: invisible until the attempt completes."""
+    """Staged result, invisible until the attempt completes."""
 
     name: str = Field(
         min_length=1, max_length=1500, description="Name that is unique within the attempt; other outputs refer to it."
@@ -123,13 +123,13 @@ class StagedOutput(Request):
 
 
 class StageRequest(Request):
-    """Stage results."""
+    """Request to stage results."""
 
     outputs: tuple[StagedOutput, ...] = Field(min_length=1, max_length=256)
 
 
 class CompleteRequest(Request):
-    """Publish what is staged and end the job. The same `write_id` again gives the same answer."""
+    """Request to publish the staged outputs and end the job; repeating a `write_id` repeats the answer."""
 
     write_id: str = Field(min_length=8, max_length=64)
     result: dict[str, Any] = Field(default_factory=dict)
@@ -153,14 +153,14 @@ class FailRequest(Request):
 
 
 class BatchCompletion(CompleteRequest):
-    """One completion of a batch."""
+    """Completion of one job in a batch."""
 
     job: str
     fence: int
 
 
 class BatchCompleteRequest(Request):
-    """Complete many jobs that stage no outputs beyond those staged already."""
+    """Request to complete many jobs without staging further outputs."""
 
     completions: tuple[BatchCompletion, ...] = Field(min_length=1, max_length=256)
 
@@ -182,7 +182,7 @@ class FailAnswer(Answer):
 
 
 class BatchCompletionResult(Answer):
-    """Result of one completion of a batch: an answer, or the reason why there is none."""
+    """Result of one completion in a batch: an answer, or the reason for its refusal."""
 
     job: str
     fence: int
@@ -192,7 +192,7 @@ class BatchCompletionResult(Answer):
 
 
 class BatchCompleteAnswer(Answer):
-    """One result per completion, in the order sent."""
+    """Results of the completions in a batch, in the order of the request."""
 
     results: tuple[BatchCompletionResult, ...]
 

@@ -10,7 +10,7 @@ GLOBAL_OPTIONS = ("--server", "--token-file")
 
 
 INTERRUPTED = 130
-"""The exit status after Ctrl-C."""
+"""Exit status after Ctrl-C."""
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def _run() -> None:
 
 
 def _take_any_text() -> None:
-    """Print what the encoding of an output lacks as escapes, and nothing where the output is closed."""
+    """Make output streams escape characters that their encoding lacks, and ignore output to a closed stream."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open to the end

@@ -1,4 +1,4 @@
-"""`login`, `token` and `user`."""
+"""Commands `login`, `token` and `user`."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def create_token(
 
 
 def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
-    """Make a token and write its secret to a new file; where that cannot be made, no token is."""
+    """Create a token and write its secret to a new file; if the file cannot be created, no token is."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         try:
             made = marey.tokens.create(wanted)
@@ -265,7 +265,7 @@ def _ask_name() -> str:
 
 
 def _ask_secret(what: str, *, twice: bool = False) -> str:
-    """Return a password from the terminal, unseen; where there is none, the next line of standard input."""
+    """Return a password typed at the terminal without echo; without a terminal, the next line of standard input."""
     if sys.stdin.isatty():
         return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
     if secret := sys.stdin.readline().rstrip("\r\n"):

@@ -1,4 +1,4 @@
-"""Addresses such as `lab/raw/walk`, a project, a folder and an item, and the things that are found there."""
+"""Addresses of projects, folders and items, such as `lab/raw/walk`, and lookup of their targets."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ID = re.compile(r"([a-z]+)_[0-9a-hjkmnp-tv-z]{26}")
 
 @dataclass(frozen=True)
 class Address:
-    """A project and a path in it; the path may name a folder or an item."""
+    """Project and a path in it; the path may name a folder or an item."""
 
     project: str
     path: str
@@ -43,17 +43,17 @@ class Address:
 
     @property
     def name(self) -> str:
-        """The last name of the path, which may also be an item's id."""
+        """The last name of the path, or an item's id."""
         return self.path.rpartition("/")[2]
 
     @property
     def has_id(self) -> bool:
-        """True if the last name is an id."""
+        """Whether the last name is an id."""
         return _ID.fullmatch(self.name) is not None
 
 
 def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHandle | None:
-    """Return the item an address names, of the first of `kinds` that has one; None if there is none."""
+    """Return the item at an address, of the first of `kinds` that has one; None if there is none."""
     project = marey.project(address.project)
     if not address.path:
         return None
@@ -70,7 +70,7 @@ def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHand
 
 
 def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
-    """Return the item an address names. Raises `WrongUsage` where there is none."""
+    """Return the item at an address. Raises `WrongUsage` if there is none."""
     found = find_item(marey, address, kinds)
     if found is None:
         wanted = " or ".join(kind.value for kind in kinds) if len(kinds) <= 2 else "item"
@@ -79,7 +79,7 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
 
 
 def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
-    """Read several addresses. Raises `WrongUsage` where they are not all in one project."""
+    """Parse several addresses. Raises `WrongUsage` if they are not all in one project."""
     addresses = [Address.parse(place) for place in places]
     if len({address.project for address in addresses}) > 1:
         raise WrongUsage(f"{', '.join(places)}: all of these must be in one project")
@@ -87,7 +87,7 @@ def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
 
 
 def kind_named(name: str) -> Kind:
-    """Return the kind of item with a name. Raises `WrongUsage`."""
+    """Return the kind of item with the given name. Raises `WrongUsage`."""
     from marey_schemas.kinds import Kind
 
     try:
@@ -110,7 +110,7 @@ def _existing(items: Any, item_id: str) -> ItemHandle | None:
 
 
 class Thing(Protocol):
-    """A folder or an item of a project."""
+    """Interface of folders and items for commands that organise a project."""
 
     @property
     def id(self) -> str: ...
@@ -120,21 +120,21 @@ class Thing(Protocol):
     def place(self) -> str: ...
 
     def count(self) -> int:
-        """Count the items that are removed with it."""
+        """Return the number of items that `delete` removes."""
 
     def move(self, folder: str, name: str) -> Collection | Item:
-        """Put it into a folder under a name; what it is then."""
+        """Move to a folder and rename; return the moved folder or item."""
 
     def delete(self) -> None:
-        """Hide it."""
+        """Delete; it can be restored."""
 
     def restore(self) -> Collection | Item:
-        """Bring it back."""
+        """Restore after deletion."""
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder, with all it holds."""
+    """Folder with its contents."""
 
     project: ProjectHandle
     collection: Collection
@@ -151,28 +151,28 @@ class Folder:
         return f"{self.project.name}/{self.collection.path}"
 
     def count(self) -> int:
-        """Count its items, at any depth."""
+        """Return the number of items in the folder and below it."""
         from marey_schemas.kinds import Kind
 
         with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
             return sum(pool.map(lambda kind: self.project.items(kind).count(collection=self.collection.path), Kind))
 
     def move(self, folder: str, name: str) -> Collection:
-        """Move and rename it."""
+        """Move and rename the folder."""
         return self.project.collections.move(self.collection, f"{folder}/{name}".lstrip("/"))
 
     def delete(self) -> None:
-        """Delete the item or folder with its contents; it can be restored."""
+        """Delete the folder with its contents; it can be restored."""
         self.project.collections.delete(self.collection)
 
     def restore(self) -> Collection:
-        """Bring it back with what was deleted along with it."""
+        """Restore the folder with the contents that were deleted along with it."""
         return self.project.collections.restore(self.collection)
 
 
 @dataclass(frozen=True)
 class SingleItem:
-    """An item."""
+    """Item of a project."""
 
     handle: ItemHandle
 
@@ -183,7 +183,7 @@ class SingleItem:
 
     @property
     def kind(self) -> str:
-        """The kind of the item or folder."""
+        """The kind of the item."""
         return self.handle.item.kind.value
 
     @property
@@ -192,28 +192,29 @@ class SingleItem:
         return f"{self.handle.project}/{self.handle.path}"
 
     def count(self) -> int:
-        """Itself."""
+        """Return 1."""
         return 1
 
     def move(self, folder: str, name: str) -> Item:
-        """Move and rename it."""
+        """Move and rename the item."""
         from marey_schemas.items import ItemChange
 
         return self.handle.change(ItemChange(collection=folder, name=name))
 
     def delete(self) -> None:
-        """Hide it."""
+        """Delete the item; it can be restored."""
         self.handle.delete()
 
     def restore(self) -> Item:
-        """Bring it back."""
+        """Restore the item."""
         return self.handle.restore()
 
 
 def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
-    """The one thing an address names; a final `/` means a folder. Raises `WrongUsage` where there is none, or several.
+    """Return the folder or item at an address; a final `/` means a folder.
 
-    Of several that were deleted at one place, one after the other, the last.
+    Raises `WrongUsage` if there is none, or several. Of several that were deleted at one place, the last one is
+    returned.
     """
     address = Address.parse(text)
     if not address.path:
@@ -230,7 +231,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
 
 
 def require_apart(things: Sequence[Thing]) -> None:
-    """Raise `WrongUsage` where one thing is named twice, or lies in a folder that is named, too."""
+    """Raise `WrongUsage` if an address is given twice, or is inside a folder that is also given."""
     for place, one in enumerate(things):
         for other in (*things[:place], *things[place + 1 :]):
             if other.id == one.id:
@@ -240,7 +241,7 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
-    """Yield the things at an address: folders first; of each kind, the one that was deleted last comes first."""
+    """Yield the folders and items at an address: folders first, and within each sort the last deleted one first."""
     from marey_schemas.kinds import Kind
 
     if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:

@@ -1,4 +1,4 @@
-"""`annotation`: segments and keyframes of clips."""
+"""Command `annotation`: segments and keyframes of clips."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
 class Neighbour(StrEnum):
-    """The segment to merge with."""
+    """Segment to merge with."""
 
     NEXT = "next"
     PREVIOUS = "previous"
@@ -42,7 +42,7 @@ class Neighbour(StrEnum):
 
 
 class EndIndex(StrEnum):
-    """The meaning of the last index of a section of the predecessor."""
+    """Meaning of the last index of a section in the predecessor's files."""
 
     INCLUSIVE = "inclusive"
     EXCLUSIVE = "exclusive"
@@ -281,7 +281,7 @@ def export_annotation(
 
 
 def annotation_at(marey: Marey, place: str) -> AnnotationHandle:
-    """Return the annotation at a place. Raises `WrongUsage` where there is none."""
+    """Return the annotation at an address. Raises `WrongUsage` if there is none."""
     from marey_schemas.kinds import Kind
 
     found: AnnotationHandle = require_item(marey, Address.parse(place), [Kind.ANNOTATION])

@@ -1,4 +1,4 @@
-"""The command `marey`, with the commands of all modules."""
+"""Command `marey`, with the commands of all modules."""
 
 from __future__ import annotations
 

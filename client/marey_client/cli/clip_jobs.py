@@ -1,4 +1,4 @@
-"""`retarget`, `align` and `cut`: jobs that make clips of clips."""
+"""Commands `retarget`, `align` and `cut`: jobs that create clips from clips."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def cut(
 
 
 def print_labelled(result: dict[str, Any]) -> None:
-    """Print how many clips or annotations a job made, how many there are of each label, and what gave none."""
+    """Print the number of created clips or annotations, in total and by label, and the inputs without results."""
     made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
     counts = result.get("segments") or result.get("labels") or {}
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
@@ -134,7 +134,7 @@ def print_labelled(result: dict[str, Any]) -> None:
 
 
 def _reference(marey: Marey, text: str) -> str:
-    """Return a reference as the job takes it: a rule by its name, or the id of a clip."""
+    """Return a reference in the form that the job takes: the name of a rule, or the id of a clip."""
     from marey_schemas.kinds import Kind
 
     return text if text in REFERENCES else str(require_item(marey, Address.parse(text), [Kind.CLIP]).id)

@@ -1,4 +1,4 @@
-"""`edit`: commands on clips, saved, applied and previewed."""
+"""Command `edit`: commands on clips, saved, applied and previewed."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def list_commands(
 def _commands(
     marey: Marey, project: str, do: list[str] | None, file: str | None, saved: str | None
 ) -> EditHandle | EditDocument:
-    """Return the saved edit, or the commands that were typed or are in a file."""
+    """Return the saved edit, or the commands given as arguments or in a file."""
     if saved is None:
         return _given(marey, project, do, file)
     if do or file:
@@ -203,7 +203,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return the command with the id of its source, where that is named by its address."""
+    """Return the command with the id of its source, if the source is given by its address."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -233,7 +233,7 @@ def _range(text: str) -> slice:
 
 
 def parse_command(text: str) -> dict[str, Any]:
-    """Return a command with its parameters. Raises `WrongUsage`, and says what there is, for what no command has."""
+    """Return a command with its parameters. Raises `WrongUsage`, which lists the valid commands or parameters."""
     from marey_schemas.editing.edits import COMMAND_MODELS
 
     try:
@@ -255,7 +255,7 @@ def parse_command(text: str) -> dict[str, Any]:
 
 
 def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
-    """Name, type, default and meaning of each parameter of a command."""
+    """Return name, type, default and description of each parameter of a command."""
     required = model.model_json_schema().get("required", ())
     for name, schema in _parameters(model).items():
         default = "required" if name in required else json.dumps(schema.get("default"))
@@ -263,7 +263,7 @@ def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]
 
 
 def _parameters(model: type[BaseModel]) -> dict[str, Schema]:
-    """Return the schemas of a command's parameters; its name is none."""
+    """Return the schemas of a command's parameters, without its name."""
     return {name: schema for name, schema in parameters_of(model).items() if name != "command"}
 
 
@@ -292,7 +292,7 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 
 def _finding(finding: dict[str, Any]) -> str:
-    """Write the finding of a command in one line; segments as ranges of frames."""
+    """Return the finding of a command as one line, with segments as ranges of frames."""
     told = []
     for name, value in finding.items():
         if name == "segments":

@@ -1,4 +1,4 @@
-"""`evaluate` and `report`."""
+"""Commands `evaluate` and `report`."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def report(
 
 
 def _clips_in(marey: Marey, address: Address) -> list[Any]:
-    """Return the clip at an address, or all in a folder and below it."""
+    """Return the clip at an address, or all clips in a folder and below it."""
     from marey_schemas.kinds import Kind
 
     clip = find_item(marey, address, [Kind.CLIP])
@@ -150,7 +150,7 @@ def _clips_in(marey: Marey, address: Address) -> list[Any]:
 
 
 def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
-    """Id of a clip and the frames to use of it."""
+    """Return the id of a clip and the range of its frames to use."""
     from marey_schemas.kinds import Kind
 
     place, _, frames = text.rpartition("=")
@@ -161,7 +161,7 @@ def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
 
 
 def evaluation_at(marey: Marey, place: str) -> EvaluationHandle:
-    """Return the evaluation at a place. Raises `WrongUsage` where there is none."""
+    """Return the evaluation at an address. Raises `WrongUsage` if there is none."""
     from marey_schemas.kinds import Kind
 
     found: EvaluationHandle = require_item(marey, Address.parse(place), [Kind.EVALUATION])

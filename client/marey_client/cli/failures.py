@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 FAILED, WRONG_USAGE = 1, 2
 MOST_SHOWN = 80
-"""Characters of a text that cannot be used."""
+"""Greatest number of characters shown of a text that is not valid."""
 
 ANONYMOUS_HINT = (
     "no token was found here: marey login, or --token-file; a server on this machine keeps one in admin.token "
@@ -18,11 +18,11 @@ ANONYMOUS_HINT = (
 
 
 class Refused(Exception):
-    """Something was refused, and the message is printed already; the exit status is 1."""
+    """The server or a job refused something; the message is already printed, and the exit status is 1."""
 
 
 class WrongUsage(Exception):
-    """The command makes no sense; the text says why."""
+    """The arguments of the command are not valid; the text gives the reason."""
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def sentence(error: BaseException) -> str:
 
 
 def _told(error: BaseException) -> str:
-    """Return the text of an error; of a file, its name and the reason, without the number of the error."""
+    """Return the text of an error; for errors about files, the file name and the reason."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)

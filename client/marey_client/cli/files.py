@@ -1,4 +1,4 @@
-"""`upload`, `ls`, `show` and `download`."""
+"""Commands `upload`, `ls`, `show` and `download`."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _show_deleted(
 
 
 def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
-    """Return the item at an address that is no folder. Raises `WrongUsage` if there is none."""
+    """Return the items at an address that is not a folder. Raises `WrongUsage` if there are none."""
     from marey_schemas.kinds import Kind
 
     item = find_item(marey, address, list(Kind))
@@ -165,7 +165,7 @@ def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
 
 
 def _folders_in(marey: Marey, address: Address) -> list[str]:
-    """Names of the folders directly in the folder an address names."""
+    """Return the names of the folders directly in the folder at an address."""
     below = marey.project(address.project).collections.list(path=address.path)
     names = (one.path.removeprefix(address.path).strip("/").partition("/")[0] for one in below)
     return sorted({name for name in names if name})
@@ -219,7 +219,7 @@ def show(
 
 
 def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
-    """Yield names and values that describe an item; of a clip also its skeleton, source and warnings."""
+    """Yield names and values that describe an item; for a clip also its skeleton, source and warnings."""
     from marey_client.handles.clips import ClipHandle
 
     yield from item.item.model_dump(mode="json", exclude={"parts", "summary", "rev", "tags"}).items()

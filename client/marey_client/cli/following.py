@@ -1,4 +1,4 @@
-"""Commands that submit jobs: the options they share, the bar that follows a job, and its end."""
+"""Commands that submit jobs: their common options, the progress bar, and the output at the end of a job."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job
 
 
 def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
-    """Return what an address names as the input of a job: a clip, else a folder."""
+    """Return the clips at an address as the input of a job: a clip, or else a folder."""
     from marey_schemas.kinds import Kind
 
     return input_at(marey, address, Kind.CLIP, pinned=False)
 
 
 def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ItemInput | CollectionInput:
-    """Return the input of a job that an address names: an item of a kind, `pinned` to its revision, else a folder."""
+    """Return the input of a job at an address: an item of the kind, `pinned` to its revision, or else a folder."""
     from marey_schemas.jobs import CollectionInput, ItemInput
 
     found = find_item(marey, address, [kind])
@@ -45,7 +45,7 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
 def follow(
     marey: Marey, submitted: Job, *, wait: bool = True, as_json: bool = False, count: int | None = None, unit: str = ""
 ) -> Job | None:
-    """Wait until a job has ended, with a bar; of `count` units if the job gathers tasks that work on them.
+    """Wait until a job has ended, with a progress bar; `count` is the number of units of a gathering job.
 
     Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
     """
@@ -69,7 +69,7 @@ def follow(
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show how far a job is; the progress of one that gathers tasks is counted in tasks, or in `count` units."""
+    """Show the progress of a job; that of a gathering job is counted in tasks, or in `count` units."""
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)
@@ -81,7 +81,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the result of a job by `show`, or its counts, and its refused inputs. Raises `Refused` for those."""
+    """Print the result of a job by `show`, or else its counts, and its refused inputs. Raises `Refused` for those."""
     result = ended.result or {}
     refused = result.get("refused", ())
     if as_json:

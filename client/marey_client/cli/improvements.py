@@ -1,4 +1,4 @@
-"""`compare`, `suggest`, `optimise` and `sweep`."""
+"""Commands `compare`, `suggest`, `optimise` and `sweep`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TOLD_FIRST = (
     ("pose_cost_mean", "pose cost m"),
     ("transitions_per_s", "switches 1/s"),
 )
-"""The metrics that people see; --json and the report have all."""
+"""Metrics in the printed tables; --json and the report contain all metrics."""
 
 Evaluation = Annotated[str, typer.Argument(help="An evaluation: project/folder/name, or project/id.")]
 From = Annotated[
@@ -289,7 +289,7 @@ def _print_sweep(document: Mapping[str, Any]) -> None:
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Arrays as lists."""
+    """Return a tree with arrays as lists."""
     import numpy as np
 
     def plain(value: Any) -> Any:

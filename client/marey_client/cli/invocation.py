@@ -1,4 +1,4 @@
-"""Options of `marey` itself, and the session with the server that they name."""
+"""Global options of `marey`, and the connection to the server that they name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text
 
 @dataclass(frozen=True)
 class Invocation:
-    """The options of `marey` itself."""
+    """Global options of `marey`."""
 
     server: str | None
     token_file: Path | None
@@ -31,7 +31,7 @@ class Invocation:
 
 @contextmanager
 def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Marey]:
-    """A session with the server that the options, the environment or `marey login` name."""
+    """Return a connection to the server named by the options, the environment or `marey login`."""
     from marey_client.credentials import resolve
     from marey_client.errors import Unauthenticated
     from marey_client.marey import Marey

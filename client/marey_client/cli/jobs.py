@@ -1,4 +1,4 @@
-"""`job` and `why`."""
+"""Commands `job` and `why`."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
 
 
 def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
-    """Return an item, or where the input takes many, a folder; or what a job makes."""
+    """Return an item, or a folder if the input takes several items, or the output of a job."""
     from marey_schemas.jobs import ItemInput, JobOutputsInput
 
     if address.has_id and address.name.startswith("job_"):

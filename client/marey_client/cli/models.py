@@ -1,4 +1,4 @@
-"""`model` and `sample`."""
+"""Commands `model` and `sample`."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def sample(
 
 
 def model_at(marey: Marey, place: str) -> ModelHandle:
-    """Return the model at a place. Raises `WrongUsage` where there is none."""
+    """Return the model at an address. Raises `WrongUsage` if there is none."""
     from marey_schemas.kinds import Kind
 
     found: ModelHandle = require_item(marey, Address.parse(place), [Kind.MODEL])

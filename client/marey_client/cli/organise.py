@@ -1,4 +1,4 @@
-"""`mv`, `rm`, `restore` and `tag`: a project is put in order. What is removed can be restored."""
+"""Commands `mv`, `rm`, `restore` and `tag`, which organise a project. Removed items can be restored."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _parted(path: str) -> tuple[str, str]:
 
 
 def _typed(thing: Thing) -> str:
-    """Return a thing as it is typed; a folder with a final stroke."""
+    """Return the address of a folder or item as users type it; a folder ends with a slash."""
     place = f"{thing.place}/" if thing.kind == FOLDER else thing.place
     return place if place.isascii() and " " not in place else f"'{place}'"
 
@@ -163,7 +163,7 @@ def _named(things: Sequence[Thing]) -> str:
 
 
 def _ask(question: str) -> None:
-    """Go on after a yes. Raises `Refused` after anything else, `WrongUsage` where nobody can answer."""
+    """Ask for confirmation. Raises `Refused` unless the answer is yes, and `WrongUsage` without a terminal."""
     if not sys.stdin.isatty():
         raise WrongUsage(f"{question} there is no terminal to ask at: confirm with --yes")
     if not typer.confirm(question, err=True):
@@ -172,7 +172,7 @@ def _ask(question: str) -> None:
 
 
 def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_json: bool) -> None:
-    """Do something to each thing, also after a refusal, which is printed. Raises `Refused` at the end."""
+    """Apply a function to each folder or item, also after a refusal, which is printed. Raises `Refused` at the end."""
     from marey_client.errors import RequestFailed
 
     results: list[Any] = []

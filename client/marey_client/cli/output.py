@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 COPIED = ("id", "job")
-"""Columns whose cells people copy into the next command: the others give way where a terminal is narrow."""
+"""Columns that people copy into the next command; on a narrow terminal, the other columns are shortened."""
 
 
 def print_json(value: Any) -> None:
@@ -24,7 +24,7 @@ def print_json(value: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[str] = ()) -> None:
-    """Print rows under headings; the columns named in `right` are aligned to the right. Cells are plain text."""
+    """Print rows under headings, as plain text; the columns named in `right` are aligned to the right."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -42,7 +42,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
 
 def _shown(cell: object) -> str:
-    """Return a cell as text; moments to the second, as the server's clock of UTC has them."""
+    """Return a cell as text; times are in UTC, to the second."""
     from datetime import datetime
 
     if isinstance(cell, datetime):
@@ -51,7 +51,7 @@ def _shown(cell: object) -> str:
 
 
 def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
-    """Print names, figures aligned to the right, and what they count."""
+    """Print rows of a name, a number aligned to the right, and its unit."""
     rows = list(rows)
     widths = [max(len(row[place]) for row in rows) for place in range(2)]
     for name, figure, meaning in rows:
@@ -59,7 +59,7 @@ def print_rows(rows: Iterable[tuple[str, str, str]]) -> None:
 
 
 def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
-    """Print names and values, one pair a line."""
+    """Print names and values, one pair on each line."""
     shown = [(name, value) for name, value in pairs if value not in (None, "", ())]
     width = max((len(name) for name, _ in shown), default=0)
     for name, value in shown:
@@ -67,12 +67,12 @@ def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
 
 
 def tell(text: str) -> None:
-    """Print a message that is not a result, on the error stream."""
+    """Print a message that is not a result to standard error."""
     typer.echo(text, err=True)
 
 
 def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:
-    """Print the inputs that a job refused, and the reasons, on the error stream: a line each, at most `most`."""
+    """Print the refused inputs of a job with their reasons to standard error, at most `most` lines."""
     for one in refused[:most]:
         name, detail = str(one.get("name")), str(one.get("detail"))
         tell(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
@@ -81,12 +81,12 @@ def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = Non
 
 
 Advance = Callable[[str, float, float | None], None]
-"""Called with the current activity, the amount done, and the total amount."""
+"""Function called with the current activity, the amount done, and the total amount."""
 
 
 @contextmanager
 def progress() -> Iterator[Advance]:
-    """A bar on the error stream while the block runs; nothing where that is no terminal."""
+    """Show a progress bar on standard error inside the block; nothing if that is not a terminal."""
     if not sys.stderr.isatty():
         yield lambda _what, _done, _total: None
         return

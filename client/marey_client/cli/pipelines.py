@@ -1,4 +1,4 @@
-"""`pipeline` and `build-model`: jobs that work on the results of others, submitted and followed together."""
+"""Commands `pipeline` and `build-model`: jobs that read outputs of others, submitted and followed together."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def build_model(
 
 
 def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Parameters by step, and by the members of their objects."""
+    """Return the parameters typed for each step, with nested objects."""
     chosen: dict[str, dict[str, Any]] = {}
     for text in choices:
         path, equals, value = text.partition("=")
@@ -131,7 +131,7 @@ def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) -> None:
-    """Put a value at its place. Raises `WrongUsage` where something else was chosen on the way to it."""
+    """Set a value in nested objects. Raises `WrongUsage` if its path conflicts with an earlier one."""
     place: Any = chosen
     for depth, name in enumerate(path[:-1], start=1):
         place = place.setdefault(name, {})
@@ -141,7 +141,7 @@ def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) 
 
 
 def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the project, and the takes as `build_model` wants them. Files are sent."""
+    """Return the project, and the takes in the form that `build_model` needs. Local files are sent."""
     if project is None:
         addresses = [Address.parse(take) for take in takes]
         if len({address.project for address in addresses}) > 1:
@@ -169,9 +169,9 @@ def _skeleton(marey: Marey, to: str, project: str) -> str:
 
 
 def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> None:
-    """Wait for the jobs of a pipeline, if that is wanted, and print their states.
+    """Wait for the jobs of a pipeline if requested, and print their states.
 
-    Raises `JobUnsuccessful`, and `Refused` where jobs refused some of their inputs.
+    Raises `JobUnsuccessful`, and `Refused` if jobs refused some of their inputs.
     """
     if not wait:
         return print_steps(run, as_json)
@@ -192,7 +192,7 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
 
 
 def _refused(job: Job) -> list[Mapping[str, Any]]:
-    """Return the inputs that a job refused; of an import, files."""
+    """Return the inputs that a job refused; for an import, files."""
     result = job.result or {}
     failed = [entry for entry in result.get("entries", ()) if entry["status"] == "failed"]
     return [*result.get("refused", ()), *({"name": entry["name"], **entry["error"]} for entry in failed)]
@@ -222,7 +222,7 @@ def print_steps(run: PipelineRun, as_json: bool) -> None:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
-    """Show a table on the error stream while the block runs, if that is a terminal."""
+    """Show a table on standard error inside the block, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _steps: None
         return
@@ -252,7 +252,7 @@ def _state(job: Job) -> str:
 
 
 def _done(job: Job) -> str:
-    """Return the number of ended tasks of all tasks, or the progress of the job itself."""
+    """Return the number of ended tasks and of all tasks, or the progress of a job without tasks."""
     if job.state.terminal and job.size is None:
         return ""
     if job.size is not None:

@@ -1,4 +1,4 @@
-"""`serve`, `worker`, `demo` and `db`: commands that run here instead of asking a server."""
+"""Commands `serve`, `worker`, `demo` and `db`, which run locally instead of asking a server."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DatabaseUrl = Annotated[
 
 
 class LogForm(StrEnum):
-    """The form of log lines."""
+    """Form of log lines."""
 
     TEXT = "text"
     JSON = "json"

@@ -1,4 +1,4 @@
-"""`project` and `member`."""
+"""Commands `project` and `member`."""
 
 from __future__ import annotations
 

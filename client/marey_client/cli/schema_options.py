@@ -36,15 +36,15 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 Chosen = dict[str, Any]
-"""The options of one model that were typed, by its fields."""
+"""Values of the options given on the command line, by field of the model."""
 
 NONE = "none"
-"""The text for null, of fields that have another default."""
+"""Text that stands for null in options with another default."""
 
 
 @dataclass(frozen=True)
 class OptionsOf:
-    """The fields of a model that become options of a command.
+    """Options of a command that are derived from the fields of a model.
 
     Parameters
     ----------
@@ -63,11 +63,11 @@ class OptionsOf:
 
     @cached_property
     def options(self) -> tuple[_Option, ...]:
-        """The options, in the order of the fields; fields of nested models in the place of those."""
+        """The options in the order of the fields; a nested model is replaced by its fields."""
         return tuple(self._made(parameters_of(self._model), ()))
 
     def read(self, typed: Mapping[str, Any]) -> Chosen:
-        """Return what was typed as the fields of the model. Raises `WrongUsage` for what the model refuses."""
+        """Return the options given as fields of the model. Raises `WrongUsage` if the model refuses them."""
         from pydantic import ValidationError
 
         chosen: Chosen = {}
@@ -103,7 +103,7 @@ class OptionsOf:
             yield _Option(path, schema, _several(self.short.get(path[-1], ())), self.nulls.get(name))
 
     def _spelled(self, place: tuple[int | str, ...]) -> str:
-        """Name the option that a place in the model belongs to."""
+        """Return the name of the option for a place in the model."""
         fitting = (one for one in self.options if place[: len(one.path)] == one.path)
         option = next(fitting, None)
         if option is None:
@@ -130,7 +130,7 @@ class _Option:
         return (f"--{name}", *(one for one in self.short if one != f"--{name}"))
 
     def parameter(self) -> inspect.Parameter:
-        """Return the parameter of a command that typer makes this option of."""
+        """Return the function parameter from which typer creates this option."""
         declared = [f"{one}/--no-{one[2:]}" for one in self.spellings] if self._form == "boolean" else self.spellings
         option = typer.Option(*declared, help=self.help, metavar=self._metavar, show_default=False)
         return inspect.Parameter(
@@ -138,7 +138,7 @@ class _Option:
         )
 
     def read(self, typed: Any) -> Any:
-        """Return a typed value as the model takes it. Raises `WrongUsage`."""
+        """Convert a typed value to the type of the field. Raises `WrongUsage`."""
         spelled = self.spellings[0]
         if self._form == "number or none":
             return None if typed in (NONE, self.null) else read_number(typed, spelled)
@@ -152,7 +152,7 @@ class _Option:
 
     @property
     def help(self) -> str:
-        """Return the help text of an option: description, range, default, and the form of several values."""
+        """Return the help text of an option: description, range, default, and the syntax for several values."""
         meaning = self.schema.get("description", "")
         notes = [
             range_text(self._schema),
@@ -201,7 +201,7 @@ class _Option:
 
 
 def add_command(app: typer.Typer, function: Callable[..., Any], name: str | None = None, **options: OptionsOf) -> None:
-    """Register a command whose parameters named in `options` get what is typed of the options of a model."""
+    """Register a command; the parameters named in `options` receive the options given for their models."""
 
     class Command(TyperCommand):
         @cached_property
@@ -225,7 +225,7 @@ def add_command(app: typer.Typer, function: Callable[..., Any], name: str | None
 
 
 def _expanded(function: Callable[..., Any], groups: Mapping[str, OptionsOf]) -> Callable[..., Any]:
-    """Return a function that has each option as a parameter, and calls `function` with what was typed."""
+    """Return a function with each option as a parameter, which calls `function` with the options given."""
 
     def run(**typed: Any) -> Any:
         for name, group in groups.items():

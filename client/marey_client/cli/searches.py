@@ -1,4 +1,4 @@
-"""`search` and `tree`."""
+"""Commands `search` and `tree`."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def _constraint(
 
 
 def _moment(text: str) -> str | float:
-    """Return a canonical frame where it is a number, else a label."""
+    """Return a time as a canonical frame if it is a number, else as a label."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""`skeleton map` and `skeleton axes`."""
+"""Commands `skeleton map` and `skeleton axes`."""
 
 from __future__ import annotations
 

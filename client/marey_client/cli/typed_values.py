@@ -1,4 +1,4 @@
-"""Values that people type or keep in files of JSON, read and described by a JSON Schema."""
+"""Values on the command line or in JSON files, parsed and described by a JSON Schema."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Schema = Mapping[str, Any]
 
 STANDARD_INPUT = "-"
 MOST_DIGITS = 18
-"""Digits of the number of a frame, which is sent as a 64-bit integer."""
+"""Greatest number of digits of a frame number, which is sent as a 64-bit integer."""
 MOST_VALUES = 200
-"""Values of a range, where the schema sets no limit."""
+"""Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
 MOST_TOLD = 1e15
-"""Larger bounds are those of the integers of a computer, not of the field."""
+"""Bounds above this are those of machine integers, and are not shown."""
 
 
 # -- schemas --
@@ -66,7 +66,7 @@ def without_null(schema: Schema) -> Schema:
 
 
 def type_text(schema: Schema) -> str:
-    """Name the type of a value in a word or two."""
+    """Return a short name for the type of a value."""
     names = []
     for one in _choices(schema):
         if "const" in one or "enum" in one:
@@ -84,7 +84,7 @@ def type_text(schema: Schema) -> str:
 
 
 def range_text(schema: Schema) -> str:
-    """Name the range of a number, or of the numbers of a list or an object; empty where there is none."""
+    """Return the range of a number, or of the numbers in a list or an object; empty if there is none."""
     of = without_null(schema.get("items") or schema.get("additionalProperties") or schema)
     if "minimum" in of and "maximum" in of:
         return f"{_number_text(of['minimum'])} to {_number_text(of['maximum'])}"
@@ -94,7 +94,7 @@ def range_text(schema: Schema) -> str:
 
 
 def default_text(schema: Schema) -> str:
-    """Write a default as people type it; empty where nothing is the default."""
+    """Return a default in the syntax of the command line; empty if there is none."""
     default = schema.get("default")
     if isinstance(default, bool):
         return "on" if default else ""
@@ -110,7 +110,7 @@ def _number_text(number: float) -> str:
 
 
 def _list_text(values: Sequence[Any]) -> str:
-    """Write equally spaced numbers as first:last:step, other values as a,b,c."""
+    """Return equally spaced numbers as first:last:step, other values as a,b,c."""
     if len(values) > 3 and all(isinstance(value, float) for value in values):
         step = values[1] - values[0]
         if all(abs(after - before - step) < EVEN for before, after in pairwise(values)):
@@ -122,7 +122,7 @@ def _list_text(values: Sequence[Any]) -> str:
 
 
 def json_or_text(text: str) -> Any:
-    """Return a value: JSON where it is, else the text itself."""
+    """Return a text parsed as JSON, or unchanged if it is not JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -130,7 +130,7 @@ def json_or_text(text: str) -> Any:
 
 
 def is_frame(text: str) -> bool:
-    """Return whether a text is the number of a frame."""
+    """Return whether a text is a frame number."""
     return text.isdecimal() and len(text) <= MOST_DIGITS
 
 
@@ -160,14 +160,14 @@ def read_value(text: str, schema: Schema) -> Any:
 
 
 def read_parameter(text: str, schema: Schema | None) -> Any:
-    """Return a value: JSON where it is, but text where the schema takes nothing else."""
+    """Return a text parsed as JSON; unchanged if the schema only allows text."""
     value = json_or_text(text)
     only_text = schema is not None and all(one.get("type") == "string" for one in _choices(schema))
     return text if only_text and not isinstance(value, str) else value
 
 
 def read_number(text: str, given: str) -> float:
-    """Return a number. Raises `WrongUsage` with the text that holds it."""
+    """Return a number. Raises `WrongUsage`, which shows the text."""
     try:
         return float(text)
     except ValueError:
@@ -175,7 +175,7 @@ def read_number(text: str, given: str) -> float:
 
 
 def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str, float]:
-    """Return name and number of `name=number`. Raises `WrongUsage`, also for a name that is none of `names`."""
+    """Return name and number of `name=number`. Raises `WrongUsage`, also for a name that is not in `names`."""
     name, equals, value = text.rpartition("=")
     if not (name and equals) or (names is not None and name not in names):
         known = "" if names is None else f" with one of {', '.join(names)}"
@@ -184,7 +184,7 @@ def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str
 
 
 def read_numbers(text: str, most: int | None = None) -> list[float]:
-    """Return all values of a range `1:3:0.25`, its last one included, or those of `1,2,3`. Raises `WrongUsage`."""
+    """Return the values of a range `1:3:0.25`, including the last one, or of `1,2,3`. Raises `WrongUsage`."""
     try:
         numbers = [float(part) for part in text.replace(",", ":").split(":")]
     except ValueError:

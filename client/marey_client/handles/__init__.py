@@ -1,1 +1,1 @@
-"""Handles of items, pipelines and streams: objects that represent things of a server, and ask it when called."""
+"""Handles: objects for items, pipelines and streams of a server, whose methods send requests."""

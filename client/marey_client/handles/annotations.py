@@ -14,18 +14,18 @@ from marey_schemas.items import Item
 
 
 class AnnotationHandle(ItemHandle):
-    """One layer of annotation over a clip."""
+    """Handle of an annotation: one layer of segments and keyframes over a clip."""
 
     def document(self, *, revision: int | None = None) -> Annotation:
-        """Return its clip, segments and keyframes."""
+        """Return the annotation's clip, segments and keyframes."""
         return Annotation.model_validate(self.part("annotation", revision=revision))
 
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
-        """Apply commands one after another, all of them or none, as one new revision.
+        """Apply commands in order, all or none, as one new revision.
 
-        A command is what its documentation lists, such as `{"command": "split_segment", "at": 120}`.
-        `PreconditionFailed` if somebody changed the annotation since it was read, `RequestFailed` naming the command
-        that cannot be carried out.
+        A command is a dict as in its documentation, such as `{"command": "split_segment", "at": 120}`. Raises
+        `PreconditionFailed` if the annotation was changed since it was read, and `RequestFailed`, which names the
+        command, if one cannot be applied.
         """
         change = AnnotationChange.model_validate({"commands": several(commands), "message": message})
         response = self.transport.send(
@@ -34,5 +34,5 @@ class AnnotationHandle(ItemHandle):
         return self._renewed(read_model(Item, response))
 
     def put(self, annotation: Annotation, *, message: str | None = None) -> Item:
-        """Make a revision with other segments and keyframes."""
+        """Create a revision with other segments and keyframes."""
         return self.put_part("annotation", annotation.model_dump(mode="json", by_alias=True), message=message)

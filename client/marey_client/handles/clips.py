@@ -22,9 +22,9 @@ from marey_schemas.kinds import Kind
 
 
 class MotionArrays(MotionDocument):
-    """The poses of a clip, or of some of its frames and joints.
+    """Poses of a clip, or of some of its frames and joints.
 
-    Metres, right-handed with Y up; quaternions w, x, y, z. Members a newer server adds are ignored.
+    Metres, right-handed with Y up; quaternions w, x, y, z. Members that a newer server adds are ignored.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -41,7 +41,7 @@ class MotionArrays(MotionDocument):
 
 
 class ClipHandle(ItemHandle):
-    """One clip."""
+    """Handle of a clip."""
 
     def motion(
         self,
@@ -50,7 +50,7 @@ class ClipHandle(ItemHandle):
         joints: str | Sequence[str] | None = None,
         revision: int | None = None,
     ) -> MotionArrays:
-        """Return the poses as numpy arrays; only the blocks that hold `frames` and `joints` are read and sent."""
+        """Return the poses as numpy arrays; only the blocks that contain `frames` and `joints` are read and sent."""
         query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
@@ -59,11 +59,11 @@ class ClipHandle(ItemHandle):
         return ClipInfo.model_validate(self.part("info"))
 
     def put_info(self, info: ClipInfo) -> Item:
-        """Make a revision with another description; the poses are shared."""
+        """Create a revision with another description and the same poses."""
         return self.put_part("info", info.model_dump(mode="json", by_alias=True))
 
     def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:
-        """Make a revision with other poses; `PreconditionFailed` if the clip was changed since it was read."""
+        """Create a revision with other poses. Raises `PreconditionFailed` if the clip was changed since it was read."""
         return self.put_part("motion", motion.model_dump(by_alias=True, exclude_none=True), message=message)
 
     def annotations(self) -> Iterator[AnnotationHandle]:
@@ -72,9 +72,9 @@ class ClipHandle(ItemHandle):
         return found.list(sort="created_at", filters={"clip": self.id})
 
     def annotate(self, layer: str, *, name: str | None = None, **said: Any) -> AnnotationHandle:
-        """Make a layer of annotation beside the clip, over the revision that was read.
+        """Create an annotation of this revision of the clip, in the clip's folder.
 
-        `said` are `segments` and `keyframes` as in `Annotation`; a layer may start without any.
+        `said` are `segments` and `keyframes` as in `Annotation`; without them the annotation is empty.
         """
         document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **said})
         return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(
@@ -95,7 +95,7 @@ class ClipHandle(ItemHandle):
         return preview_edit(self.transport, self.url, commands, frames=bounds, **given)
 
     def import_annotation(self, document: Mapping[str, Any], **options: Any) -> AnnotationHandle:
-        """Make an annotation beside the clip from a document of the predecessor.
+        """Create an annotation in the clip's folder from a document of the predecessor.
 
         `options` are those of `AnnotationImport`, such as `layer="phases"` or `end_index="exclusive"`.
         """
@@ -105,7 +105,7 @@ class ClipHandle(ItemHandle):
 
 
 def frames_text(frames: slice | None) -> str | None:
-    """Write a slice as the query `a:b`; None for all frames. Raises `ValueError` for steps and negative bounds."""
+    """Return a slice as the query `a:b`; None for all frames. Raises `ValueError` for steps and negative bounds."""
     if frames is None:
         return None
     if frames.step not in (None, 1):

@@ -25,7 +25,7 @@ ROOT_COLUMNS = 3
 
 @dataclass(frozen=True)
 class CoverageStreams:
-    """The performances of a project that are being measured."""
+    """Coverage streams of a project."""
 
     transport: Transport
     project: str
@@ -38,10 +38,11 @@ class CoverageStreams:
     def begin(
         self, frame_rate_hz: float, *, skeleton: str | None = None, evaluation: str | None = None, **options: Any
     ) -> CoverageStreamHandle:
-        """Begin to measure a performance.
+        """Create a coverage stream.
 
-        `skeleton` is the id of the one whose poses will be sent; `evaluation` that of an evaluation whose coverage is
-        gone on from. `options` are those of `CoverageStreamCreate`, for example `turn_rates_deg_s=(-90, 0, 90)`.
+        `skeleton` is the id of the skeleton of the poses to be sent; `evaluation` is the id of an evaluation whose
+        coverage is the initial state. `options` are those of `CoverageStreamCreate`, for example
+        `turn_rates_deg_s=(-90, 0, 90)`.
         """
         request = CoverageStreamCreate.model_validate(
             {"frame_rate_hz": frame_rate_hz, "skeleton": skeleton, "evaluation": evaluation, **options}
@@ -55,12 +56,12 @@ class CoverageStreams:
         )
 
     def list(self) -> Iterator[CoverageStream]:
-        """Every stream that got frames within a day, the newest first."""
+        """List the streams that received frames within a day, newest first."""
         return pages(self.transport, CoverageStream, self.url)
 
 
 class CoverageStreamHandle:
-    """One performance that is being measured. `offset` counts the frames sent so far."""
+    """Handle of a coverage stream. `offset` is the number of frames sent so far."""
 
     def __init__(self, transport: Transport, streams_url: str, stream: CoverageStream) -> None:
         self.transport = transport
@@ -97,11 +98,11 @@ class CoverageStreamHandle:
         return self._send({"offset": self.offset, "ends_take": True})
 
     def read(self) -> CoverageStreamState:
-        """Return the whole map, the state of the performer, and the motions to record next."""
+        """Return the whole coverage map, the performer's state, and the motions to record next."""
         return self.transport.get(CoverageStreamState, self.url)
 
     def delete(self) -> None:
-        """Drop the stream; the server does so by itself a day after its last frame."""
+        """Delete the stream; the server deletes it a day after its last frame."""
         self.transport.send("DELETE", self.url)
 
     def _send(self, said: dict[str, Any]) -> CoverageProgress:

@@ -1,4 +1,4 @@
-"""Edits: lists of commands that are saved as items, applied to clips, and looked at before."""
+"""Edits: lists of commands saved as items, previewed, and applied to clips."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ from marey_schemas.items import Item
 
 
 class EditHandle(ItemHandle):
-    """One edit."""
+    """Handle of an edit."""
 
     def document(self, *, revision: int | None = None) -> EditDocument:
-        """Return its title and its commands."""
+        """Return the edit's title and commands."""
         return EditDocument.model_validate(self.part("edit", revision=revision))
 
     def put(self, edit: EditDocument, *, message: str | None = None) -> Item:
-        """Make a revision with other commands; `PreconditionFailed` if it was changed since it was read."""
+        """Create a revision with other commands.
+
+        Raises `PreconditionFailed` if the edit was changed since it was read.
+        """
         return self.put_part("edit", edit.model_dump(mode="json", by_alias=True), message=message)
 
 
 Command = Mapping[str, Any] | BaseModel
 Commands = EditHandle | EditDocument | Command | Sequence[Command]
-"""An edit that is stored or not, or its commands, such as `{"command": "trim", "start": 10}`."""
+"""Edit as a handle or a document, or a list of commands such as `{"command": "trim", "start": 10}`."""
 
 
 class Edits(Items[EditHandle]):
-    """The edits of a project."""
+    """Edits of a project."""
 
     def save(
         self,
@@ -44,7 +47,7 @@ class Edits(Items[EditHandle]):
         collection: str = "",
         message: str = "",
     ) -> EditHandle:
-        """Keep commands as an edit: a new one, or a revision of the one that has this name in the collection."""
+        """Save commands as an edit: a new one, or a new revision of the edit with this name in the collection."""
         edit = as_edit(commands, title=title)
         held = next(self.list(path=f"{collection}/{name}".lstrip("/"), page_size=1), None)
         if held is not None:

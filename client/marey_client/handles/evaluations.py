@@ -1,4 +1,4 @@
-"""Evaluations of locomotion clips: read the results of one, and improve the clips by them."""
+"""Evaluations of locomotion clips: results, and jobs that improve the clips by them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
 
 class EvaluationHandle(ReportedHandle):
-    """One evaluation."""
+    """Handle of an evaluation."""
 
     @property
     def verdict(self) -> str:
@@ -35,7 +35,10 @@ class EvaluationHandle(ReportedHandle):
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Return all but the ticks: options, provenance, metrics, usage, coverage; arrays are numpy arrays."""
+        """Return the evaluation without its ticks: options, provenance, metrics, usage, coverage.
+
+        Arrays are numpy arrays.
+        """
         return self.part("evaluation", revision=revision)
 
     def trials(self) -> list[dict[str, Any]]:
@@ -53,13 +56,14 @@ class EvaluationHandle(ReportedHandle):
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
         """Return the frames that the trials displayed, the jumps between them, and the order of each walk.
 
-        `nodes` are frames of clips with the ticks they were displayed for, `edges` jumps with their number, by index of
-        the nodes; `walks` are runs of frames, one list for each of `trials`. Without `trial`, all trials together.
+        `nodes` are frames of clips with the number of ticks for which they were displayed; `edges` are jumps with their
+        number, by index of the nodes; `walks` are runs of frames, one list for each of `trials`. Without `trial`, the
+        graph is that of all trials together.
         """
         return dict(json.loads(self._walk_graph("json", trial)))
 
     def save_walk_graph(self, path: str | Path, *, trial: str | None = None) -> Path:
-        """Write the walk graph to a file, as GraphML or JSON by the ending of its name."""
+        """Write the walk graph to a file, as GraphML or JSON according to its ending."""
         form = Path(path).suffix.lower().removeprefix(".")
         if form not in ("json", "graphml"):
             raise ValueError(f"{path}: the name of a walk graph must end in .json or .graphml")
@@ -80,7 +84,7 @@ class EvaluationHandle(ReportedHandle):
     def suggest(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find clips that can go, and those of the candidates, folders and clips, that fill holes.
+        """Find clips to remove, and candidates, given as folders and clips, that fill gaps.
 
         `options` are those of `SuggestParams`.
         """
@@ -89,7 +93,7 @@ class EvaluationHandle(ReportedHandle):
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Remove clips and add candidates, one step after another, as long as that lowers the objective.
+        """Remove clips and add candidates step by step, as long as that lowers the objective.
 
         `options` are those of `OptimiseParams`.
         """
@@ -102,20 +106,20 @@ class EvaluationHandle(ReportedHandle):
     # -- requests for the same jobs --
 
     def compare_request(self, after: EvaluationHandle, **options: Any) -> JobCreate:
-        """Ask for a comparison with another evaluation; `options` are those of `CompareParams`."""
+        """Return the job request of `compare`; `options` are those of `CompareParams`."""
         inputs = {"before": self.as_input(), "after": after.as_input()}
         return job_request("compare", inputs, CompareParams.model_validate(options))
 
     def suggest_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
-        """Ask for suggestions; `options` are those of `SuggestParams`."""
+        """Return the job request of `suggest`; `options` are those of `SuggestParams`."""
         return job_request("suggest", self._with_candidates(candidates), SuggestParams.model_validate(options))
 
     def optimise_request(self, candidates: Places[ClipHandle] = (), **options: Any) -> JobCreate:
-        """Ask for an optimisation; `options` are those of `OptimiseParams`."""
+        """Return the job request of `optimise`; `options` are those of `OptimiseParams`."""
         return job_request("optimise", self._with_candidates(candidates), OptimiseParams.model_validate(options))
 
     def sweep_request(self, **options: Any) -> JobCreate:
-        """Ask for a sweep of the weights; `options` are those of `SweepParams`."""
+        """Return the job request of `sweep`; `options` are those of `SweepParams`."""
         return job_request("sweep", {"evaluation": self.as_input()}, SweepParams.model_validate(options))
 
     def _with_candidates(self, candidates: Places[ClipHandle]) -> dict[str, Any]:
@@ -132,7 +136,7 @@ class EvaluationHandle(ReportedHandle):
 
 
 def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """One row per trial of an evaluation's document: what it asked for and its metrics, flat."""
+    """Return one flat row for each trial of an evaluation's document: its requested motion and its metrics."""
     for one in document["trials"]:
         asked = one["trial"]
         turn_rate_deg_s = math.degrees(asked["turn_rate_rad_s"])
@@ -146,7 +150,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """One row per clip of an evaluation's document: its frames at the rate of the trials, and how much it was used."""
+    """Return one row for each clip of an evaluation's document: its frames at the rate of the trials, and its use."""
     usage = document["usage"]
     columns = zip(*(usage[name].tolist() for name in ("ticks", "share", "entries", "trials")), strict=True)
     for clip, (ticks, share, entries, trials) in zip(document["clips"], columns, strict=True):

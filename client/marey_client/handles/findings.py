@@ -1,4 +1,4 @@
-"""Findings of jobs on evaluations: numbers, a document with all results, and sometimes a report."""
+"""Findings: results of jobs on evaluations, with numbers, a document, and for some kinds a report."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from marey_schemas.jobs import Job
 
 @dataclass(frozen=True)
 class Findings:
-    """The findings of one job; `job.result` holds their counts."""
+    """Findings of one job; `job.result` holds their counts."""
 
     transport: Transport
     job: Job
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The numbers that lists show."""
+        """The numbers shown in lists."""
         return {name: value for name, value in (self.job.result or {}).items() if name not in ("document", "report")}
 
     def document(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Generative models of motion: read the quality of one, and draw motions from it."""
+"""Generative models of motion: their quality, and motions drawn from them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Samples:
 
 
 class ModelHandle(SearchableHandle):
-    """One model."""
+    """Handle of a model."""
 
     @property
     def verdict(self) -> str:
@@ -58,7 +58,7 @@ class ModelHandle(SearchableHandle):
         return dict(self.document()["training"] or {})
 
     def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:
-        """Draw `n` motions; the same for the same seed, and the first are those of a smaller number."""
+        """Draw `n` motions. The same seed gives the same motions; a greater `n` adds motions at the end."""
         tree = self._samples(n, seed, revision)
         motions = tuple(MotionArrays.model_validate(motion) for motion in tree["motions"])
         return Samples(tree["latents"], tree["log_densities"], motions)
@@ -73,7 +73,7 @@ class ModelHandle(SearchableHandle):
         unit: str | None = None,
         revision: int | None = None,
     ) -> list[Path]:
-        """Draw `n` motions and write each to a file: bvh, npz or predecessor; or all to one, as json."""
+        """Draw `n` motions and write each to a file (bvh, npz or predecessor), or all to one file (json)."""
         if format == "json":
             target = Path(folder) / safe_file_name(f"{self.name} {seed}.json")
             return [_saved(target, encode_tree(self._samples(n, seed, revision), JSON))]
@@ -89,9 +89,10 @@ class ModelHandle(SearchableHandle):
     def add_samples(
         self, n: int = 1, seed: int = 0, *, into: str, tags: str | Sequence[str] = (), names: str | None = None
     ) -> list[ClipHandle]:
-        """Draw `n` motions and make clips of them in the folder `into`, on the model's skeleton.
+        """Draw `n` motions and create clips from them in the folder `into`, on the model's skeleton.
 
-        They are called `names`, by default as the model, then seed and number. `Conflict` where a name is taken.
+        By default, they are called after the model, then seed and number; `names` gives other names. Raises `Conflict`
+        if a name is taken.
         """
         tree = self._samples(n, seed, self.item.revision)
         clips = Items(self.transport, self.project, Kind.CLIP, ClipHandle)

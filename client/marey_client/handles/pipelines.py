@@ -1,4 +1,4 @@
-"""Pipelines: jobs that work on the results of others, submitted and followed together."""
+"""Pipelines: jobs that read outputs of others, submitted and followed together."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ OnProgress = Callable[[Mapping[str, Job]], None]
 LOOK_EVERY_S = 1.0
 LONGEST_WAIT_S = 20.0
 SHORTEST_PAUSE_S = 0.2
-"""Between two looks, however soon the server answers."""
+"""Least time in seconds between two requests for the state of the jobs."""
 
 
 class PipelineRun:
-    """The jobs of a pipeline by the names of its steps, as they stood when last looked at."""
+    """Jobs of a pipeline by the names of its steps, in their states at the last request."""
 
     def __init__(self, transport: Transport, jobs: Mapping[str, Job]) -> None:
         self._jobs = Jobs(transport)
@@ -33,23 +33,23 @@ class PipelineRun:
 
     @property
     def steps(self) -> Mapping[str, Job]:
-        """Every job, each after those it needs."""
+        """All jobs, each after those it depends on."""
         return MappingProxyType(self._steps)
 
     @property
     def ended(self) -> bool:
-        """True when every job has ended."""
+        """Whether every job has ended."""
         return all(job.state.terminal for job in self._steps.values())
 
     def refresh(self) -> dict[str, Job]:
-        """Return the jobs by step, as they are now."""
+        """Request the states of the jobs; return the jobs by step."""
         return dict(self._look(wait_s=0.0))
 
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
-        """Wait until every job has ended; `on_progress` sees all of them about once a second.
+        """Wait until every job has ended; `on_progress` is called with all of them about once a second.
 
-        Raises `JobUnsuccessful` for the first step that brought nothing by its own fault, `WaitedTooLong` after
-        `timeout_s`; the jobs go on in both cases.
+        Raises `JobUnsuccessful` for the first step that failed by itself, not only because of another one, and
+        `WaitedTooLong` after `timeout_s`; the jobs continue in both cases.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -69,11 +69,11 @@ class PipelineRun:
                 time.sleep(max(0.0, min(left_s, asked + SHORTEST_PAUSE_S - time.monotonic())))
 
     def outputs(self, step: str) -> Iterator[JobOutput]:
-        """The revisions a step made."""
+        """Return the revisions created by a step."""
         return self._jobs.outputs(self._steps[step].id)
 
     def cancel(self) -> Mapping[str, Job]:
-        """Ask every job that has not ended to stop, the last ones first: so none fails because another was stopped."""
+        """Cancel every job that has not ended, the last ones first, so that none fails because of another."""
         for job in reversed(self.refresh().values()):
             if not job.state.terminal:
                 with suppress(Conflict):  # it has ended since
@@ -81,7 +81,7 @@ class PipelineRun:
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:
-        """Ask for every job that had not ended; up to `wait_s` later if the first of them does not end before."""
+        """Request the state of every unfinished job, after waiting up to `wait_s` for the end of the first."""
         for name, known in self._steps.items():
             if not known.state.terminal:
                 self._steps[name] = self._jobs.get(known.id, wait_s=wait_s)

@@ -1,4 +1,4 @@
-"""Aligned clips: read canonical frames, time functions and sources."""
+"""Aligned clips: canonical frames, time functions and sources."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from marey_schemas.kinds import Kind
 
 
 class ProcessedHandle(ItemHandle):
-    """An aligned clip: canonical frames of an action, and the mapping to the frames of its source clip."""
+    """Handle of an aligned clip: canonical frames of an action, and their mapping to frames of the source clip."""
 
     def motion(
         self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None
     ) -> MotionArrays:
-        """Return its canonical frames, in the canonical frame of reference."""
+        """Return the canonical frames, in the canonical frame of reference."""
         query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Return its set, keyframes, cost and options, and the places and times of its frames in the source."""
+        """Return set, keyframes, cost and options of the alignment, and the origin of the frames in the source."""
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
@@ -34,7 +34,7 @@ class ProcessedHandle(ItemHandle):
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:
-        """Return the clip that it comes from, as it is now; None if that is not in the store."""
+        """Return the source clip at its newest revision; None if it is not in the store."""
         clip = self.info().clip
         if clip is None:
             return None

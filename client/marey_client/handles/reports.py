@@ -11,7 +11,7 @@ from marey_schemas.documents.reports import StoredFigure
 
 
 class ReportedHandle(ItemHandle):
-    """An item that may have a part `report`."""
+    """Handle of an item that may have a part `report`."""
 
     def figures(self) -> tuple[StoredFigure, ...]:
         """Return the figures of the report."""
@@ -31,7 +31,7 @@ class ReportedHandle(ItemHandle):
     ) -> bytes:
         """Return a figure as png or svg, its data as json, or one table of its data as csv.
 
-        `trial` names one of an evaluation, for figures that were asked for of it.
+        `trial` names the trial, for figures of single trials.
         """
         params = {"format": format, "trial": trial, "table": table}
         return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
@@ -58,7 +58,7 @@ class ReportedHandle(ItemHandle):
 
 
 def saved(path: str | Path, data: bytes) -> Path:
-    """Write bytes to a file that appears whole or not at all."""
+    """Write bytes to a file that is created completely or not at all."""
     with saved_atomically(path) as file:
         file.write(data)
     return Path(path)

@@ -1,4 +1,4 @@
-"""Motions of models that meet constraints, and the trees that make searching for them quick."""
+"""Searches for motions of models that meet constraints, and the trees that make searches fast."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from marey_schemas.search import SearchAnswer, SearchRequest
 
 Constraint = Mapping[str, Any] | BaseModel
 Constraints = Constraint | Sequence[Constraint]
-"""Such as `{"type": "joint_position", "joint": "left_wrist", "at": "contact", "target_m": (0.3, 1.2, None)}`."""
+"""Constraint: `{"type": "joint_position", "joint": "left_wrist", "at": "contact", "target_m": (0.3, 1, None)}`."""
 
 
 class SearchableHandle(ReportedHandle):
-    """An item whose motions can be searched."""
+    """Handle of an item whose motions can be searched."""
 
     def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
         """Return the motion that meets constraints best; `options` are those of `SearchRequest`.
 
-        Several motions that follow one another are asked for with `steps`, each with constraints and, where it is
-        another one, the id of its model. The answer holds the error of each constraint.
+        `steps` requests a sequence of motions, each with its constraints and, if different, the id of its model. The
+        answer contains the error of each constraint.
         """
         request = search_request(constraints, **options)
         response = self.transport.send(
@@ -46,7 +46,7 @@ class SearchableHandle(ReportedHandle):
         unit: str = "cm",
         **options: Any,
     ) -> Path:
-        """Write what a search finds to a file of motion: bvh, npz or predecessor."""
+        """Write the result of a search to a motion file: bvh, npz or predecessor."""
         response = self.transport.send(
             "POST",
             f"{self.url}/search/export",
@@ -63,7 +63,7 @@ class SearchableHandle(ReportedHandle):
         return target
 
     def make_tree(self, *, seed: int = 0, on_progress: OnProgress | None = None, **options: Any) -> Job:
-        """Group samples of the model, as its part `tree`, and wait until that is done. Raises `JobUnsuccessful`.
+        """Build a tree of samples as the model's part `tree`, and wait for its job. Raises `JobUnsuccessful`.
 
         `options` are those of `TreeParams`.
         """
@@ -71,10 +71,10 @@ class SearchableHandle(ReportedHandle):
         return Jobs(self.transport).run(self.project, request, on_progress=on_progress)
 
     def tree_request(self, **options: Any) -> JobCreate:
-        """Ask for the tree of samples; `options` are those of `TreeParams`."""
+        """Return the job request of `make_tree`; `options` are those of `TreeParams`."""
         return job_request("tree", {"model": self.as_input()}, TreeParams.model_validate(options))
 
 
 def search_request(constraints: Constraints, **options: Any) -> SearchRequest:
-    """Return a request with these constraints."""
+    """Return a search request with the given constraints."""
     return SearchRequest.model_validate({"constraints": several(constraints), **options})

@@ -8,7 +8,7 @@ from marey_schemas.items import Item
 
 
 class SkeletonHandle(ItemHandle):
-    """One skeleton."""
+    """Handle of a skeleton."""
 
     def hierarchy(self) -> SkeletonHierarchy:
         """Return joints, offsets and rest pose."""
@@ -19,5 +19,5 @@ class SkeletonHandle(ItemHandle):
         return SkeletonMapping.model_validate(self.part("mapping"))
 
     def put_mapping(self, mapping: SkeletonMapping) -> Item:
-        """Make a revision with another mapping."""
+        """Create a revision with another mapping."""
         return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))

@@ -1,1 +1,1 @@
-"""Documents that the revisions of items are made of."""
+"""Documents of the revisions of items."""

@@ -17,7 +17,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ExampleRef(Request):
-    """A revision of a clip, as it is or mirrored."""
+    """Revision of a clip, either unchanged or mirrored."""
 
     item: str
     revision: int = Field(ge=1)
@@ -35,7 +35,7 @@ class AlignedPlacement(Request):
 
 
 class AlignmentInfo(Request):
-    """Part `info` of an aligned clip: which set it belongs to, and the way back to its source.
+    """Part `info` of an aligned clip: its set of examples, and the mapping to its source.
 
     Part `motion` holds its canonical frames.
     """

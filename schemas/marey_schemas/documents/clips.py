@@ -1,4 +1,4 @@
-"""Clips: their motions and what is known about where they come from.
+"""Clips: their motions, and descriptions of their origin.
 
 Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed with Y up
 (docs/explanation/conventions.md).
@@ -58,7 +58,7 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """One finding about a motion: a stable code, where it was seen, and a sentence for people."""
+    """Finding about a motion: a stable code, its place, and a sentence."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
     message: str
@@ -86,7 +86,7 @@ class ClipSource(Request):
 
 
 class ClipInfo(Request):
-    """Part `info` of a clip: what people and importers say about it."""
+    """Part `info` of a clip: descriptions by users and importers."""
 
     schema_: Literal["marey/clip-info@1"] = Field("marey/clip-info@1", alias="schema")
     subject: str | None = None

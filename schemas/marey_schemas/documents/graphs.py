@@ -1,4 +1,4 @@
-"""Graphs of motion primitives: which action may follow which."""
+"""Graphs of motion primitives: they define which action may follow which."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NodeName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 
 
 class GraphPlace(Request):
-    """A primitive of an action."""
+    """Reference to a primitive of an action."""
 
     action: NodeName
     primitive: NodeName
@@ -45,8 +45,8 @@ class GraphAction(Request):
 class ModelGraph(Request):
     """Part `graph` of an item of the kind `graph`.
 
-    Every primitive can be reached from the start, from every primitive one can come to an end (of type end, idle or
-    single), and an idle primitive may follow itself.
+    Every primitive can be reached from the start, and from every primitive an end (of type end, idle or single) can be
+    reached. An idle primitive may follow itself.
     """
 
     schema_: Literal["marey/model-graph@1"] = Field("marey/model-graph@1", alias="schema")

@@ -19,7 +19,7 @@ MOST_JOINTS = 4096
 MOST_KEYFRAMES = 1000
 MOST_CANONICAL_FRAMES = 10_000
 MOST_BASIS_NUMBERS = 20_000_000
-"""Canonical frames times spline coefficients, whose products are kept while a model is in use."""
+"""Greatest product of the numbers of canonical frames and spline coefficients: the size of a matrix kept in memory."""
 MOST_SAMPLES = 1000
 MOST_SEED = 2**63 - 1
 Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
@@ -82,7 +82,7 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Record of the training of a model: some members are read again, any others are allowed."""
+    """Record of the training of a model; some members are read again, others are allowed and ignored."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -98,7 +98,7 @@ class PredecessorOrigin(Noted):
 
 
 class ModelProvenance(Noted):
-    """The examples of a model, and where they come from."""
+    """Examples of a model, and their origin."""
 
     predecessor: PredecessorOrigin | None = None
 

@@ -18,7 +18,7 @@ CONTENT = {
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""Members of a part that are read from its file."""
+"""Members of a part that come from its file."""
 
 
 class StoredOriginal(Request):
@@ -35,6 +35,6 @@ def content_digest(part: str, document: Mapping[str, Any]) -> str:
 
 
 def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) -> dict[str, Any]:
-    """Record of the file that a part was imported from."""
+    """Return the record of the file that a part was imported from."""
     name = file.replace("\\", "/").rpartition("/")[2]
     return StoredOriginal(name=name, blob=digest, content=content_digest(part, document)).model_dump()

@@ -1,4 +1,4 @@
-"""The document models by the name of their schema."""
+"""Registry of document models by the name of their schema."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marey_schemas.editing.edits import EditDocument
 
 
 class OpenDocument(Request):
-    """A document of a kind whose own schema is not fixed yet: anything under `body`."""
+    """Document of a kind without a fixed schema: any content under `body`."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -51,4 +51,4 @@ SCHEMAS: dict[str, type[Request]] = {
         OpenDocument,
     )
 }
-"""Model by schema name."""
+"""Models by the name of their schema."""

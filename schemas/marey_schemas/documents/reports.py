@@ -1,4 +1,4 @@
-"""Reports for people: one page and its figures, as part of an evaluation or of a model."""
+"""Reports for people: a page and its figures, as a part of an evaluation or a model."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from marey_schemas.base import Request
 from marey_schemas.names import Digest, TrialName
 
 ScriptDigest = Annotated[str, StringConstraints(pattern=r"^sha256-[A-Za-z0-9+/]{43}=$")]
-"""A script by its content, as a Content-Security-Policy names it."""
+"""Digest of a script, in the syntax of Content-Security-Policy."""
 
 FigureName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
 
 
 class StoredFile(Request):
-    """A file that a document names."""
+    """File stored as a blob, with its name and media type."""
 
     blob: Digest
     size_bytes: int = Field(ge=0)
 
 
 class StoredFigure(Request):
-    """A figure in each of its forms: picture, drawing, and what is plotted, as one JSON and as tables of CSV."""
+    """Figure in each of its forms: image, vector drawing, and its data as one JSON and as CSV tables."""
 
     name: FigureName
     number: str = Field("", description="The corresponding figure of the publication.")
@@ -41,7 +41,7 @@ class StoredFigure(Request):
 
 
 class Report(Request):
-    """One page for people, and its figures."""
+    """Page for people, and its figures."""
 
     schema_: str = Field(alias="schema")
     title: str
@@ -59,7 +59,7 @@ class EvaluationReport(Report):
 
 
 class ModelReport(Report):
-    """Part `report` of a model: how good it is, and how its examples were aligned."""
+    """Part `report` of a model: its quality, and the alignment of its examples."""
 
     schema_: Literal["marey/model-report@1"] = Field("marey/model-report@1", alias="schema")
 

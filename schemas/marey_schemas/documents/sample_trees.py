@@ -16,10 +16,10 @@ from marey_schemas.options.modelling import MOST_TREE_SAMPLES, TreeOptions
 
 
 class SampleTreeDocument(Request):
-    """Part `tree` of a model: samples of it, grouped by k-means in k-means.
+    """Part `tree` of a model: samples of it, grouped by recursive k-means.
 
-    Nodes come level by level from the root; the children of a node follow one another, and each holds a part of its
-    samples, which stand side by side. A node without children is a leaf.
+    Nodes are stored level by level from the root; the children of a node are adjacent, and each holds a contiguous part
+    of its samples. A node without children is a leaf.
     """
 
     schema_: Literal["marey/sample-tree@1"] = Field("marey/sample-tree@1", alias="schema")

@@ -1,4 +1,4 @@
-"""Skeletons: the hierarchy of joints, and which joint plays which standard joint.
+"""Skeletons: the hierarchy of joints, and their mapping to standard joints.
 
 Lengths are metres, quaternions w,x,y,z; axes are right-handed with Y up (docs/explanation/conventions.md).
 """
@@ -20,7 +20,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 class Joint(Request):
-    """One joint of a hierarchy."""
+    """Joint of a hierarchy."""
 
     name: JointName
     parent: int = Field(ge=-1, description="Index of the parent, smaller than the joint's own; -1 for the root.")
@@ -32,7 +32,7 @@ class Joint(Request):
 
 
 class EndSiteDocument(Request):
-    """A point at the end of a chain that has no rotation of its own."""
+    """Point at the end of a chain, without a rotation of its own."""
 
     joint: int = Field(ge=0)
     offset: Vector3
@@ -69,7 +69,7 @@ class JointAxesDocument(Request):
 
 
 class SkeletonMapping(Request):
-    """Part `mapping` of a skeleton: which joint plays which standard joint, and its axes. Editable."""
+    """Part `mapping` of a skeleton: the joint for each standard joint, and the axes of joints. Editable."""
 
     schema_: Literal["marey/skeleton-mapping@1"] = Field("marey/skeleton-mapping@1", alias="schema")
     rig: str | None = Field(None, description="The known rig whose joint names were recognised.")

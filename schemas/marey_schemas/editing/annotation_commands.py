@@ -113,7 +113,7 @@ AnnotationCommand = Annotated[
 
 
 class AnnotationChange(Request):
-    """Commands that are applied to an annotation one after another: all of them, or none."""
+    """Commands that are applied to an annotation in order, all or none."""
 
     commands: tuple[AnnotationCommand, ...] = Field(min_length=1, max_length=MAX_COMMANDS)
     message: Message = Field("", description="Message shown in the history.")

@@ -1,6 +1,6 @@
-"""The commands of an edit that use inverse kinematics.
+"""Commands of an edit that use inverse kinematics.
 
-Joints are called by their own names or by standard ones, such as `left_wrist`. Positions are metres in the world,
+Joints are given by their own names or by standard ones, such as `left_wrist`. Positions are metres in the world,
 rotations unit quaternions (w, x, y, z) in the world; offsets and axes are in the joint's own frame.
 """
 

@@ -1,4 +1,4 @@
-"""Previews of edits, before anything is stored."""
+"""Previews of edits, which compute a result without storing it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marey_schemas.jobs import ItemInput
 
 
 class EditPreviewRequest(Request):
-    """Preview of the result of an edit; nothing is stored."""
+    """Request for a preview of the result of an edit; nothing is stored."""
 
     commands: tuple[EditCommand, ...] = Field(
         (), max_length=MOST_COMMANDS, description="Commands to apply; absent: those of `edit`."
@@ -42,7 +42,7 @@ class EditPreviewRequest(Request):
 
 
 class EditPreview(Answer):
-    """Frames of what an edit makes of a clip."""
+    """Frames of the result of an edit."""
 
     pieces: int = Field(description="Number of clips that the edit makes from the clip.")
     frame_count: int = Field(description="Number of frames of the whole result.")

@@ -1,1 +1,1 @@
-"""Arrays and documents as bytes: JSON, MessagePack, BSON, and the block codec of stored arrays."""
+"""Encodings of arrays and documents: JSON, MessagePack, BSON, and the block codec of stored arrays."""

@@ -1,7 +1,7 @@
-"""The array leaf: numpy arrays inside documents, and how each media type writes them.
+"""Array leaves: numpy arrays in documents, and their form in each media type.
 
-A leaf is `{"dtype": "<f4", "shape": [frames, columns], "data": ...}` with nested lists in JSON and little-endian
-bytes in MessagePack and BSON; `"encoding": "blocks"` says that the bytes are those of `blocks.encode`.
+A leaf is `{"dtype": "<f4", "shape": [frames, columns], "data": ...}` with nested lists in JSON and little-endian bytes
+in MessagePack and BSON; `"encoding": "blocks"` means that the bytes are those of `blocks.encode`.
 """
 
 from collections.abc import Mapping
@@ -34,13 +34,13 @@ __all__ = [
 LEAF_KEYS = frozenset({"dtype", "shape", "data"})
 MAX_ARRAY_BYTES = 1 << 28
 _MISREAD_BITS = 0x15AE43FD
-"""7.038531e-26, the one float32 whose shortest text gives its neighbour if it is read as a double first."""
+"""7.038531e-26, the only float32 whose shortest text yields its neighbour when it is parsed as a double first."""
 _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int}, "b": {bool}}
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedArray:
-    """A block-encoded array that is passed on without being decoded."""
+    """Block-encoded array that is passed on without being decoded."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -48,19 +48,19 @@ class EncodedArray:
 
     @classmethod
     def of(cls, array: NDArray[Any], *, predict: bool = True) -> "EncodedArray":
-        """Encode `array` in blocks; without `predict`, fast rather than small."""
+        """Encode `array` in blocks; without `predict`, the encoding is faster and the result larger."""
         spec = ArraySpec.of(array)
         return cls(spec.dtype, spec.shape, blocks.encode(array, predict=predict))
 
     def cut_frames(self, start: int, stop: int) -> "EncodedArray":
-        """Frames `start` to `stop`. Raises `ArrayError` where the bytes are corrupt."""
+        """Return frames `start` to `stop`. Raises `ArrayError` if the bytes are corrupt."""
         try:
             return EncodedArray(self.dtype, (stop - start, *self.shape[1:]), blocks.cut_frames(self.data, start, stop))
         except blocks.BlockError as error:
             raise ArrayError("bad-array", str(error)) from error
 
     def decode(self, *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
-        """The array itself. Raises `ArrayError` where the bytes disagree with dtype and shape, or are corrupt."""
+        """Return the decoded array. Raises `ArrayError` if the bytes are corrupt or do not match dtype and shape."""
         claimed = ArraySpec(self.dtype, self.shape)
         claimed.require(max_bytes)
         try:
@@ -73,14 +73,14 @@ class EncodedArray:
 
 
 def is_leaf(value: Mapping[str, Any]) -> bool:
-    """Return whether an object of a parsed document stands for an array."""
+    """Return whether an object of a parsed document is an array leaf."""
     return value.keys() >= LEAF_KEYS
 
 
 def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
-    """Array of a leaf in any of its three forms; writable, C-contiguous, finite.
+    """Return the array of a leaf in any of its three forms; writable, C-contiguous, finite.
 
-    Raises `ArrayError` where data does not match dtype and shape, and before allocating more than `max_bytes`.
+    Raises `ArrayError` if data does not match dtype and shape, and before allocating more than `max_bytes`.
     """
     unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
     if unknown:
@@ -111,7 +111,7 @@ def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:
 
 
 def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
-    """Nested lists, checked level by level: numpy would truncate, cast and guess silently."""
+    """Return the array of nested lists, checked level by level: numpy would truncate and cast silently."""
     level: list[Any] = [data]
     for axis, size in enumerate(spec.shape):
         for item in level:
@@ -131,9 +131,9 @@ def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
 
 
 def json_data(array: NDArray[Any]) -> Any:
-    """`data` of a JSON leaf for `orjson`, which writes arrays itself: each number as its shortest text.
+    """Return `data` of a JSON leaf for `orjson`, which writes arrays itself, each number as its shortest text.
 
-    A float32 gets at most nine digits (0.1, not 0.10000000149011612) and reads back to the same bits.
+    A float32 gets at most nine digits (0.1, not 0.10000000149011612) and is read back to the same bits.
     """
     if array.dtype == np.float32 and (array.view(np.uint32) & 0x7FFFFFFF == _MISREAD_BITS).any():
         array = array.astype(np.float64)
@@ -141,7 +141,7 @@ def json_data(array: NDArray[Any]) -> Any:
 
 
 def nested_lists(array: NDArray[Any]) -> Any:
-    """`data` of a JSON leaf as Python lists, or one number where the array has no axes."""
+    """Return `data` of a JSON leaf as nested lists, or as one number if the array has no axes."""
     return orjson.loads(orjson.dumps(json_data(array), option=orjson.OPT_SERIALIZE_NUMPY))
 
 
@@ -158,7 +158,7 @@ class ArrayOf:
     columns: int | None = None
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return the array, or `ArrayError` saying which of dtype, dimensions, columns or values is wrong."""
+        """Return the array. Raises `ArrayError`, which says whether dtype, dimensions, columns or values are wrong."""
         if isinstance(value, EncodedArray):
             array = require_finite(value.decode())
         elif isinstance(value, np.ndarray):

@@ -14,7 +14,7 @@ MAX_ELEMENTS = 1 << 40  # keeps every product of sizes inside 64 bits, whatever 
 
 
 class ArrayError(ValueError):
-    """An array, or the leaf that claims to be one, cannot travel."""
+    """An array, or an array leaf, violates the limits or does not match its declaration."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(code, detail)
@@ -27,7 +27,7 @@ class ArrayError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ArraySpec:
-    """Dtype and shape of an array, checked before anything is allocated for it.
+    """Dtype and shape of an array, checked before memory is allocated.
 
     `dtype` is one of `DTYPES` (numpy's spelling, little-endian). Raises `ArrayError`.
     """
@@ -48,12 +48,12 @@ class ArraySpec:
 
     @classmethod
     def of(cls, array: NDArray[Any]) -> "ArraySpec":
-        """Spec of `array` once its bytes are little-endian."""
+        """Return the spec of `array` after conversion to little-endian."""
         return cls(array.dtype.newbyteorder("<").str, array.shape)
 
     @classmethod
     def parse(cls, dtype: object, shape: object) -> "ArraySpec":
-        """Spec from the two members of a leaf, as they came out of a parser."""
+        """Return the spec of the parsed members `dtype` and `shape` of a leaf."""
         if not isinstance(dtype, str):
             raise ArrayError("bad-dtype", f"dtype must be a string, not {type(dtype).__name__}")
         if not isinstance(shape, Sequence) or isinstance(shape, str | bytes):
@@ -67,7 +67,7 @@ class ArraySpec:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the plain array; an empty size counts as one."""
+        """The size of the array in bytes; an axis of size 0 counts as one."""
         return int(np.dtype(self.dtype).itemsize * math.prod(max(size, 1) for size in self.shape))
 
     def require(self, max_bytes: int) -> None:

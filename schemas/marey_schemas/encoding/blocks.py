@@ -1,6 +1,6 @@
-"""The block codec: an array as compressed tiles of frames and columns, exact to the bit, readable in parts.
+"""Block codec: an array as compressed tiles of frames and columns, lossless, readable in parts.
 
-The first axis counts frames; all others together are columns. docs/reference/block-format.md is the layout.
+The first axis counts frames; all others together are columns. docs/reference/block-format.md describes the layout.
 """
 
 import math
@@ -26,7 +26,7 @@ MAX_ARRAY_BYTES = 1 << 30
 
 
 class BlockError(ValueError):
-    """Block-encoded bytes are corrupt, truncated or not what they claim to be."""
+    """Block-encoded bytes are corrupt, truncated or do not match their header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,19 +54,19 @@ class _Layout:
         return -(-self.columns // self.group_columns)
 
     def of_frames(self, frames: int) -> "_Layout":
-        """Return the same tiles for another number of frames."""
+        """Return the same layout for another number of frames."""
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
-        """Frames of a block."""
+        """The number of frames in a block."""
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
 
     def group(self, index: int) -> slice:
-        """Number of columns in a group of tiles."""
+        """The number of columns in a group of tiles."""
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:
-        """Columns of a group before its first quaternion; None where the shape rules quaternions out.
+        """The number of columns of a group before its first quaternion; None if the shape excludes quaternions.
 
         Poses have 3 + 4k columns, a translation and a quaternion per joint; rotations have a last axis of four.
         """
@@ -79,10 +79,10 @@ class _Layout:
 
 
 def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
-    """Encode an array of any shape and travelling dtype; the same array always gives the same bytes.
+    """Encode an array of any shape and allowed dtype; the same array always gives the same bytes.
 
-    Without `predict`, tiles are raw and take hardly more time than copying: for bytes that are read once. Raises
-    `ArrayError` for a dtype or shape that may not travel.
+    Without `predict`, tiles are uncompressed and take hardly more time than copying: for bytes that are read once.
+    Raises `ArrayError` for a dtype or shape that is not allowed.
     """
     array = little_endian(array)
     spec = ArraySpec.of(array)
@@ -92,10 +92,10 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 
 
 def cut_frames(data: bytes, start: int, stop: int) -> bytes:
-    """Encode frames `start` to `stop` of an encoded array.
+    """Return frames `start` to `stop` of an encoded array, encoded.
 
-    Where `start` is that of a block, blocks that are wanted whole are passed on as they are stored. All others are
-    decoded and written raw. Raises `BlockError`.
+    If `start` is the start of a block, whole blocks are copied as they are. All others are decoded and written
+    uncompressed. Raises `BlockError`.
     """
     layout, starts = _read_head(data)
     cut = layout.of_frames(stop - start)
@@ -108,7 +108,7 @@ def cut_frames(data: bytes, start: int, stop: int) -> bytes:
 
 
 def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[bytes]:
-    """Return the tiles of an array, each compressed by itself."""
+    """Return the tiles of an array, each compressed separately."""
     table = array.reshape(layout.frames, layout.columns)
     parts = (
         (table[layout.block(block), layout.group(group)], layout.lead(group))
@@ -119,7 +119,7 @@ def _packed(layout: _Layout, array: NDArray[Any], *, predict: bool) -> list[byte
 
 
 def _assembled(layout: _Layout, packed: list[bytes]) -> bytes:
-    """Header, index and tiles."""
+    """Return header, index and tiles as bytes."""
     spec = layout.spec
     head = MAGIC + spec.dtype.encode("ascii")
     head += struct.pack(f"<B{len(spec.shape)}Q", len(spec.shape), *spec.shape)
@@ -128,7 +128,7 @@ def _assembled(layout: _Layout, packed: list[bytes]) -> bytes:
 
 
 def read_spec(data: bytes) -> ArraySpec:
-    """Dtype and shape of an encoded array, without decoding it. Raises `BlockError`."""
+    """Return dtype and shape of an encoded array without decoding it. Raises `BlockError`."""
     return _read_head(data)[0].spec
 
 
@@ -139,11 +139,11 @@ def decode(
     columns: NDArray[np.intp] | None = None,
     max_bytes: int = MAX_ARRAY_BYTES,
 ) -> NDArray[Any]:
-    """Decode an array, or some frames and columns of it, touching only the tiles that hold them.
+    """Decode an array, or some frames and columns of it, reading only the tiles that contain them.
 
     `columns` are indices into all axes after the first, flattened: the result is then two-dimensional and equals
-    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable and at most `max_bytes` large.
-    Raises `BlockError`; `IndexError` where numpy's indexing would.
+    `array.reshape(len(array), -1)[frames][:, columns]`. The result is writable and at most `max_bytes` large. Raises
+    `BlockError`, and `IndexError` in the same cases as numpy's indexing.
     """
     layout, starts = _read_head(data)
     if not layout.spec.shape and (frames is not None or columns is not None):
@@ -169,7 +169,7 @@ def decode(
 
 
 def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
-    """Layout of an encoded array and where each tile starts, followed by where the last one ends."""
+    """Return the layout of an encoded array, the start of each tile, and the end of the last one."""
     if data[: len(MAGIC)] != MAGIC:
         raise BlockError("these bytes are not a block-encoded array")
     try:
@@ -214,7 +214,9 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Per block that holds some of the ascending `rows`: its index, where they go, where they are in the block."""
+    """Yield, for each block with some of the ascending `rows`: its index, and their indices in the result and in the
+    block.
+    """
     done = 0
     while done < len(rows):
         index = rows[done] // layout.block_frames
@@ -228,7 +230,7 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Per group that holds some of the picked columns: its index, where they go, where they are in the group."""
+    """Yield, for each group with some of the columns: its index, and their indices in the result and in the group."""
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)

@@ -1,4 +1,4 @@
-"""Names of content: digests of arrays and documents that depend on what they say, not on how it is stored."""
+"""Digests of arrays and documents that depend on their content, not on their encoding."""
 
 import hashlib
 import json
@@ -13,10 +13,10 @@ from marey_schemas.encoding.arrayspec import ArraySpec, little_endian
 
 
 def array_digest(array: NDArray[Any] | EncodedArray) -> str:
-    """`sha256:<hex>` of dtype, shape and little-endian bytes, independent of any compression.
+    """Return `sha256:<hex>` of dtype, shape and little-endian bytes, independent of any compression.
 
-    Hashed is the line `<f4 [2,3]` (dtype, space, shape as JSON without spaces) and its line feed, then the raw bytes
-    in C order.
+    The hashed bytes are the line `<f4 [2,3]` (dtype, space, shape as JSON without spaces) with its line feed, then the
+    raw bytes in C order.
     """
     plain = little_endian(array.decode() if isinstance(array, EncodedArray) else array)
     spec = ArraySpec.of(plain)
@@ -28,11 +28,11 @@ _LEAVES = (str, float, int, bool, type(None))
 
 
 def canonical_json(tree: Any) -> bytes:
-    """Return the one JSON text of a tree without arrays: sorted keys, no spaces, UTF-8, one spelling per number.
+    """Return the canonical JSON text of a tree without arrays: sorted keys, no spaces, UTF-8.
 
-    JSON has one type of number, and databases and languages keep no other: a whole number below 2**63 is written
-    without a point whether it came as 1 or 1.0 (and -0.0 as 0), any other as the shortest text of its double. Raises
-    `ValueError` for NaN and infinities, `TypeError` for a key that is no string.
+    JSON has only one type of number: a whole number below 2**63 is written without a point whether it is 1 or 1.0 (and
+    -0.0 as 0), any other as the shortest text of its double. Raises `ValueError` for NaN and infinities, `TypeError`
+    for a key that is not a string.
     """
     return json.dumps(
         _canonical(tree), sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False
@@ -40,7 +40,7 @@ def canonical_json(tree: Any) -> bytes:
 
 
 def document_digest(tree: Any) -> str:
-    """`sha256:<hex>` of the canonical JSON of a tree in which each array is replaced by its reference."""
+    """Return `sha256:<hex>` of the canonical JSON of a tree in which each array is replaced by its reference."""
     return _name(canonical_json(detach_arrays(tree, lambda _digest, _array: None)))
 
 
@@ -64,7 +64,7 @@ def detach_arrays(tree: Any, keep: Callable[[str, NDArray[Any] | EncodedArray], 
 
 
 def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray]) -> Any:
-    """Return the inverse of `detach_arrays`: each reference is replaced by `load(digest)`."""
+    """Return the tree with each reference replaced by `load(digest)`, the inverse of `detach_arrays`."""
     if isinstance(tree, Mapping):
         if tree.keys() == {"dtype", "shape", "content"}:
             return load(tree["content"])

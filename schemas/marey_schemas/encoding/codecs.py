@@ -1,6 +1,6 @@
-"""Documents as bytes: JSON, MessagePack and BSON carry the same trees, and refuse the same things.
+"""Encoding of documents as JSON, MessagePack and BSON, which represent the same trees with the same limits.
 
-A tree is made of objects (str keys), lists, str, int (64 bit), finite float, bool, None, and arrays. BSON has objects
+A tree consists of objects (str keys), lists, str, int (64 bit), finite float, bool, None, and arrays. BSON has objects
 only at its top level, so a list or a scalar there is refused in BSON.
 """
 
@@ -30,7 +30,7 @@ ArrayForm = Literal["plain", "blocks"]
 
 
 class CodecError(ValueError):
-    """A document cannot be written or read; `pointer` (RFC 6901) says where, `code` is a stable slug."""
+    """A document cannot be encoded or decoded; `pointer` (RFC 6901) is the place, `code` a stable slug."""
 
     def __init__(self, code: str, pointer: str, detail: str) -> None:
         super().__init__(code, pointer, detail)
@@ -43,10 +43,10 @@ class CodecError(ValueError):
 
 
 def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> bytes:
-    """Write a tree whose leaves may be numpy arrays or `EncodedArray`.
+    """Encode a tree whose leaves may be numpy arrays or `EncodedArray`.
 
-    `arrays="blocks"` (not in JSON) writes every array in the block encoding; an `EncodedArray` is then passed on as
-    it is. Raises `CodecError`.
+    `arrays="blocks"` (not in JSON) writes every array in the block encoding; an `EncodedArray` is then copied as it is.
+    Raises `CodecError`.
     """
     _require_media_type(media_type)
     if media_type == JSON and arrays == "blocks":
@@ -76,9 +76,9 @@ def _write_bson(plain: Any) -> bytes:
 
 
 def decode_tree(data: bytes, media_type: str, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
-    """Read a tree; array leaves become writable numpy arrays.
+    """Decode a tree; array leaves become writable numpy arrays.
 
-    `max_bytes` limits the bytes read and, separately, the bytes of all arrays together. Raises `CodecError`.
+    `max_bytes` limits the bytes of the input and, separately, the bytes of all arrays together. Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
@@ -152,7 +152,7 @@ _FOREIGN = (bson.Code, msgpack.ExtType)
 
 
 class _Walk:
-    """One pass over a tree that checks every value and converts every array, in either direction.
+    """Traversal of a tree that checks every value and converts every array, in either direction.
 
     With `on_array` it turns arrays into leaves; without, it turns leaves into arrays.
     """
@@ -171,7 +171,7 @@ class _Walk:
 
     @property
     def pointer(self) -> str:
-        """JSON pointer of the value being visited."""
+        """The JSON Pointer of the current value."""
         return "".join("/" + str(step).replace("~", "~0").replace("/", "~1") for step in self._path)
 
     def visit(self, value: Any) -> Any:

@@ -1,8 +1,8 @@
-"""One tile of the block codec: some frames of some columns as one zstd frame, exact to the bit.
+"""Tiles of the block codec: some frames of some columns as one zstd frame, lossless.
 
-What makes motion small is prediction, done on integers so that it is exact: float bits become integers that grow
-with the number, each column is differenced up to three times, and the largest component of a unit quaternion follows
-from the other three but for a few units in the last place. docs/reference/block-format.md has the layout.
+Compression is based on integer prediction, which is exact: float bits become integers in the order of the numbers, each
+column is differenced up to three times, and the largest component of a unit quaternion is predicted from the other
+three up to a few units in the last place. docs/reference/block-format.md describes the layout.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ class TileError(ValueError):
 def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
-    `lead` is the number of columns before the first quaternion, None where the columns hold none. Of the forms that
-    predict, the first that decodes to the same bits is taken, unless the plain bytes compress better.
+    `lead` is the number of columns before the first quaternion, None if there are no quaternions. Of the predicting
+    forms, the first that decodes to the same bits is used, unless the plain bytes compress better.
     """
     plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
     packed = _compress([np.array([RAW], np.uint8), plain])
@@ -41,13 +41,13 @@ def pack(tile: NDArray[Any], lead: int | None) -> bytes:
 
 
 def pack_raw(tile: NDArray[Any]) -> bytes:
-    """Frame a (frames, columns) little-endian array as it is, at about the speed of copying."""
+    """Store a (frames, columns) little-endian array uncompressed, at about the speed of copying."""
     plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
     return _compress([np.array([RAW], np.uint8), plain], level=FASTEST)
 
 
 def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
-    """The (frames, columns) array of a tile. Raises `TileError`, before allocating more than such a tile needs."""
+    """Return the (frames, columns) array of a tile. Raises `TileError` before allocating more than a tile needs."""
     try:
         size = zstandard.frame_content_size(data)
         if not 0 < size <= 2 + 2 * columns + frames * columns * dtype.itemsize:
@@ -59,7 +59,7 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
 
 
 def _compress(sections: list[Bytes], level: int = 1) -> bytes:
-    """One zstd frame in which every section ends a block, so that each has entropy tables of its own."""
+    """Return one zstd frame in which every section ends a block, so that each has its own entropy tables."""
     size = sum(section.size for section in sections)
     stream = zstandard.ZstdCompressor(level=level, write_checksum=True).compressobj(size=size)
     parts = []
@@ -90,7 +90,7 @@ def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) ->
 
 
 class _Sections:
-    """The sections of a tile's content, taken one after the other."""
+    """Reader of the sections of a tile's content, one after the other."""
 
     def __init__(self, content: Bytes) -> None:
         self._rest = content
@@ -110,7 +110,7 @@ class _Sections:
 
 
 def _to_integers(channels: NDArray[Any]) -> Integers:
-    """Unsigned integers; those of floats, read as signed, are in the order of the numbers."""
+    """Return the values as unsigned integers; those of floats, read as signed, have the order of the numbers."""
     bits = channels.view(f"<u{channels.dtype.itemsize}")
     return _order(bits) if channels.dtype.kind == "f" else bits
 
@@ -120,7 +120,7 @@ def _from_integers(integers: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _order(bits: Integers) -> Integers:
-    """Flip all but the sign bit of negative floats; its own inverse."""
+    """Flip all but the sign bit of negative floats; the function is its own inverse."""
     width = 8 * bits.itemsize
     signs = bits.view(f"<i{bits.itemsize}") >> (width - 1)
     ordered: Integers = bits ^ (signs.view(bits.dtype) >> 1)
@@ -128,7 +128,7 @@ def _order(bits: Integers) -> Integers:
 
 
 def _fold_sign(integers: Integers) -> Integers:
-    """0, -1, 1, -2, ... as 0, 1, 2, 3, ..., so that small differences have empty high bytes."""
+    """Map 0, -1, 1, -2, ... to 0, 1, 2, 3, ..., so that the high bytes of small differences are zero."""
     signs = integers.view(f"<i{integers.itemsize}") >> (8 * integers.itemsize - 1)
     folded: Integers = (integers << 1) ^ signs.view(integers.dtype)
     return folded
@@ -143,7 +143,7 @@ def _unfold_sign(folded: Integers) -> Integers:
 
 
 def _difference(channels: Integers) -> list[Bytes]:
-    """Orders (one byte per channel), then the byte planes of the differences, lowest byte first."""
+    """Return the orders (one byte per channel), then the byte planes of the differences, lowest byte first."""
     best = _fold_sign(channels)
     cost = _bits_needed(best)
     orders = np.zeros(len(channels), np.uint8)
@@ -158,7 +158,7 @@ def _difference(channels: Integers) -> list[Bytes]:
 
 
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
-    """Per channel, about the sum of log2 of the numbers: a float's bits grow with its logarithm."""
+    """Return, for each channel, about the sum of log2 of the numbers: a float's exponent grows with its logarithm."""
     logarithms = (folded | 1).astype(np.float32).view(np.int32)
     cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)
     return cost
@@ -199,7 +199,7 @@ def _holds_rotations(tile: NDArray[np.float32], lead: int) -> bool:
 
 
 def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:
-    """For each quaternion the component furthest from zero in the tile is predicted from the other three."""
+    """Predict the largest component of each quaternion of the tile from the other three."""
     count = (len(channels) - lead) // 4
     values = _from_integers(channels, np.dtype("<f4"))
     quaternions = values[lead : lead + 4 * count].reshape(count, 4, -1)
@@ -228,13 +228,13 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
 
 
 def _rows(chosen: NDArray[Any], columns: int, lead: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of the predicted channels and, in order, of all others."""
+    """Return the indices of the predicted channels and of all others, in order."""
     predicted = lead + 4 * np.arange(len(chosen)) + chosen
     return predicted.astype(np.intp), np.delete(np.arange(columns), predicted)
 
 
 def _prediction(others: Integers, lead: int, count: int, negative: NDArray[np.bool_]) -> Integers:
-    """Integers of ±sqrt(1 - a² - b² - c²), in double precision.
+    """Return the integers of ±sqrt(1 - a² - b² - c²), computed in double precision.
 
     Products of two float32 are exact in double precision, so a fused multiply-add changes nothing: every machine with
     IEEE 754 arithmetic computes the same bits.

@@ -1,1 +1,1 @@
-"""Options: the one declaration of name, type, range, default and meaning of everything that can be chosen."""
+"""Options of computations: name, type, range, default and description of each, declared only here."""

@@ -15,7 +15,7 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Share of the farthest reach from which on a hand is on its way."""
+"""Share of the farthest reach above which a hand counts as reaching."""
 
 
 class ContactOptions(Options):

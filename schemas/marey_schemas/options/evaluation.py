@@ -1,4 +1,4 @@
-"""Options of evaluations: the trials, what is measured, and the database and controller that are tried."""
+"""Options of evaluations: the trials, the measures, the database and the controller."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 
 COVERAGE_LEAST_S = 1.0
-"""Seconds of data that a cell needs to count as covered, unless other ones are chosen."""
+"""Default number of seconds of data that a cell needs to count as covered."""
 TARGET_PATH_S = 4.0
-"""Duration of the path to record for a cell without enough data, in seconds, unless another one is chosen."""
+"""Default duration in seconds of the path to record for a cell without enough data."""
 
 
 class Grid(Options):
-    """Speeds and turn rates of a suite of trials, each with each; the defaults are the published ones."""
+    """Speeds and turn rates of a suite of trials, in all combinations; the defaults are the published ones."""
 
     speeds_m_s: tuple[Speed, ...] = Field(
         tuple(1.0 + 0.25 * step for step in range(9)),
@@ -43,7 +43,7 @@ class Grid(Options):
 
 
 class EvaluationOptions(Grid):
-    """Everything that decides the result of an evaluation beside the clips."""
+    """Options that, together with the clips, determine the result of an evaluation."""
 
     families: tuple[Family, ...] = Field(
         ("circle", "switching"),

@@ -1,4 +1,4 @@
-"""Options of imports: what the caller knows and the files do not say."""
+"""Options of imports: facts that the files do not contain."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ Handedness = Literal["right", "left"]
 
 
 class ImportOptions(Options):
-    """Facts that the user knows better than the files. Absent: inferred from evidence, or refused when ambiguous.
+    """Facts about files that the user knows. An absent fact is inferred from the file, or the file is refused if it is
+    ambiguous.
 
     `marey_motion.read_motion` uses those about the content of a file: unit, axes, frame rate, rest pose and floor.
 

@@ -1,4 +1,4 @@
-"""Options of what improves a set of clips: suggestions, optimisations, sweeps of weights."""
+"""Options of improvements of a set of clips: suggestions, optimisations, sweeps of weights."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ObjectiveOptions(Options):
 
 
 class ObjectiveChoice(Options):
-    """The objective that a computation makes smaller."""
+    """Objective that a computation minimises."""
 
     objective: ObjectiveOptions = Field(ObjectiveOptions(), description="Weights of the objective.")
 

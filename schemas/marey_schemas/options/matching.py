@@ -1,4 +1,4 @@
-"""Options of motion matching: how clips become a database, and how a controller plays it."""
+"""Options of motion matching: the database of clips, and the controller that plays it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Selection = Literal["features", "pose_distance"]
 Follow = Literal["time", "path", "open_loop"]
 
 TICK_RATE_HZ = 60.0
-"""Rate of features and simulation unless another one is chosen."""
+"""Default rate of features and simulation in Hz."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 _OF_GROUP = "Weight of the {} in the cost of a match; 0 leaves it out."
@@ -38,7 +38,7 @@ class FeatureWeights(Options):
 
 
 class DatabaseOptions(Options):
-    """Database that clips become for motion matching."""
+    """Conversion of clips to a database for motion matching."""
 
     mirroring: Mirroring = Field(
         "none", description="add: a mirrored copy of every clip beside it; only: the mirrored copies alone."

@@ -1,4 +1,4 @@
-"""Options of generative models: how a model is trained, and how samples of it are grouped in a tree."""
+"""Options of generative models: training, and grouping of samples in a tree."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class ModelOptions(MixtureOptions):
 
 
 class TreeOptions(Options):
-    """Tree in which samples of a model are grouped."""
+    """Tree that groups samples of a model."""
 
     samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Number of samples drawn from the model.")
     branching: int = Field(4, ge=2, le=64, description="Greatest number of children of a node.")

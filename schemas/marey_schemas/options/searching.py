@@ -28,7 +28,7 @@ TRANSITION_TOLERANCE_M = 0.02
 
 
 class RefineOptions(Options):
-    """Refinement of what a search found, by numerical optimisation."""
+    """Refinement of the best sample of a search by numerical optimisation."""
 
     likelihood_weight: float = Field(
         1.0,

@@ -1,4 +1,4 @@
-"""The demonstration's last step: how good the retargeted locomotion is."""
+"""Last step of the demonstration: the evaluation of the retargeted locomotion."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""A clip is locomotion where its root gets so far..."""
+"""Distance in metres that the root of a locomotion clip travels within `WINDOW_S`."""
 WINDOW_S = 1.0
-"""...within so long, in most of its frames."""
+"""Time in seconds within which the root travels `TRAVEL_M`, from most frames."""
 OPTIONS: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5, 2.0, 2.5, 3.0),
     "turn_rates_deg_s": (-100.0, -50.0, 0.0, 50.0, 100.0),
 }
-"""Every second speed and turn rate of the published suite: 50 trials instead of 162."""
+"""Every other speed and turn rate of the published suite: 50 trials instead of 162."""
 
 
 @dataclass(frozen=True)
 class DemoEvaluation:
-    """The result of the evaluation; `summary` is None if no clip is locomotion."""
+    """Result of the evaluation; `summary` is None if no clip is locomotion."""
 
     clips: int
     chosen: int
@@ -43,7 +43,7 @@ class DemoEvaluation:
 
     @property
     def selection(self) -> str:
-        """The clips that were evaluated, and the reason for the choice."""
+        """The evaluated clips, and the reason for the choice."""
         return (
             f"of {self.clips} retargeted clips: those whose root gets {TRAVEL_M:g} m away within {WINDOW_S:g} s, "
             "in most frames"
@@ -53,7 +53,7 @@ class DemoEvaluation:
 def evaluate_locomotion(
     project: ProjectHandle, clips: Sequence[ClipHandle], root: str, folder: Path, advance: Advance
 ) -> DemoEvaluation:
-    """Evaluate those of the clips that are locomotion, and write the report to `folder`. `root` is their root joint."""
+    """Evaluate the clips that are locomotion, and write the report to `folder`. `root` is their root joint."""
     chosen = []
     for done, clip in enumerate(clips):
         advance("looking for locomotion", done, len(clips))

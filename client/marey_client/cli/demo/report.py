@@ -1,4 +1,4 @@
-"""The report of the demonstration, for people and for programs."""
+"""Report of the demonstration, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ REASONS_SHOWN = 12
 
 @dataclass
 class DemoReport:
-    """Figures and places. `seconds` is by step: import, retarget, files, evaluate."""
+    """Results of the demonstration and places of its files. `seconds` is by step: import, retarget, files, evaluate."""
 
     entries: Sequence[ImportEntry]
     left_out: int
@@ -44,7 +44,7 @@ class DemoReport:
 
     @property
     def refused(self) -> list[tuple[str, str]]:
-        """(step, name and reason) of everything that was not taken or not made."""
+        """(step, name and reason) of everything that was refused."""
         imports = [("import", refusal_text(entry)) for entry in self.entries if entry.error is not None]
         result = (self.job.result if self.job else None) or {}
         retargets = [
@@ -55,11 +55,11 @@ class DemoReport:
 
     @property
     def warnings(self) -> Counter[str]:
-        """The number of files that had a warning, by its code."""
+        """The number of files with a warning, by its code."""
         return Counter(code for entry in self.entries for code in {warning.code for warning in entry.warnings})
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything, for programs."""
+        """Return the report as a dict for JSON."""
         return {
             "server": self.server,
             "data": str(self.data.absolute()),
@@ -110,7 +110,7 @@ def print_report(report: DemoReport) -> None:
 
 
 def _command() -> str:
-    """Return how to call the `marey` command here; it need not be on the path."""
+    """Return the command line that starts `marey` here, even if it is not on the path."""
     return "marey" if shutil.which("marey") else shlex.quote(sys.argv[0])
 
 

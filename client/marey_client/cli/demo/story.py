@@ -1,6 +1,6 @@
-"""The demonstration: takes go in, are retargeted to a second skeleton, drawn, evaluated, and come out as files.
+"""Demonstration: takes are imported, retargeted to a second skeleton, drawn, evaluated, and exported.
 
-Everything goes through a server of its own on this machine, by the same requests that any other program would send.
+All steps use a local server and the same requests as any other program.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SHEET_TAKES = 8
 
 
 def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
-    """Run the demonstration; with the same `data` again, nothing is done twice."""
+    """Run the demonstration; repeated with the same `data`, it reuses the earlier results."""
     os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
     with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
@@ -54,7 +54,7 @@ def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json:
 
 @dataclass
 class Story:
-    """The steps of the demonstration in one project."""
+    """Steps of the demonstration in one project."""
 
     project: ProjectHandle
     files: FoundFiles
@@ -106,7 +106,7 @@ class Story:
         return self.project.imports.upload(self.files.files, options, notice=self.advance)
 
     def _target(self) -> SkeletonHandle:
-        """Return the second skeleton: made on the first run, found on later ones."""
+        """Return the second skeleton, created on the first run."""
         found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 
@@ -124,7 +124,7 @@ class Story:
         return clip.export(self.data / "files", format="bvh")
 
     def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]]) -> Path | None:
-        """Source and result figures side by side, as a picture."""
+        """Draw source and result side by side, as an image."""
         if not pairs:
             return None
         figures = embedded.room("marey_reports.drawing.contact_sheet", "all")
@@ -139,7 +139,7 @@ class Story:
 
 
 def _generated_takes(folder: Path) -> FoundFiles:
-    """Walks, runs and turns as BVH files; the same on every machine."""
+    """Return walks, runs and turns as BVH files; the same on every machine."""
     folder.mkdir(parents=True, exist_ok=True)
     write_bvh = embedded.room("marey_motion.formats", "all").write_bvh
     files = []
@@ -151,7 +151,7 @@ def _generated_takes(folder: Path) -> FoundFiles:
 
 
 def _game_skeleton_parts() -> dict[str, Any]:
-    """Another rig than the takes have: other names, proportions, rest pose and axes."""
+    """Return a skeleton that differs from the takes': names, proportions, rest pose and axes."""
     documents = embedded.room("marey_motion.documents", "all")
     rigs = embedded.room("marey_motion.rigs", "all")
     skeleton = embedded.room("marey_motion.gait", "all").game_skeleton()
@@ -164,7 +164,7 @@ def _game_skeleton_parts() -> dict[str, Any]:
 
 
 def _clip_loader(project: ProjectHandle) -> Callable[[ClipHandle], Any]:
-    """Return a function from clips of the server to clips of `marey_motion`; reads each skeleton once."""
+    """Return a function that loads clips of the server as clips of `marey_motion`, each skeleton once."""
     documents = embedded.room("marey_motion.documents", "all")
     skeletons: dict[tuple[str, int], Any] = {}
 
@@ -189,12 +189,12 @@ def _demo_project(marey: Marey) -> ProjectHandle:
 
 
 def _source_path(result: ClipHandle) -> str:
-    """Results keep the path of their source below the folder they go to."""
+    """Return the path of a result's source, which is the result's path below its folder."""
     return result.path.removeprefix(f"{RESULTS}/")
 
 
 def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:
-    """At most so many, spread over all of them."""
+    """Return at most a given number of elements, evenly spaced over all of them."""
     if len(clips) <= most:
         return list(clips)
     return [clips[index * (len(clips) - 1) // (most - 1)] for index in range(most)]
