@@ -81,8 +81,9 @@ def _edit(walk: Clip, *commands: AnyCommand, **sources: Clip) -> Clip:
 
 def _alone(walk: Clip, run_clip: Clip, command: AnyCommand) -> Row:
     (ours,) = time_in_turn(lambda: _edit(walk, command, run=run_clip), repeats=5)
-    given = isinstance(command, Smooth) and "method" in command.model_fields_set
-    told = f"{command.command} ({command.method})" if given else command.command
+    told: str = command.command
+    if isinstance(command, Smooth) and "method" in command.model_fields_set:
+        told = f"{told} ({command.method})"
     return Row(
         f"edit: {told}",
         f"{walk.frame_count:,} frames x {walk.skeleton.joint_count} joints",

@@ -6,7 +6,7 @@ generated walk, with wrist targets 8 cm (standard deviation per axis) from where
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -61,7 +61,7 @@ def run() -> list[Row]:
     near = motion.positions(skeleton)[:, wrist] + np.random.default_rng(0).normal(0.0, SPREAD_M, (BATCH, 3))
     single = [(motion.at_frames(np.array([f])), [PositionTarget(wrist, near[f])]) for f in range(TARGETS)]
     look = LookAtTarget(head, (0.5, 1.4, 30.0), axis=(0.0, 0.0, 1.0))
-    several = [(one, [*targets, look]) for one, targets in single]
+    several: list[tuple[Motion, Sequence[Target]]] = [(one, [*targets, look]) for one, targets in single]
     return [
         _each("CCD, wrist, chain to the root", skeleton, single, to_root, partial(solve_ccd, options=OPTIONS), CCD_MS),
         _each("CCD, wrist, arm only", skeleton, single, arm, partial(solve_ccd, options=OPTIONS), ARM_MS),
@@ -76,7 +76,7 @@ def run() -> list[Row]:
 def _each(
     job: str,
     skeleton: Skeleton,
-    problems: list[tuple[Motion, list[Target]]] | list[tuple[Motion, list[PositionTarget]]],
+    problems: Sequence[tuple[Motion, Sequence[Target]]],
     freedom: Freedom,
     solver: Solver,
     stated_ms: float,
@@ -106,7 +106,7 @@ def _each(
     )
 
 
-def _with_scipy(skeleton: Skeleton, motion: Motion, targets: list[Target], freedom: Freedom) -> float:
+def _with_scipy(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> float:
     """Solve the same objective by trust regions and finite differences, with the project's kinematics."""
     carried = {joint for target in targets for joint in skeleton.path_to_root(target.joint)}
     joints = sorted(carried if freedom.joints is None else carried & set(freedom.joints))

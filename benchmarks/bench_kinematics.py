@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pymotion.ops import skeleton as pymotion_skeleton  # type: ignore[import-untyped]
+from pymotion.ops import skeleton as pymotion_skeleton
 
 from benchmarks.material import captured_walk, noisy_clip, with_fingers
 from benchmarks.timing import Row, time_in_turn

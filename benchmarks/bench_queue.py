@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
-from pymotion.ops import skeleton as pymotion_skeleton  # type: ignore[import-untyped]
-from pymotion.rotations import quat as pymotion_quat  # type: ignore[import-untyped]
+from pymotion.io.bvh import BVH
+from pymotion.ops import skeleton as pymotion_skeleton
+from pymotion.rotations import quat as pymotion_quat
 
 from benchmarks.local_server import PROJECT, clip_parts, local_server, one_worker
 from benchmarks.material import captured_walk

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pymotion.io.bvh import BVH  # type: ignore[import-untyped]
+from pymotion.io.bvh import BVH
 
 
 def load_with_pymotion(path: Path) -> NDArray[np.float64]:

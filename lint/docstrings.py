@@ -32,16 +32,16 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def public_functions(tree: ast.Module | ast.ClassDef, within: str = "") -> Iterator[tuple[str, Function]]:
-    """List the functions and methods without underscore, except properties."""
+    """List the functions and methods without underscore, except properties and overloads, which only add types."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from public_functions(node, f"{within}{node.name}.")
-        elif isinstance(node, Function) and not node.name.startswith("_") and not _is_property(node):
+        elif isinstance(node, Function) and not node.name.startswith("_") and not _is_exempt(node):
             yield f"{within}{node.name}", node
 
 
-def _is_property(function: Function) -> bool:
-    return any(ast.unparse(each).endswith(("property", ".setter")) for each in function.decorator_list)
+def _is_exempt(function: Function) -> bool:
+    return any(ast.unparse(each).endswith(("property", ".setter", "overload")) for each in function.decorator_list)
 
 
 def problem_of(function: Function) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marey_motion import quaternions
-from marey_motion.arrays import Floats, Ints
+from marey_motion.arrays import AnyFloats, Floats, Ints
 from marey_motion.motion import Motion
 
 
@@ -113,7 +113,7 @@ def continue_motion(motion: Motion, seam: LoopSeam, before: int, after: int) -> 
     return going_on._replace(rotations=np.asarray(quaternions.unroll(going_on.rotations), dtype=np.float64))
 
 
-def about_vertical(angles_rad: Floats) -> Floats:
+def about_vertical(angles_rad: AnyFloats) -> Floats:
     """Make rotations about the vertical.
 
     Parameters

@@ -8,7 +8,7 @@ floating type of the arguments (float32 in, float32 out). Angles are radians. A 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,10 @@ NEARLY_OPPOSITE = 0.1
 EULER_BLOCK = 4096
 
 
+@overload
+def identity(*leading: int) -> Floats: ...
+@overload
+def identity(*leading: int, dtype: type[np.floating[Any]]) -> AnyFloats: ...
 def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> AnyFloats:
     """Make rotations that change nothing.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from marey_motion import quaternions
-from marey_motion.arrays import Floats
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
@@ -37,7 +37,7 @@ def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats,
     """
     above = skeleton.path_to_root(carrier)[:0:-1]
     arm = np.zeros((motion.frame_count, 3))
-    parent = quaternions.identity(motion.frame_count)
+    parent: AnyFloats = quaternions.identity(motion.frame_count)
     for joint, child in zip(above, (*above, carrier)[1:], strict=True):
         parent = quaternions.multiply(parent, motion.rotations[:, joint])
         arm += quaternions.rotate_vectors(parent, skeleton.offsets[child])
@@ -61,7 +61,7 @@ def spins_of(motion: Motion, skeleton: Skeleton, joint: int) -> Floats:
     -------
     (F, 4) float64    unit quaternions
     """
-    spins = quaternions.identity(motion.frame_count)
+    spins: AnyFloats = quaternions.identity(motion.frame_count)
     for one in skeleton.path_to_root(joint)[::-1]:
         spins = quaternions.multiply(spins, motion.rotations[:, one])
     return np.asarray(spins, dtype=np.float64)

@@ -23,7 +23,7 @@ from marey_schemas.encoding.codecs import ArrayForm, CodecError, decode_tree, en
 
 def finite_arrays() -> st.SearchStrategy[np.ndarray[Any, Any]]:
     def of(dtype: str) -> st.SearchStrategy[np.ndarray[Any, Any]]:
-        numbers = {"allow_nan": False, "allow_infinity": False} if dtype[1] == "f" else {}
+        numbers: dict[str, Any] = {"allow_nan": False, "allow_infinity": False} if dtype[1] == "f" else {}
         shapes = hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=6)
         return hnp.arrays(dtype, shapes, elements=hnp.from_dtype(np.dtype(dtype), **numbers))
 

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import httpx
 import pytest
@@ -132,7 +133,7 @@ def send(house: House, route, role: str) -> httpx.Response:
     """The request of a route, with everything right but perhaps the caller."""
     operation, variables = route[1], dict(house.variables)
     headers: dict[str, str] = {}
-    content: dict[str, object] = {}
+    content: dict[str, Any] = {}
     template = route[0].template()
     if "/users/" in template and house.tokens[role]:
         variables["user"] = {"admin": "root", "attempt": "owner"}.get(role, role)

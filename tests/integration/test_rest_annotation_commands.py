@@ -66,7 +66,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch, name: str, action: Callable[[], N
             left.pop()()
         return carry_out(layer, **arguments)
 
-    monkeypatch.setitem(layers.COMMANDS, name, interrupted)  # type: ignore[arg-type]
+    monkeypatch.setitem(layers.COMMANDS, name, interrupted)
 
 
 RELABEL = {"command": "relabel_segment", "at": 5, "label": "b"}

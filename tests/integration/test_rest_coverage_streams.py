@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import httpx
 import numpy as np
@@ -40,13 +41,13 @@ def skeleton(owner: httpx.Client, walk) -> str:
     return str(made.json()["id"])
 
 
-def begin(client: httpx.Client, **body) -> dict:
+def begin(client: httpx.Client, **body) -> dict[str, Any]:
     made = client.post(STREAMS, json={"frame_rate_hz": RATE_HZ, **body})
     assert made.status_code == 201, made.text
     return made.json()
 
 
-def send(client: httpx.Client, stream: dict, media_type: str = MSGPACK, **frames) -> httpx.Response:
+def send(client: httpx.Client, stream: dict[str, Any], media_type: str = MSGPACK, **frames) -> httpx.Response:
     body = encode_tree(frames, media_type)
     url = f"{STREAMS}/{stream['id']}/frames"
     return client.post(url, content=body, headers={"Content-Type": media_type})
@@ -80,7 +81,7 @@ def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float):
     return np.column_stack((np.cumsum(steps, axis=0) - steps, headings))
 
 
-def problem(answer: httpx.Response, status: int) -> dict:
+def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
     assert answer.status_code == status, answer.text
     return answer.json()
 
@@ -239,7 +240,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleto
     long[3, 7:11] *= 2.0
     far = np.zeros((2, 3))
     far[1, 0] = 1e9
-    wrong = [
+    wrong: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         (stream, {"poses": long}, "frame 3 has a rotation of length 2"),
         (stream, {"poses": poses[:, :-4]}, "columns"),
         (stream, {"poses": poses.astype(np.float64) * 1e300}, "only finite numbers"),

@@ -5,6 +5,7 @@
 
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -39,7 +40,7 @@ CHECKS = [
     response_schema_conformance,
 ]
 CONFIGURATION = schemathesis.config.SchemathesisConfig()
-DOCUMENT = build_document(RouteTable(None, RESOURCES), version("marey"))  # type: ignore[arg-type]
+DOCUMENT = build_document(RouteTable(None, RESOURCES), version("marey"))
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,8 @@ def furnish(server: Server, token: str) -> dict[str, object]:
 def operations():
     """Every operation of the document."""
     schema = schemathesis.openapi.from_dict(DOCUMENT, config=CONFIGURATION)
-    return [result.ok() for result in schema.get_all_operations()]
+    results: Any = schema.get_all_operations()
+    return [result.ok() for result in results]
 
 
 def probes():
@@ -87,7 +89,8 @@ def probes():
 def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(fuzzed, operation, mode):
     server, callers, things = fuzzed
     names = {parameter.name for parameter in operation.path_parameters}
-    for known in (things, {}):
+    nothing: dict[str, str] = {}
+    for known in (things, nothing):
         chosen = {name: value for name, value in known.items() if name in names}
         strategy = operation.as_strategy(mode, path_parameters=chosen or None)
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -37,7 +38,7 @@ class Process:
             stderr=subprocess.PIPE,
             text=True,
         )
-        self.lines: list[dict] = []
+        self.lines: list[dict[str, Any]] = []
         self.no_json: list[str] = []
         self._listening = threading.Event()
         self._reader = threading.Thread(target=self._read)

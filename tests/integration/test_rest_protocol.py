@@ -6,6 +6,7 @@ import hashlib
 import json
 import socket
 import time
+from typing import Any
 from urllib.parse import urlsplit
 
 import bson
@@ -26,7 +27,7 @@ HIERARCHY = {
 }
 
 
-def motion(skeleton: str, frames: int = 40) -> dict:
+def motion(skeleton: str, frames: int = 40) -> dict[str, Any]:
     rng = np.random.default_rng(7)
     poses = rng.normal(size=(frames, 3 + 4 * len(JOINTS))).astype("<f4")
     return {
@@ -38,7 +39,7 @@ def motion(skeleton: str, frames: int = 40) -> dict:
     }
 
 
-def make(client: httpx.Client, kind: str, name: str, **parts: dict) -> dict:
+def make(client: httpx.Client, kind: str, name: str, **parts: dict[str, Any]) -> dict[str, Any]:
     body = msgpack.packb({"name": name, "parts": parts})
     made = client.post(f"/projects/lab/{kind}", content=body, headers={"Content-Type": "application/msgpack"})
     assert made.status_code == 201, made.text
@@ -79,7 +80,7 @@ def test_blocks_are_the_stored_bytes(owner: httpx.Client, clip: str):
 
 @pytest.mark.parametrize("accept", [*MEDIA_TYPES, "application/msgpack; arrays=blocks"])
 def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, accept: str):
-    def read(query: str) -> dict:
+    def read(query: str) -> dict[str, Any]:
         answer = owner.get(f"{clip}/parts/motion{query}", headers={"Accept": accept})
         assert answer.status_code == 200, answer.text
         assert answer.headers["Content-Type"] == accept
@@ -182,7 +183,7 @@ def test_a_pinned_revision_never_changes_and_says_so(owner: httpx.Client, clip: 
 
 def test_members_can_be_made_only_where_there_is_none(server: Server, owner: httpx.Client):
     server.make_user("ben")
-    put = {"json": {"role": "reader"}, "headers": {"If-None-Match": "*"}}
+    put: dict[str, Any] = {"json": {"role": "reader"}, "headers": {"If-None-Match": "*"}}
     assert owner.put("/projects/lab/members/ben", **put).status_code == 200
     assert owner.put("/projects/lab/members/ben", **put).status_code == 412
 

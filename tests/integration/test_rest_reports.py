@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+from typing import Any
 from xml.etree import ElementTree
 
 import httpx
@@ -18,7 +19,7 @@ FILES = {"png": b"\x89PNG drawn", "svg": b"<svg/>", "json": b'{"tables": {}}', "
 TYPES = {"png": "image/png", "svg": "image/svg+xml", "json": "application/json", "csv": "text/csv; charset=utf-8"}
 
 
-def stored(client: httpx.Client, data: bytes) -> dict:
+def stored(client: httpx.Client, data: bytes) -> dict[str, Any]:
     digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
     assert client.put(f"/blobs/{digest}", content=data).is_success
     return {"blob": digest, "size_bytes": len(data)}
@@ -123,7 +124,7 @@ def walked(owner: httpx.Client) -> str:
     return f"/projects/lab/evaluations/{made.json()['id']}"
 
 
-def read_graphml(data: bytes) -> tuple[list, list, dict]:
+def read_graphml(data: bytes) -> tuple[list[Any], list[Any], dict[str, Any]]:
     """(clip, frame, ticks) of nodes, (source, target, count) of edges, walks by trial; read from the XML alone."""
     space = {"g": "http://graphml.graphdrawing.org/xmlns"}
     root = ElementTree.fromstring(data)

@@ -1,6 +1,7 @@
 """Samples of models over HTTP: a client that holds them is told when they are of another revision."""
 
 import hashlib
+from typing import Any
 
 import httpx
 from tests.support.search_primitives import walking
@@ -10,7 +11,7 @@ from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_schemas.encoding import codecs
 
 
-def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict:
+def created(owner: httpx.Client, kind: str, name: str, **parts: object) -> dict[str, Any]:
     body = codecs.encode_tree({"name": name, "parts": parts}, codecs.MSGPACK)
     headers = {"Content-Type": codecs.MSGPACK, "Accept": "application/json"}
     made = owner.post(f"/projects/lab/{kind}", content=body, headers=headers)

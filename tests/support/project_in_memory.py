@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, field
+from typing import Any
 
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.documents.references import RevisionRef
@@ -24,11 +25,11 @@ class ProjectInMemory:
     scratch: object
     task: Task = field(default_factory=lambda: Task(0, 1))
     threads: int = 1
-    inputs: dict = field(default_factory=dict)
-    parts: dict = field(default_factory=dict)
-    blobs: dict = field(default_factory=dict)
-    staged: list = field(default_factory=list)
-    told: list = field(default_factory=list)
+    inputs: dict[str, Any] = field(default_factory=dict)
+    parts: dict[Any, Any] = field(default_factory=dict)
+    blobs: dict[str, bytes] = field(default_factory=dict)
+    staged: list[Any] = field(default_factory=list)
+    told: list[Any] = field(default_factory=list)
     into: str = ""
 
     def document(self, kind, item, revision, part):
@@ -62,6 +63,9 @@ class ProjectInMemory:
 
     def stage(self, outputs):
         self.staged += outputs
+
+    def log(self, text: str) -> None:
+        print(text)
 
     def progress(self, done, total=None, note=""):
         self.told.append((done, total, note))

@@ -20,7 +20,10 @@ class Page(HTMLParser):
 
     def __init__(self, source):
         super().__init__()
-        self.opened, self.tags, self.ids, self.links = [], Counter(), Counter(), []
+        self.opened: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.ids: Counter[str] = Counter()
+        self.links: list[str] = []
         self.attributes, self.words, self.scripts = set(), [], []
         self.feed(source)
         self.close()

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Flags, Floats
 from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.gait import studio_skeleton
 from marey_motion.matching.body import MatchingBody
@@ -96,7 +97,9 @@ def synthetic_database(
 ) -> MatchingDatabase:
     """Return the tracks as clips in the order given; futures clamp to the last frame, or wrap for loops."""
     options = options or DatabaseOptions()
-    features, selectable, clips = [], [], []
+    features: list[Floats] = []
+    selectable: list[Flags] = []
+    clips: list[DatabaseClip] = []
     for number, track in enumerate(tracks):
         wraps = track.loop and options.end_policy == "loop"
         features.append(_features(track, wraps))

@@ -94,7 +94,7 @@ TIERS = {
 }
 
 
-LEFT_OUT: pytest.StashKey[Counter[str]] = pytest.StashKey()
+LEFT_OUT = pytest.StashKey[Counter[str]]()
 """How many tests the tier left out, by reason."""
 
 
@@ -156,7 +156,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """Send the counts of a process of pytest-xdist to the one that prints."""
     output = getattr(session.config, "workeroutput", None)
     if output is not None:
-        output["left_out"] = dict(session.config.stash[LEFT_OUT])
+        counts: Counter[str] = session.config.stash[LEFT_OUT]
+        output["left_out"] = dict(counts)
 
 
 def pytest_report_header() -> str:

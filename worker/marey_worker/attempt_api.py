@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import msgpack  # type: ignore[import-untyped]
+import msgpack
 
 from marey_client.blobs import Blobs
 from marey_client.errors import Conflict, LeaseLost, Unauthenticated

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.provenance import require_comparable
 from marey_motion.evaluation.result import EvaluationResult
@@ -138,7 +139,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     )
 
 
-def paired_change(metric: str, before: Sequence[float], after: Sequence[float]) -> MetricChange:
+def paired_change(metric: str, before: Sequence[float] | Floats, after: Sequence[float] | Floats) -> MetricChange:
     """Compute the change of one metric over trials paired by index, with its bootstrap interval.
 
     Parameters

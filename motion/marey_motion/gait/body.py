@@ -276,7 +276,7 @@ def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
 
 def _turned(axes: str, *angles: AnyFloats) -> AnyFloats:
     """Rotations (n, 4) about the axes of the moving frame, in the order written; angles (n,) in radians."""
-    result = quaternions.identity()
+    result: AnyFloats = quaternions.identity()
     for axis, angle in zip(axes, angles, strict=True):
         result = quaternions.multiply(result, quaternions.from_axis_angle(np.eye(3)["xyz".index(axis)], angle))
     return result

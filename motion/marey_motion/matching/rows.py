@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
-from marey_motion.arrays import Floats
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.looping import LoopSeam, about_vertical, continue_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.features import FeatureLayout, extract_features, in_root_frame, look_ahead
@@ -113,7 +113,7 @@ def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body
     """Put the joints above the carrier at rest, so that they follow the root and the carrier is where it was."""
     skeleton = body.skeleton
     above = skeleton.path_to_root(body.carrier)[1:]
-    turned = quaternions.identity(motion.frame_count)
+    turned: AnyFloats = quaternions.identity(motion.frame_count)
     for joint in (*above[::-1], body.carrier):
         turned = quaternions.multiply(turned, motion.rotations[:, joint])
     unturn = about_vertical(np.array(-rest_heading(body)))

@@ -79,7 +79,7 @@ def one_thread() -> Iterator[None]:
     ------
     None    once, within the context
     """
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+    from threadpoolctl import threadpool_limits
 
     for module in ("scipy.linalg", "sklearn.mixture"):
         import_module(module)  # libraries that are loaded later would not be held to it

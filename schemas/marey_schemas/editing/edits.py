@@ -13,7 +13,7 @@ from marey_schemas.editing.constraints import ConstraintCommand
 MOST_COMMANDS = 256
 AnyCommand = MotionCommand | ConstraintCommand
 EditCommand = Annotated[AnyCommand, Field(discriminator="command")]
-COMMAND_MODELS: dict[str, type[Request]] = {
+COMMAND_MODELS: dict[str, type[AnyCommand]] = {
     get_args(model.model_fields["command"].annotation)[0]: model for model in get_args(AnyCommand)
 }
 """Model by the name of the command."""

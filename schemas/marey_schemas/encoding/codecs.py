@@ -12,7 +12,7 @@ from typing import Any, Literal, NoReturn
 
 import bson
 import bson.errors
-import msgpack  # type: ignore[import-untyped]
+import msgpack
 import numpy as np
 import orjson
 from bson.raw_bson import RawBSONDocument

@@ -74,7 +74,7 @@ class ComputeThreads:
 
 def compute_on_one_thread_each() -> None:
     """Limit each computation of this process to one thread, because several computations run at the same time."""
-    from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+    from threadpoolctl import threadpool_limits
 
     for name in BLAS_VARIABLES:  # for libraries that are not loaded yet
         os.environ.setdefault(name, "1")

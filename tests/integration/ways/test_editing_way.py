@@ -21,6 +21,7 @@ from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.editing.registry import edit_clip
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
+from marey_schemas.documents.references import RevisionRef
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.jobs import Job
 
@@ -50,6 +51,7 @@ def clips_of(project: ProjectHandle, folder: str) -> dict[str, ClipHandle]:
 
 def as_motion(project: ProjectHandle, clip: ClipHandle) -> Clip:
     document = clip.motion()
+    assert isinstance(document.skeleton, RevisionRef)
     hierarchy = project.skeletons.get(document.skeleton.item).hierarchy()
     return clip_from_document(document, skeleton_from_document(hierarchy))
 
@@ -93,7 +95,7 @@ def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: P
     assert (after.item.revision, after.item.summary["frames"]) == (2, 60)
     assert len(after.motion(revision=1).poses) == straight.item.summary["frames"]
     assert after.info().source is not None
-    assert after.info().source.file is not None  # type: ignore[union-attr]
+    assert after.info().source.file is not None
 
 
 def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
@@ -150,7 +152,7 @@ def test_a_preview_shows_what_the_job_makes_and_stores_nothing(marey: Marey, lab
     (made,) = clips_of(lab, "clean").values()
     assert shown.motion is not None
     assert np.array_equal(shown.motion.poses, made.motion(frames=slice(20, 50)).poses)
-    assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)  # type: ignore[union-attr]
+    assert np.array_equal(walk.preview(edit, frames=slice(20, 50)).motion.poses, shown.motion.poses)
     with pytest.raises(RequestFailed, match=r"commands\[0\] \(trim\)"):
         walk.preview([{"command": "trim", "start": 100_000}])
 

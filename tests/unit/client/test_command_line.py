@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
+from typing import Any
 
 import httpx
 import pytest
@@ -49,6 +50,11 @@ def nowhere(tmp_path):
         "XDG_CONFIG_HOME": str(tmp_path), "MAREY_DATA": str(tmp_path), "MAREY_URL": "http://127.0.0.1:9",
         "MAREY_TOKEN": "marey_very_secret",
     }  # fmt: skip
+
+
+def a_job(**fields: Any) -> Job:
+    """A job of which only these fields are looked at."""
+    return Job.model_construct(**fields)
 
 
 def test_help_loads_nothing_heavy():
@@ -280,7 +286,7 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(script, capsy
         raise KeyboardInterrupt
 
     script.answers = [interrupt]
-    running = Job.model_construct(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None)
+    running = a_job(id="job_1", kind="retarget", state=JobState.RUNNING, progress=None)
     with pytest.raises(KeyboardInterrupt):
         follow(script.marey(), running)
     told = capsys.readouterr().err
@@ -289,7 +295,7 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(script, capsy
 
 
 def test_a_job_that_is_not_waited_for_is_named(script, capsys):
-    submitted = Job.model_construct(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
+    submitted = a_job(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
     assert follow(script.marey(), submitted, wait=False) is None
     assert capsys.readouterr().out == "job_1\n"
     assert script.requests == []
@@ -303,7 +309,7 @@ def test_results_are_counted_as_people_count(capsys):
         "clips": 1, "frames": 1, "frame_rate_hz": 30.0, "keyframes": {}, "reference": "walk", "aligned": [aligned],
         "refused": [],
     }  # fmt: skip
-    print_ended(Job.model_construct(id="job_1", result=result), False, _print_aligned)
+    print_ended(a_job(id="job_1", result=result), False, _print_aligned)
     assert capsys.readouterr().out.splitlines()[-1] == "1 clip of 1 frame at 30 Hz; 0 refused"
 
 
@@ -311,7 +317,7 @@ def test_results_are_counted_as_people_count(capsys):
 def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(as_json, capsys):
     result = {"clips": 0, "labels": {}, "refused": [{"name": "walk", "code": "no-feet", "detail": "it has no feet"}]}
     with pytest.raises(Refused):
-        print_ended(Job.model_construct(id="job_1", result=result), as_json, print_labelled)
+        print_ended(a_job(id="job_1", result=result), as_json, print_labelled)
     assert "it has no feet" in "".join(capsys.readouterr())
 
 
@@ -370,7 +376,7 @@ def test_where_files_go_is_called_the_same_by_every_command(command):
 
 def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys):
     for empty, told in ((["raw/walk"], "in raw/walk"), (["raw/a", "raw/b"], "in 2 clips, such as raw/a")):
-        job = Job.model_construct(result={"empty": empty})
+        job = a_job(result={"empty": empty})
         _tell_shortfalls(PipelineRun(None, {"annotate": job}))
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 

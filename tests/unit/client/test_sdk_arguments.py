@@ -40,7 +40,7 @@ def test_folders_and_files_may_be_named_by_texts(script, tmp_path):
 def test_poses_that_were_read_are_put_back_as_the_next_revision(script):
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
-        "joints": ["Hips"], "poses": np.tile(np.float32([0, 1, 0, 1, 0, 0, 0]), (3, 1)),
+        "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
     }  # fmt: skip
     stored = encode_tree(motion, "application/msgpack", arrays="blocks")
     script.answers = [
@@ -50,7 +50,7 @@ def test_poses_that_were_read_are_put_back_as_the_next_revision(script):
     ]
     clip = script.marey().project("lab").clips.get("clip_1")
     read: MotionArrays = clip.motion()
-    moved = read.model_copy(update={"poses": read.poses + np.float32([1, 0, 0, 0, 0, 0, 0])})
+    moved = read.model_copy(update={"poses": read.poses + np.array([1, 0, 0, 0, 0, 0, 0], np.float32)})
     assert clip.put_motion(moved, message="to the left").revision == 2
     sent = decode_tree(script.requests[-1].content, "application/msgpack", max_bytes=1 << 20)
     assert sent["poses"][:, 0].tolist() == [1, 1, 1]
@@ -106,7 +106,7 @@ def query_of(request):
 def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script):
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
-        "joints": ["Hips"], "poses": np.tile(np.float32([0, 1, 0, 1, 0, 0, 0]), (3, 1)),
+        "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
     }  # fmt: skip
     stored = encode_tree(motion, "application/msgpack", arrays="blocks")
     read = httpx.Response(200, content=stored, headers={"Content-Type": BLOCKS})

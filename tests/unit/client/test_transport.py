@@ -3,6 +3,7 @@
 import logging
 import pickle
 import ssl
+from typing import Any
 
 import httpx
 import numpy as np
@@ -266,7 +267,8 @@ def test_authorities_of_the_house_are_trusted_beside_the_public_ones(monkeypatch
     (tmp_path / "root.pem").write_text(ROOT)
     monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / "root.pem"))
     trusted = trusted_authorities()
-    names = [dict(part[0] for part in one["subject"]).get("commonName") for one in trusted.get_ca_certs()]
+    authorities: list[dict[str, Any]] = trusted.get_ca_certs()
+    names = [dict(part[0] for part in one["subject"]).get("commonName") for one in authorities]
     assert "Root of the tests" in names
     assert public > 50
     assert len(names) > 50

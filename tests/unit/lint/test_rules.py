@@ -74,6 +74,11 @@ def test_a_documented_function_of_the_library_is_fine():
     assert not list(docstrings.find(house({"marey_motion.turns": text})))
 
 
+def test_overloads_of_a_documented_function_need_no_docstring() -> None:
+    text = "@overload\ndef turned() -> None: ...\n"
+    assert not list(docstrings.find(house({"marey_motion.turns": text})))
+
+
 def test_a_small_module_with_one_importer_belongs_into_it():
     modules = {"marey_x.small": "", "marey_x.one": f"import marey_x.small\n{LONG}", "marey_x.other": LONG}
     assert messages(small_modules.find(house(modules))) == ["0 lines, imported only by marey_x.one; merge it"]

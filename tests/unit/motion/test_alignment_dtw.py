@@ -41,7 +41,8 @@ def all_ways(n, m, max_run=None):
 
 
 def cheapest_way(costs, max_run=None):
-    return min((sum(costs[cell] for cell in way) for way in all_ways(*costs.shape, max_run)), default=None)
+    rows, columns = costs.shape
+    return min((sum(costs[cell] for cell in way) for way in all_ways(rows, columns, max_run)), default=None)
 
 
 def links_between_layers(max_run):

@@ -84,7 +84,7 @@ def test_turns_through_half_a_turn_go_on_and_do_not_swing_back() -> None:
     frames = np.arange(10)
     still = Motion(np.zeros((10, 3)), quaternions.identity(10, 1), np.zeros((10, 0, 3)), ())
     angles = np.linspace(2.8, 3.6, 10)[:, None]
-    turning = still._replace(rotations=quaternions.from_axis_angle((0.0, 1.0, 0.0), angles))
+    turning = still._replace(rotations=np.asarray(quaternions.from_axis_angle((0.0, 1.0, 0.0), angles), np.float64))
     given = frames[::3]
     result = displace(still, given, turning.at_frames(given), (Window(0, 10, False, False),))
     assert quaternions.angle_between(result.rotations, turning.rotations).max() < 0.05

@@ -51,7 +51,9 @@ def share_of(pixels, colour):
 
 def chain(names, offsets, tips=()):
     count = len(names)
-    return Skeleton(names, np.arange(-1, count - 1), np.array(offsets), quaternions.identity(count), tips)
+    return Skeleton(
+        names, np.arange(-1, count - 1, dtype=np.int32), np.array(offsets), quaternions.identity(count), tips
+    )
 
 
 def still(skeleton, frames=3):
@@ -100,11 +102,12 @@ def test_only_the_frames_shown_are_computed(walk, monkeypatch):
     from marey_motion import kinematics
 
     original = kinematics.forward_kinematics
-    monkeypatch.setattr(
-        kinematics,
-        "forward_kinematics",
-        lambda skeleton, poses, **options: computed.append(len(poses)) or original(skeleton, poses, **options),
-    )
+
+    def counted(skeleton, poses, **options):
+        computed.append(len(poses))
+        return original(skeleton, poses, **options)
+
+    monkeypatch.setattr(kinematics, "forward_kinematics", counted)
     contact_sheet([TakePair("long", walk, walk)], moments=5)
     assert computed == [5, 5]
 

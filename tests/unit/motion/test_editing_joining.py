@@ -23,6 +23,7 @@ from marey_motion.kinematics import global_positions
 from marey_motion.matching.body import MatchingBody
 from marey_motion.rigs import map_joints
 from marey_schemas.editing.commands import Concatenate, Rotate, Translate
+from marey_schemas.editing.edits import AnyCommand
 
 BLENDS = ("inertialise", "slerp")
 
@@ -41,7 +42,7 @@ def heading_of(clip: Clip) -> np.ndarray:
 @pytest.mark.parametrize("away", [0.0, 2.5])
 def test_the_second_goes_on_where_the_first_ends(blend: str, away: float) -> None:
     first = make_walk(turn_rate_rad_s=0.6)
-    elsewhere = [Rotate(angle_deg=degrees(away)), Translate(shift_m=(5.0, 0.0, -3.0))]
+    elsewhere: list[AnyCommand] = [Rotate(angle_deg=degrees(away)), Translate(shift_m=(5.0, 0.0, -3.0))]
     second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
     joined = join(first, second, blend=blend)
     require_sound(joined)
@@ -162,7 +163,7 @@ def test_feet_and_heading_go_on_at_the_seam(blend: str, start: int) -> None:
 @pytest.mark.parametrize("turned_by", [0.0, 1.5, 3.1])
 def test_bodies_under_a_static_root_are_joined_as_bodies_that_are_the_root(blend: str, turned_by: float) -> None:
     first = make_walk(turn_rate_rad_s=0.6)
-    elsewhere = [Rotate(angle_deg=degrees(turned_by)), Translate(shift_m=(5.0, 0.0, -3.0))]
+    elsewhere: list[AnyCommand] = [Rotate(angle_deg=degrees(turned_by)), Translate(shift_m=(5.0, 0.0, -3.0))]
     second = apply_edit(make_walk(turn_rate_rad_s=-0.4), elsewhere)
     joined = join(under_static_root(first), under_static_root(second), blend=blend)
     require_sound(joined)

@@ -88,9 +88,9 @@ def test_scaling_scales_the_path_and_leaves_the_limbs() -> None:
     scaled = apply_edit(walk, [Scale(factor=0.5)])
     assert np.allclose(scaled.root_translations, 0.5 * walk.root_translations, atol=1e-6)
     assert np.array_equal(scaled.rotations, walk.rotations)
-    assert np.array_equal(scaled.translations, walk.translations)  # type: ignore[arg-type]
+    assert np.array_equal(scaled.translations, walk.translations)
     whole = apply_edit(walk, [Scale(factor=0.5, translations=True)])
-    assert np.allclose(whole.translations, 0.5 * walk.translations, atol=1e-6)  # type: ignore[operator]
+    assert np.allclose(whole.translations, 0.5 * walk.translations, atol=1e-6)
 
 
 def test_a_world_with_z_up_gets_y_up() -> None:
@@ -116,8 +116,8 @@ def test_flipped_axes_are_a_rotation_that_takes_up_to_y_and_forward_to_z(up: str
 
     assert np.allclose(after[..., 1], along(up), atol=1e-5)
     assert np.allclose(after[..., 2], along(forward), atol=1e-5)
-    lengths = [np.linalg.norm(p[:, 1:] - p[:, :1], axis=-1) for p in (before, after)]
-    assert np.allclose(*lengths, atol=1e-5)
+    length, unflipped = (np.linalg.norm(p[:, 1:] - p[:, :1], axis=-1) for p in (after, before))
+    assert np.allclose(length, unflipped, atol=1e-5)
 
 
 @pytest.mark.parametrize("profile", ["linear", "smooth"])

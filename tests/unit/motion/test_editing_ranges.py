@@ -46,7 +46,7 @@ def test_pieces_put_together_again_are_the_motion() -> None:
     commands = [Concatenate(source=name, place="keep", blend_s=0.0) for name in sources]
     whole = apply_edit(first.clip, commands, sources=sources)
     assert np.array_equal(whole.poses, walk.poses)
-    assert np.array_equal(whole.translations, walk.translations)  # type: ignore[arg-type]
+    assert np.array_equal(whole.translations, walk.translations)
 
 
 def test_what_follows_a_split_is_done_to_every_piece() -> None:

@@ -65,9 +65,9 @@ def test_noise_gets_less(method: str) -> None:
 
 def test_joints_that_are_not_named_stay() -> None:
     rough = noisy(make_walk(), 0.03)
-    given = {"joints": ["Head", "LeftArm"], "root_translation": False}
-    smoothed = apply_edit(rough, [Smooth(**given)])
-    chosen = [rough.skeleton.index_of(name) for name in given["joints"]]  # type: ignore[union-attr]
+    names = ["Head", "LeftArm"]
+    smoothed = apply_edit(rough, [Smooth(joints=names, root_translation=False)])
+    chosen = [rough.skeleton.index_of(name) for name in names]
     others = [joint for joint in range(rough.skeleton.joint_count) if joint not in chosen]
     assert np.array_equal(smoothed.rotations[:, others], rough.rotations[:, others])
     assert np.array_equal(smoothed.root_translations, rough.root_translations)

@@ -264,7 +264,8 @@ def test_who_walks_a_targets_path_fills_its_cell():
 
 def test_the_performer_is_where_the_newest_frame_has_him_and_moves_as_the_newest_window(walk):
     online = OnlineCoverage(RATE_HZ)
-    assert online.performer is None
+    at_first = online.performer
+    assert at_first is None
     positions, headings = circling(2.0, 50.0, 3.0)
     online.add_roots(positions[:50], headings[:50])
     assert online.performer.window is None

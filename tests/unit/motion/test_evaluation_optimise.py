@@ -2,6 +2,7 @@
 
 import json
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from tests.support.smaller_databases import without_sources
@@ -115,7 +116,7 @@ def test_the_log_of_an_optimisation_is_a_plain_document(found):
 
 
 def test_each_step_is_handed_over_as_soon_as_it_is_made(simulation):
-    made = []
+    made: list[Any] = []
     found = optimise(simulation, AIM.replace(max_steps=2), absent=TURNS, made=made.append)
     assert tuple(made) == found.steps
 

@@ -1,11 +1,13 @@
 """Parameters of an evaluation are the options that the mathematics takes, and a few of the job."""
 
+from typing import Any
+
 from marey_motion.evaluation.result_documents import options_from_tree
 from marey_motion.evaluation.scenario import suite_trials
 from marey_schemas.job_params import EvaluateParams
 from marey_schemas.options.evaluation import EvaluationOptions
 
-OF_RELEASE_0_1 = {
+OF_RELEASE_0_1: dict[str, Any] = {
     "grid": {"speeds_m_s": [0.5, 2.0], "turn_rates_deg_s": [-30.0]},
     "families": ["switching"],
     "approach_s": 1.0,
@@ -51,7 +53,7 @@ OF_RELEASE_0_1 = {
 
 
 def test_options_of_documents_of_release_0_1_are_those_of_the_same_parameters() -> None:
-    flat = {**OF_RELEASE_0_1, **OF_RELEASE_0_1["grid"]}
+    flat: dict[str, Any] = {**OF_RELEASE_0_1, **OF_RELEASE_0_1["grid"]}
     asked = EvaluateParams.model_validate({name: value for name, value in flat.items() if name != "grid"})
     assert options_from_tree(OF_RELEASE_0_1) == EvaluationOptions.of(asked)
 

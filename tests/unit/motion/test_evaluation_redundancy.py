@@ -80,7 +80,7 @@ def test_a_plan_predicts_every_step_exactly(database, simulation):
 
 def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
     plan = plan_removals(simulation, 3, ObjectiveOptions())
-    gone = []
+    gone: list[str] = []
     for step in plan:
         assert step.removal == leave_one_out(simulation, ObjectiveOptions(), removed=gone)[0]
         gone.append(step.removal.source)

@@ -68,7 +68,7 @@ def test_the_threshold_is_the_suites_own_when_none_is_given(database):
     result = evaluated(database)
     found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
     assert found.similarity.threshold_m == accepted_distance(result.records)
-    assert found.plan == found.redundant == found.fillings == ()
+    assert (found.plan, found.redundant, found.fillings) == ((), (), ())
 
 
 def test_the_document_holds_everything_with_a_reason_and_travels(found):

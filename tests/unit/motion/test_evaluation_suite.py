@@ -89,14 +89,22 @@ def test_progress_begins_with_what_is_done_and_ends_with_all(database, records):
 
 def test_callbacks_run_where_the_suite_was_called(database):
     where = set()
+
+    def note_thread(*_progress: object) -> None:
+        where.add(threading.get_ident())
+
+    def not_cancelled() -> bool:
+        note_thread()
+        return False
+
     run_suite(
         database,
         OPTIONS,
         trials=TRIALS[:4],
         threads=2,
-        progress=lambda _done, _total, _note: where.add(threading.get_ident()),
-        finished=lambda _trial, _record: where.add(threading.get_ident()),
-        cancelled=lambda: where.add(threading.get_ident()) is not None,
+        progress=note_thread,
+        finished=note_thread,
+        cancelled=not_cancelled,
     )
 
     assert where == {threading.get_ident()}

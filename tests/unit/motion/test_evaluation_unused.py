@@ -1,6 +1,7 @@
 """What no trial needs can go without changing a single bit of any trial."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from marey_motion.matching.record import Status
 from marey_motion.matching.search import build_index
 from marey_schemas.options.matching import DatabaseOptions
 
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "as usual": {},
     "by pose distance": {"selection": "pose_distance"},
     "along the path": {"follow": "path"},

@@ -8,6 +8,8 @@ import pytest
 
 import marey_motion
 
+EXPORTED: list[str] = vars(marey_motion)["__all__"]
+
 PACKAGE = Path(marey_motion.__file__).parent
 
 
@@ -17,10 +19,10 @@ def modules_with_examples() -> list[str]:
         for file in PACKAGE.rglob("*.py")
         if ">>> " in file.read_text(encoding="utf-8")
     }
-    return sorted(own | {getattr(marey_motion, name).__module__ for name in marey_motion.__all__})
+    return sorted(own | {getattr(marey_motion, name).__module__ for name in EXPORTED})
 
 
-@pytest.mark.parametrize("name", marey_motion.__all__)
+@pytest.mark.parametrize("name", EXPORTED)
 def test_an_exported_name_has_an_example(name: str) -> None:
     assert ">>> " in (getattr(marey_motion, name).__doc__ or "")
 

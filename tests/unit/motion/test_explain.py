@@ -1,6 +1,7 @@
 """Why motion matching chose what it chose."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,12 +19,12 @@ INDEX = index_of(DATABASE)
 PATH = reference(Trial("circle", 2.0, 1.0, duration_s=10.0))
 
 
-def played(**options: object) -> tuple[ControllerOptions, TrialRecord]:
+def played(**options: Any) -> tuple[ControllerOptions, TrialRecord]:
     chosen = ControllerOptions(**options)
     return chosen, run_trial(DATABASE, INDEX, PATH, chosen)
 
 
-def explained(made: tuple[ControllerOptions, TrialRecord], tick: int, **asked: object) -> Explanation:
+def explained(made: tuple[ControllerOptions, TrialRecord], tick: int, **asked: Any) -> Explanation:
     options, record = made
     return explain_choice(DATABASE, INDEX, PATH, options, record, tick, **asked)
 

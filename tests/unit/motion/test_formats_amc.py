@@ -66,7 +66,7 @@ def test_degrees_of_freedom_turn_in_the_order_they_are_listed() -> None:
     other = read(AMC.replace("thigh 40 50 60", "thigh 60 40 50"), ASF.replace("dof rx ry rz", "dof rz rx ry"))
     in_that_order = Rotation.from_euler("zxy", [60, 40, 50], degrees=True)
     frame = Rotation.from_euler("z", 20, degrees=True)
-    found = Rotation.from_quat(other.rotations[0, 1], scalar_first=True)  # type: ignore[index]
+    found = Rotation.from_quat(other.rotations[0, 1], scalar_first=True)
     assert (found.inv() * frame * in_that_order * frame.inv()).magnitude() < 1e-6
 
 
@@ -81,8 +81,8 @@ def test_the_root_may_list_its_channels_in_any_order() -> None:
 
 def test_radians_are_read_as_radians() -> None:
     in_radians = AMC.replace(":DEGREES", ":RADIANS").replace("shin 70", f"shin {float(np.radians(70))!r}")
-    found = read(in_radians).rotations[0, 2]  # type: ignore[index]
-    np.testing.assert_allclose(found, read().rotations[0, 2], atol=1e-6)  # type: ignore[index]
+    found = read(in_radians).rotations[0, 2]
+    np.testing.assert_allclose(found, read().rotations[0, 2], atol=1e-6)
 
 
 def in_radians(text: str, *angles: str) -> str:
@@ -96,7 +96,7 @@ def in_radians(text: str, *angles: str) -> str:
 def test_an_amc_that_does_not_say_its_unit_of_angle_has_that_of_its_asf() -> None:
     silent = in_radians(AMC.replace(":DEGREES\n", ""), "10 20 31", "10 20 30", "40 50 60", "40 50 61", "70", "71")
     asf = in_radians(ASF, "0 0 20 XYZ", "0 30 0 XYZ").replace("angle deg", "angle rad")
-    np.testing.assert_allclose(read(silent, asf).rotations, read().rotations, atol=1e-6)  # type: ignore[arg-type]
+    np.testing.assert_allclose(read(silent, asf).rotations, read().rotations, atol=1e-6)
     np.testing.assert_array_equal(read(AMC.replace(":DEGREES\n", "")).rotations, read().rotations)
 
 

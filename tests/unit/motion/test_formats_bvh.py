@@ -72,7 +72,7 @@ class TestLayout:
     @pytest.mark.parametrize("padding", [b"\x1a", b"\0" * 100, b"\n\x1a\0\0"])
     def test_what_old_disks_put_after_the_end_is_no_number(self, padding: bytes) -> None:
         source = read(bvh([ROW]) + padding)
-        assert len(source.rotations) == 1  # type: ignore[arg-type]
+        assert len(source.rotations) == 1
         assert codes(source) == []
 
     def test_joints_without_end_sites_are_leaves(self) -> None:
@@ -151,7 +151,7 @@ class TestChannels:
         rows = [f"0 90 0 0 0 0 1 {height} 2 0 0 0" for height in (10, 10, 10.5)]
         source = read(bvh(rows, hierarchy=hierarchy))
         np.testing.assert_array_equal(source.offsets, [[0, 90, 0], [1, 10, 2]])
-        assert source.translations[:, 0, 1].tolist() == [10, 10, 10.5]  # type: ignore[index]
+        assert source.translations[:, 0, 1].tolist() == [10, 10, 10.5]
         assert codes(source) == ["offsets-from-positions"]
 
     def test_rotations_do_not_change_sign_between_frames(self) -> None:

@@ -100,7 +100,7 @@ def test_sign_flips_and_lengths_are_mended_with_a_warning() -> None:
 def test_clips_survive_every_form_and_encoding(
     body: Skeleton, tumbling: Callable[..., Clip], skeleton_form: Any, form: str, encoding: str
 ) -> None:
-    turned = quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4)))
+    turned = np.asarray(quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4))), np.float64)
     skeleton = Skeleton(body.joint_names, body.parents, body.offsets, turned, body.end_sites)
     clip = tumbling(skeleton)
     document = write_predecessor_skeleton(skeleton, form=skeleton_form)
@@ -130,7 +130,7 @@ def described(document: dict[str, Any]) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("form", ["database", "file"])
 def test_rest_rotations_survive_both_forms(body: Skeleton, form: Any) -> None:
-    turned = quaternions.normalise(np.random.default_rng(8).normal(size=(body.joint_count, 4)))
+    turned = np.asarray(quaternions.normalise(np.random.default_rng(8).normal(size=(body.joint_count, 4))), np.float64)
     skeleton = Skeleton(body.joint_names, body.parents, body.offsets, turned, body.end_sites)
     written = write_predecessor_skeleton(skeleton, form=form)
     assert same_hierarchy(read_motion(written, "body.json").skeleton, skeleton, tolerance_m=1e-9)

@@ -2,6 +2,7 @@
 
 import copy
 import json
+from typing import Any
 
 import pytest
 
@@ -76,7 +77,7 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing():
 def test_damaged_graphs_are_refused_by_the_node(path, value, told):
     document = copy.deepcopy(DOCUMENT)
     *above, last = path
-    place = document
+    place: Any = document
     for step in above:
         place = place[step]
     place[last] = value

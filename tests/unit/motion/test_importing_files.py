@@ -24,6 +24,7 @@ from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import OutputRef
+from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions
 
 DIGEST = f"sha256:{'1' * 64}"
@@ -75,7 +76,7 @@ def test_a_model_of_the_predecessor_is_decoded_once(count: Count) -> None:
 
 
 def test_the_anatomy_of_equal_skeletons_is_found_once(count: Count, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    monkeypatch.setattr(anatomy, "_KNOWN", LruCache(max_entries=8))
     takes = [generate_gait(speed, 0.0, 1.0, 30.0) for speed in (1.0, 1.4)]
     count(anatomy, "map_joints")
     calls = count(anatomy, "find_landmarks")
@@ -94,9 +95,9 @@ def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pyt
         found = read("take.bvh", data)
         return mapping_part(found), found.items[0].parts["hierarchy"], found.checks
 
-    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    monkeypatch.setattr(anatomy, "_KNOWN", LruCache(max_entries=8))
     alone = documents_of(takes[1])
-    monkeypatch.setattr(anatomy, "_KNOWN", anatomy.LruCache(max_entries=8))
+    monkeypatch.setattr(anatomy, "_KNOWN", LruCache(max_entries=8))
     documents_of(takes[0])
     assert documents_of(takes[1]) == alone
 

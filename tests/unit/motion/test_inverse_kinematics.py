@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -51,14 +52,21 @@ def skeleton(request: pytest.FixtureRequest, body: Skeleton) -> Skeleton:
     return game_skeleton() if request.param == "game" else _with_odd_axes(body)
 
 
+Solver = Literal["ccd", "least_squares", "two_bone"]
+
+
+def limb_of(body: Skeleton, start: str, middle: str, end: str) -> TwoBoneLimb:
+    return TwoBoneLimb(body.index_of(start), body.index_of(middle), body.index_of(end))
+
+
 def _with_odd_axes(body: Skeleton) -> Skeleton:
     """The same rest pose, described in local frames turned at random."""
     frames = quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4)))
     above = np.concatenate((quaternions.identity(1), frames[body.parents[1:]]))
     return replace(
         body,
-        offsets=quaternions.rotate_vectors(quaternions.conjugate(above), body.offsets),
-        rest_rotations=quaternions.multiply(quaternions.conjugate(above), frames),
+        offsets=np.asarray(quaternions.rotate_vectors(quaternions.conjugate(above), body.offsets), np.float64),
+        rest_rotations=np.asarray(quaternions.multiply(quaternions.conjugate(above), frames), np.float64),
         end_sites=(),
     )
 
@@ -298,7 +306,9 @@ def _swing_and_twist(limit: JointLimit, rotations: np.ndarray) -> tuple[np.ndarr
     turns = quaternions.multiply(quaternions.conjugate(limit.reference), rotations)
     twist, swing = quaternions.twist_swing(turns, limit.axis)
     vector = quaternions.as_rotation_vector(swing)
-    across = np.stack((vector @ np.array(limit.side), vector @ np.cross(limit.axis, limit.side)), axis=-1)
+    across = np.stack(
+        (vector @ np.array(limit.side), vector @ np.cross(np.array(limit.axis), np.array(limit.side))), axis=-1
+    )
     return across, quaternions.as_rotation_vector(twist) @ np.array(limit.axis)
 
 
@@ -378,7 +388,7 @@ def test_two_bones_meet_every_place_they_can_reach(skeleton: Skeleton, standard:
 
 def test_two_bones_stay_in_the_plane_of_the_limb(body: Skeleton) -> None:
     motion = _moved(body, frames=50)
-    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    limb = limb_of(body, "LeftUpLeg", "LeftLeg", "LeftFoot")
     places = motion.positions(body)
     nearer = places[:, limb.start] + 0.8 * (places[:, limb.end] - places[:, limb.start])
     after = solve_two_bone(body, motion, limb, PositionTarget(limb.end, nearer)).motion.positions(body)
@@ -393,7 +403,7 @@ def test_two_bones_stay_in_the_plane_of_the_limb(body: Skeleton) -> None:
 @pytest.mark.parametrize("far", [0.9, 100.0])
 def test_two_bones_stretch_towards_what_they_cannot_reach(body: Skeleton, far: float) -> None:
     motion = _moved(body, frames=20)
-    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
     way = np.array([2.0, 1.0, -2.0]) / 3.0
     start = motion.positions(body)[:, limb.start]
     solved = solve_two_bone(body, motion, limb, PositionTarget(limb.end, start + far * way))
@@ -458,7 +468,7 @@ def test_a_limb_that_is_where_it_shall_be_stays_as_it_is(body: Skeleton, bend_de
 
 def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
     motion = _moved(body, frames=30)
-    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
     places, spins = motion.positions(body), _spins(body, motion, limb.end)
     near = places[:, limb.start] + 0.7 * (places[:, limb.end] - places[:, limb.start])
     held = solve_two_bone(body, motion, limb, PositionTarget(limb.end, near), ending="held")
@@ -481,7 +491,7 @@ def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) 
         np.zeros((frames, 0, 3)),
         (),
     )
-    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftUpLeg", "LeftLeg", "LeftFoot")))
+    limb = limb_of(body, "LeftUpLeg", "LeftLeg", "LeftFoot")
     rest.rotations[:, limb.middle] = quaternions.from_axis_angle((1.0, 0.0, 0.0), 0.8)
     hip = rest.positions(body)[:, limb.start]
     target = hip - np.linspace(0.75, 0.86, frames)[:, None] * (0.0, 1.0, 0.0)
@@ -497,7 +507,9 @@ def test_damping_keeps_a_stretching_limb_from_snapping_straight(body: Skeleton) 
 
 
 @pytest.mark.parametrize("solver", ["ccd", "least_squares", "two_bone"])
-def test_frames_together_are_solved_as_each_alone(skeleton: Skeleton, solver: str) -> None:
+def test_frames_together_are_solved_as_each_alone(
+    skeleton: Skeleton, solver: Literal["ccd", "least_squares", "two_bone"]
+) -> None:
     motion = _moved(skeleton, frames=40)
     wrist = _joint(skeleton, "left_wrist")
     limb = limb_ending_at(skeleton, map_joints(skeleton), wrist)
@@ -537,7 +549,7 @@ def test_joints_with_translations_of_their_own_are_reckoned_with(body: Skeleton,
 
 def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
     motion = _moved(body, frames=1)
-    limb = TwoBoneLimb(*(body.index_of(name) for name in ("LeftArm", "LeftForeArm", "LeftHand")))
+    limb = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand")
     near = motion.positions(body)[0, limb.start] + (0.3, 0.1, 0.1)
     exact = solve(body, motion, [PositionTarget(limb.end, near)], limb=limb)
     assert exact.residual_after[0, 0] < 1e-12
@@ -547,7 +559,7 @@ def test_the_solver_that_fits_is_chosen(body: Skeleton) -> None:
     chain = Freedom(chain_of(body, limb.end, body.index_of("Spine")))
     assert not solve(body, motion, [PositionTarget(limb.end, far)], limb=limb).reached[0]
     assert solve(body, motion, [PositionTarget(limb.end, far)], limb=limb, freedom=chain).reached[0]
-    several = [PositionTarget(limb.end, near), LookAtTarget(body.index_of("Head"), near, axis=(0, 0, 1))]
+    several: list[Target] = [PositionTarget(limb.end, near), LookAtTarget(body.index_of("Head"), near, axis=(0, 0, 1))]
     assert solve(body, motion, several).reached.all()
 
 

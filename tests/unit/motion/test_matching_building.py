@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ WALK = generate_gait(1.3, 0.5, 3.0, style=GaitStyle.varied(2))
 
 
 def built(
-    clip: Clip, options: DatabaseOptions = DEFAULTS, body: MatchingBody = BODY, **source: object
+    clip: Clip, options: DatabaseOptions = DEFAULTS, body: MatchingBody = BODY, **source: Any
 ) -> MatchingDatabase:
     return build_database([SourceClip("one", "one", clip, **source)], body, options)
 
@@ -55,9 +56,11 @@ def on_the_ground(clip: Clip, turn_rad: float, shift: tuple[float, float]) -> Cl
 def game_walk() -> tuple[Clip, MatchingBody]:
     """A walk of a skeleton whose root stands on the ground below the pelvis, and has other local axes."""
     target = game_skeleton()
-    rigs = [(skeleton, map_joints(skeleton)) for skeleton in (WALK.skeleton, target)]
-    plan = plan_retarget(*(part for rig in rigs for part in (*rig, guess_axes(*rig))))
-    return retarget(WALK, plan), MatchingBody.from_mapping(target, rigs[1][1])
+    source = WALK.skeleton
+    mapping, target_mapping = map_joints(source), map_joints(target)
+    axes, target_axes = guess_axes(source, mapping), guess_axes(target, target_mapping)
+    plan = plan_retarget(source, mapping, axes, target, target_mapping, target_axes)
+    return retarget(WALK, plan), MatchingBody.from_mapping(target, target_mapping)
 
 
 def left_behind(clip: Clip) -> tuple[Clip, MatchingBody]:
@@ -126,7 +129,7 @@ class TestWhatMustNotMatter:
         poses[:, :3] = np.round(poses[:, :3] * 4096) / 4096
         clip = replace(WALK, poses=poses)
         turned = poses.copy()
-        turned[:, [0, 2]] = np.float32([3.5, -8.25]) - poses[:, [0, 2]]
+        turned[:, [0, 2]] = np.array([3.5, -8.25], np.float32) - poses[:, [0, 2]]
         w, x, y, z = poses[:, 3:7].T
         turned[:, 3:7] = np.stack((-y, z, w, -x), axis=1)
         here, there = built(clip), built(replace(WALK, poses=turned))

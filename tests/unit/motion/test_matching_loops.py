@@ -81,7 +81,8 @@ def test_a_loop_that_begins_elsewhere_has_the_same_rows(long_walk: Clip) -> None
 
 
 def _facing(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    across = sum(positions[:, left] - positions[:, right] for left, right in zip(BODY.lefts, BODY.rights, strict=True))
+    pairs = zip(BODY.lefts, BODY.rights, strict=True)
+    across = np.sum([positions[:, left] - positions[:, right] for left, right in pairs], axis=0)
     return np.unwrap(np.arctan2(-across[:, 2], across[:, 0]))
 
 
@@ -138,7 +139,7 @@ def test_a_loop_at_another_rate_keeps_its_round() -> None:
 
 class TestSeams:
     def test_the_closing_step_is_the_mean_of_its_neighbours(self) -> None:
-        angles = 0.3 + 0.05 * np.arange(12)
+        angles = 0.3 + 0.05 * np.arange(12.0)
         places = np.stack((2 - 2 * np.cos(angles), 2 * np.sin(angles)), axis=1)
         seam = loop_seam(places, angles)
         assert seam.turn_rad == pytest.approx(12 * 0.05)

@@ -10,10 +10,10 @@ from hypothesis.extra import numpy as arrays
 from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
-from marey_motion.matching.search import LARGEST, build_index, find_best, find_nearest
+from marey_motion.matching.search import LARGEST, Method, build_index, find_best, find_nearest
 from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
 
-METHODS = ("boxes", "scan", "auto")
+METHODS: tuple[Method, ...] = ("boxes", "scan", "auto")
 
 
 def true_costs(rows, query, weights=None):

@@ -176,6 +176,8 @@ def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
     ],
 )
 def test_what_is_no_pairing_is_refused(partners, message) -> None:
-    skeleton = Skeleton(("a", "b", "c"), [-1, 0, 0], np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1)))
+    skeleton = Skeleton(
+        ("a", "b", "c"), np.array([-1, 0, 0], np.int32), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
+    )
     with pytest.raises(MotionError, match=message):
         mirror_clip(wild(skeleton, 6), np.array(partners))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
 from marey_motion import quaternions
@@ -74,10 +75,10 @@ def plain_error(primitive, joints, latents, constraint):
         case LookDirection():
             axis = np.asarray(constraint.axis) / np.linalg.norm(constraint.axis)
             pointing = quaternions.rotate_vectors(rotations[:, joints[constraint.joint]], axis)
-            wanted = constraint.direction
-            if wanted is None:
-                wanted = np.asarray(constraint.point_m) - positions[:, joints[constraint.joint]]
-            return angle_between(pointing, np.broadcast_to(wanted, pointing.shape))
+            direction: ArrayLike = constraint.direction
+            if constraint.direction is None:
+                direction = np.asarray(constraint.point_m) - positions[:, joints[constraint.joint]]
+            return angle_between(pointing, np.broadcast_to(direction, pointing.shape))
         case RootHeading():
             lefts, rights = ([joints[f"{side}_{part}"] for part in ("hip", "shoulder")] for side in ("left", "right"))
             found = [headings(forward_directions(one[None], lefts, rights))[0] for one in positions]

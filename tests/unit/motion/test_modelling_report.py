@@ -46,7 +46,7 @@ def figures(model):
 
 @pytest.fixture(scope="module")
 def page(model, figures):
-    return is_sound(rendered(*model, figures))
+    return is_sound(rendered(model[0], model[1], figures))
 
 
 def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
@@ -61,7 +61,7 @@ def test_the_page_opens_with_the_verdict(page, model):
 
 
 def test_the_same_model_gives_the_same_page(model, figures):
-    assert rendered(*model, figures) == rendered(*model, figures)
+    assert rendered(model[0], model[1], figures) == rendered(model[0], model[1], figures)
 
 
 def test_the_page_may_load_nothing(model):

@@ -13,7 +13,7 @@ from tests.support.tiers import examples
 
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.search.constraints import JointPosition, RootPosition
+from marey_motion.modelling.search.constraints import Constraint, JointPosition, RootPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import FoundSamples, search_closely, search_tree
@@ -156,7 +156,7 @@ def test_looking_closer_comes_nearer_and_stays_as_likely():
     once, twice = [], []
     for target in primitive.sample(25, 31):
         place = primitive.poses(target[None], [0.0])[0, 0, :3]
-        wanted = [JointPosition("pelvis", 0, tuple(place)), RootPosition("end", (0.05, 1.1))]
+        wanted: list[Constraint] = [JointPosition("pelvis", 0, tuple(place)), RootPosition("end", (0.05, 1.1))]
         objective = build_objective(primitive, wanted, standard_joints())
         once.append(search_tree(objective, tree, candidates=4))
         twice.append(search_closely(objective, tree, candidates=4, passes=2))

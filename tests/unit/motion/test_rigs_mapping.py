@@ -415,7 +415,10 @@ def test_half_a_body_says_what_it_lacks(body):
 
 def test_what_is_no_body_is_said_to_be_none():
     snake = Skeleton(
-        tuple(f"s{i}" for i in range(20)), np.arange(-1, 19), np.full((20, 3), 0.1), quaternions.identity(20)
+        tuple(f"s{i}" for i in range(20)),
+        np.arange(-1, 19, dtype=np.int32),
+        np.full((20, 3), 0.1),
+        quaternions.identity(20),
     )
     mapping = map_joints(snake)
 

@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from marey_motion.errors import SkeletonError, UnknownJoint
 from marey_motion.skeleton import EndSite, Skeleton, same_hierarchy
 
 
-def chain(**changes):
-    fields = {
+def chain(**changes: Any) -> Skeleton:
+    fields: dict[str, Any] = {
         "joint_names": ("a", "b", "c"),
         "parents": [-1, 0, 1],
         "offsets": [[0, 1, 0], [0, 0.5, 0], [0, 0.4, 0]],
@@ -80,13 +81,15 @@ def test_the_rest_pose_turns_with_the_rest_rotations():
     quarter = quaternions.from_axis_angle([0, 0, 1], np.pi / 2)
     skeleton = chain(rest_rotations=np.stack([quarter, quarter, quaternions.identity()]))
 
-    np.testing.assert_allclose(skeleton.rest_global_positions, [[0, 1, 0], [-0.5, 1, 0], [-0.5, 0.6, 0]], atol=1e-15)
+    np.testing.assert_allclose(
+        skeleton.rest_global_positions, [[0.0, 1.0, 0.0], [-0.5, 1.0, 0.0], [-0.5, 0.6, 0.0]], atol=1e-15
+    )
 
 
 def test_the_rest_pose_is_to_the_bit_that_of_the_arithmetic_of_quaternions():
     rng = np.random.default_rng(5)
-    parents = [-1, *(int(rng.integers(joint)) for joint in range(1, 40))]
-    rest = quaternions.normalise(rng.normal(size=(40, 4)))
+    parents = np.array([-1, *(int(rng.integers(joint)) for joint in range(1, 40))], np.int32)
+    rest = np.asarray(quaternions.normalise(rng.normal(size=(40, 4))), np.float64)
     skeleton = Skeleton(tuple(map(str, range(40))), parents, rng.normal(size=(40, 3)), rest)
 
     turns, points = rest.copy(), skeleton.offsets.copy()

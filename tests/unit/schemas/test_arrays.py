@@ -94,14 +94,14 @@ def test_the_json_schema_of_a_field_states_dtype_and_dimensions() -> None:
         (leaf([1, 2, 1e39]), "not-finite"),
         (leaf(bytes(11)), "bad-array"),
         (leaf(bytes([0, 1, 2]), "|b1"), "bad-array"),
-        (leaf(np.float32([1, np.inf, 2]).tobytes()), "not-finite"),
+        (leaf(np.array([1, np.inf, 2], np.float32).tobytes()), "not-finite"),
         (leaf(bytes(12), extra=1), "bad-array"),
         (leaf(bytes(12), encoding="gzip"), "bad-array"),
         (leaf([1, 2, 3], encoding="blocks"), "bad-array"),
         (leaf(b"rubbish", encoding="blocks"), "bad-array"),
         (leaf(blocks.encode(np.zeros(4, np.float32)), encoding="blocks"), "bad-array"),
         (leaf(blocks.encode(np.zeros(3)), encoding="blocks"), "bad-array"),
-        (leaf(blocks.encode(np.float32([1, np.nan, 2])), encoding="blocks"), "not-finite"),
+        (leaf(blocks.encode(np.array([1, np.nan, 2], np.float32)), encoding="blocks"), "not-finite"),
     ],
 )
 def test_a_leaf_whose_data_does_not_match_its_claim_is_refused(value: dict[str, Any], code: str) -> None:
@@ -141,4 +141,4 @@ def test_a_float32_whose_shortest_text_would_be_misread_comes_back_to_the_bit() 
 
 
 def test_float32_is_written_with_few_digits() -> None:
-    assert json.dumps(nested_lists(np.float32([0.1, 1.5, -123.456, -0.0]))) == "[0.1, 1.5, -123.456, -0.0]"
+    assert json.dumps(nested_lists(np.array([0.1, 1.5, -123.456, -0.0], np.float32))) == "[0.1, 1.5, -123.456, -0.0]"

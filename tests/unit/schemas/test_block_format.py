@@ -82,7 +82,7 @@ def quaternion_section(stream: Iterator[int], c: int, n: int) -> list[list[int]]
     channels = list(itertools.islice(others, lead))
     for choice, residual in zip(choices, residuals, strict=True):
         three = list(itertools.islice(others, 3))
-        predicted = [predict(*us, bool(choice & 4)) for us in zip(*three, strict=True)]
+        predicted = [predict(a, b, c, bool(choice & 4)) for a, b, c in zip(*three, strict=True)]
         three.insert(choice & 3, [(p + r) % (1 << 32) for p, r in zip(predicted, residual, strict=True)])
         channels += three
     return channels + list(others)

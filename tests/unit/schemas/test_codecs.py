@@ -36,7 +36,7 @@ def write(tree: Any, media_type: str) -> bytes:
 
 
 def test_json_has_arrays_as_nested_lists() -> None:
-    document = json.loads(encode_tree({"a": np.float32([[0.1, 2], [3, 4]])}, JSON))
+    document = json.loads(encode_tree({"a": np.array([[0.1, 2], [3, 4]], np.float32)}, JSON))
     assert document == {"a": {"dtype": "<f4", "shape": [2, 2], "data": [[0.1, 2.0], [3.0, 4.0]]}}
 
 

@@ -1,5 +1,7 @@
 """What may be asked of an evaluation, and how its trials are spread."""
 
+from typing import Any
+
 import pytest
 from pydantic import ValidationError
 
@@ -30,7 +32,7 @@ def test_the_defaults_are_the_published_suite() -> None:
         ({"controler": {}}, "Extra inputs"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_or_takes_too_long_is_refused(options: dict, told: str) -> None:
+def test_what_makes_no_sense_or_takes_too_long_is_refused(options: dict[str, Any], told: str) -> None:
     with pytest.raises(ValidationError, match=told):
         EvaluateParams.model_validate(options)
 

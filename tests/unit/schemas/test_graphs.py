@@ -1,6 +1,7 @@
 """Graphs of models: what holds together."""
 
 import copy
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -17,7 +18,7 @@ def node(number, kind, *following):
     }
 
 
-GRAPH = {
+GRAPH: dict[str, Any] = {
     "schema": "marey/model-graph@1",
     "actions": {
         "idle": {"primitives": {"stand": node(1, "idle", "idle/stand", "walk/begin")}},

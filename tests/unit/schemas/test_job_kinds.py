@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -29,12 +30,12 @@ TIDY = declare()
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> list[EntryPoint]:
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[EntryPoint]]:
     """Entry points of other distributions, as the test fills them in."""
     entries: list[EntryPoint] = []
     monkeypatch.setattr(job_kinds, "entry_points", lambda group: [e for e in entries if e.group == group])
     job_kinds.job_kinds.cache_clear()
-    yield entries  # type: ignore[misc]
+    yield entries
     job_kinds.job_kinds.cache_clear()
 
 

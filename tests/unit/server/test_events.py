@@ -5,7 +5,7 @@ import threading
 import pytest
 from tests.support.store_fixtures import declared
 
-from marey_schemas.access import ProjectChange
+from marey_schemas.access import ProjectChange, ProjectCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.errors import (
@@ -51,7 +51,7 @@ def test_the_feed_goes_on_after_the_last_event_received(lab):
 def test_what_failed_did_not_happen(lab):
     before = feed(lab)
     with pytest.raises(ConflictProblem):
-        lab.write(projects.create_project, projects.ProjectCreate(name="lab"))
+        lab.write(projects.create_project, ProjectCreate(name="lab"))
     assert feed(lab) == before
 
 

@@ -70,7 +70,7 @@ def test_pieces_are_cut_again_unless_the_clips_that_name_them_are_among_the_inpu
     (walk,) = clips(desk, "walk")
     said = annotations(desk, walk)
     for inputs, serves in (({}, False), ({"clips": {"item": walk}}, True)):
-        cut = ("cut", {"annotations": said} | inputs, {})
+        cut: tuple[str, dict[str, Any], dict[str, Any]] = ("cut", {"annotations": said} | inputs, {})
         submit(desk, *cut, into="pieces")
         desk.complete(desk.claim())
         assert shares(desk, *cut, into="pieces") is serves
@@ -81,7 +81,7 @@ def test_takes_are_imported_again_once_the_skeleton_they_use_was_revised(desk: D
     clips(desk, "walk")
     (rig,) = desk.publish(Draft("r", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}, collection="rigs"))
     file = {"name": "walk.bvh", "blob": desk.database.write(desk.user, blobs.put_blob, b"a walk")}
-    load = ("import", {}, {"files": [file], "skeleton": rig.item})
+    load: tuple[str, dict[str, Any], dict[str, Any]] = ("import", {}, {"files": [file], "skeleton": rig.item})
     submit(desk, *load, into="first")
     desk.complete(desk.claim())
     assert shares(desk, *load, into="second")

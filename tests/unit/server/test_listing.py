@@ -1,6 +1,7 @@
 """Lists of items: filters, order, cursors."""
 
 from contextlib import suppress
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -35,7 +36,7 @@ def names(lab, sort="name", **filters):
     return [one.name for one in lab.read(items.list_items, "lab", Kind.CLIP, ItemFilters(**filters), sort=sort).items]
 
 
-FILTERS = (
+FILTERS: tuple[tuple[dict[str, Any], set[str]], ...] = (
     ({}, {name for name, *_ in CLIPS}),
     ({"collection": "raw"}, {"walk 1", "walk 2", "Walk 10", "zoë"}),
     ({"collection": "raw/a"}, {"walk 1", "zoë"}),

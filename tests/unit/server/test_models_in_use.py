@@ -16,7 +16,15 @@ from marey_motion.modelling.training import train_primitive
 from marey_schemas.lru import LruCache
 from marey_schemas.options.modelling import ModelOptions
 from marey_server.errors import InvalidProblem
-from marey_server.motions.models import FoundModel, LoadedModel, parse_model, sample_document, sample_file, size_bytes
+from marey_server.motions.models import (
+    FoundModel,
+    LoadedModel,
+    UsableModel,
+    parse_model,
+    sample_document,
+    sample_file,
+    size_bytes,
+)
 from marey_server.store.items.reading import FoundPart
 
 FOUND = FoundModel("model_1", "sway", FoundPart("sha256:" + "0" * 64, 3, 7))
@@ -33,7 +41,8 @@ def loaded():
 def test_the_models_used_last_are_kept_within_bounds(loaded):
     model = parse_model(loaded)
     assert size_bytes(model) > model.primitive.spatial.mean.nbytes
-    roomy, tight = (LruCache(max_bytes=places * size_bytes(model), size_of=size_bytes) for places in (3, 1))
+    roomy: LruCache[str, UsableModel] = LruCache(max_bytes=3 * size_bytes(model), size_of=size_bytes)
+    tight: LruCache[str, UsableModel] = LruCache(max_bytes=size_bytes(model), size_of=size_bytes)
     for cache in (roomy, tight):
         for name in "abc":
             cache.put(name, parse_model(loaded))

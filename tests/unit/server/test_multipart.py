@@ -102,7 +102,8 @@ def test_any_bytes_are_read_or_refused_alike_wherever_the_stream_is_cut(body, cu
 def test_nothing_of_a_file_is_held_back_but_what_may_be_a_boundary():
     reader = MultipartReader(BOUNDARY, max_parts=1)
     reader.feed(body_of([(head("files", "a.bvh"), b"")]).partition(b"\r\n\r\n")[0] + b"\r\n\r\n")
-    given_bytes = sum(len(piece) for _ in range(50) for piece in reader.feed(b"\r\n--front" * 10_000))
+    pieces = [piece for _ in range(50) for piece in reader.feed(b"\r\n--front" * 10_000)]
+    given_bytes = sum(len(piece) for piece in pieces if isinstance(piece, bytes))
     assert given_bytes >= 50 * 90_000 - len(BOUNDARY) - 4
 
 

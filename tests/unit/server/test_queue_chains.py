@@ -10,7 +10,7 @@ from tests.support.store_fixtures import declared, requiring
 
 from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
-from marey_schemas.jobs import JobCreate, Progress
+from marey_schemas.jobs import JobCreate, JobState, Progress
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
@@ -756,7 +756,7 @@ def test_lists_show_jobs_newest_first_by_state_kind_and_author(desk: Desk) -> No
         return [one.id for one in page.items]
 
     assert listed(reading.JobFilters()) == [second, first]
-    assert listed(reading.JobFilters(states=("succeeded",))) == [first]
+    assert listed(reading.JobFilters(states=(JobState.SUCCEEDED,))) == [first]
     assert listed(reading.JobFilters(kinds=("sum",))) == [second]
     assert listed(reading.JobFilters(author="ann")) == [second, first]
     assert listed(reading.JobFilters(author="bob")) == []

@@ -364,7 +364,7 @@ def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     desk.database.clock = clock
     desk.things(4)
     run_state_machine_as_test(
-        lambda: QueueMachine(desk, clock),
+        lambda: QueueMachine(desk, clock),  # type: ignore[arg-type]
         settings=settings(
             max_examples=examples(30),
             stateful_step_count=steps(40),

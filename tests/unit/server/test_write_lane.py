@@ -91,12 +91,15 @@ def test_what_follows_a_commit_sees_it_and_follows_no_refusal(database, submit_a
 
 
 def test_a_failure_after_the_commit_writes_nothing_twice(database, submit_all):
-    tries = []
+    tries: list[int] = []
+
+    def fail() -> None:
+        raise KeyError("nothing")
 
     def write(tx):
         tries.append(1)
         add_user(tx, "a")
-        tx.after_commit(lambda: {}["nothing"])
+        tx.after_commit(fail)
 
     failed, fine = submit_all(write, adding("b"))
     with pytest.raises(KeyError):

@@ -24,7 +24,6 @@ def project(tmp_path, monkeypatch):
     """A walk ahead and one backward; nothing is kept of earlier tests."""
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
-    made.log = lambda text: None
     add_clip(made, "walk", generate_gait(1.4, 0.0, 5.0))
     add_clip(made, "backward", generate_gait(1.2, 0.0, 3.0, travel_angle_rad=radians(180)))
     return made

@@ -4,6 +4,7 @@ import os
 import resource
 import shutil
 import threading
+from typing import Any
 
 import pytest
 
@@ -125,7 +126,7 @@ def test_an_input_is_handed_on_though_another_worker_cleans_up_while_it_is_writt
 
 def test_many_threads_may_ask_for_the_same(tmp_path, source):
     cache = InputCache(tmp_path, 1 << 20)
-    wrong = []
+    wrong: list[Any] = []
 
     def ask():
         wrong.extend(key for key in "abcdefgh" if cache.get(key, source.of(key)) != key.encode() * 100)

@@ -1,13 +1,16 @@
 """The function behind `evaluate`, with a project in memory instead of a server."""
 
 from math import radians
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
+from marey_motion.matching.building import build_database
 from marey_motion.matching.database import MatchingDatabase
+from marey_schemas.lru import LruCache
 from marey_worker.context import JobRefused, Task
 from marey_worker.job_io import matching_clips
 from marey_worker.kinds import evaluate
@@ -16,7 +19,7 @@ from marey_worker.kinds import evaluate
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Three walks; nothing is kept of earlier tests."""
-    monkeypatch.setattr(matching_clips, "_cache", matching_clips.LruCache(max_entries=1))
+    monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = ProjectInMemory(tmp_path)
     for turn_rate in (-50, 0, 50):
         add_clip(made, f"walk {turn_rate}", generate_gait(1.25, radians(turn_rate), 5.0))
@@ -39,10 +42,12 @@ def test_the_trials_of_all_tasks_together_are_the_suite_whatever_their_number(pr
 
 def test_the_database_is_built_once_for_all_tasks_of_an_evaluation(project, monkeypatch):
     built: list[MatchingDatabase] = []
-    build = matching_clips.build_database
-    monkeypatch.setattr(
-        matching_clips, "build_database", lambda *given, **more: built.append(build(*given, **more)) or built[-1]
-    )
+
+    def build(*given: Any, **more: Any) -> MatchingDatabase:
+        built.append(build_database(*given, **more))
+        return built[-1]
+
+    monkeypatch.setattr(matching_clips, "build_database", build)
     for position in range(3):
         project.task = Task(position, 3)
         evaluate.run(project, PARAMS)

@@ -11,6 +11,7 @@ from marey_motion.gait import generate_gait
 from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused, Task
 from marey_worker.job_io import matching_clips
@@ -27,7 +28,7 @@ class LoggedProject(ProjectInMemory):
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """Three walks and one that no trial asks for; nothing is kept of earlier tests."""
-    monkeypatch.setattr(matching_clips, "_cache", matching_clips.LruCache(max_entries=1))
+    monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = LoggedProject(tmp_path)
     for speed, turn_rate in ((1.25, -50), (1.25, 0), (1.25, 50), (4.0, 0)):
         add_clip(made, f"walk {speed} {turn_rate}", generate_gait(speed, radians(turn_rate), 5.0))

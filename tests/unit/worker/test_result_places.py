@@ -26,7 +26,6 @@ def project(tmp_path, monkeypatch):
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
-    made.log = lambda text: None
     for name, turn in (("left", 20), ("right", -20)):
         add_clip(made, name, generate_gait(1.4, radians(turn), 3.0))
     skeleton = {"item": "skeleton_a", "revision": 1, "kind": Kind.SKELETON, "name": "a", "collection": "rigs"}

@@ -1,6 +1,7 @@
 """What a retargeted clip says of bones that translations of its source moved."""
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from tests.support.project_in_memory import ProjectInMemory, add_clip
@@ -13,6 +14,7 @@ from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.worker_protocol import PinnedInput
+from marey_worker.context import Context
 from marey_worker.job_io import skeleton_cache
 from marey_worker.kinds import retarget
 
@@ -33,7 +35,6 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     project = ProjectInMemory(tmp_path)
-    project.log = lambda text: None
     plain = generate_gait(1.4, 0.0, 2.0)
     knee = plain.skeleton.index_of("LeftLeg")
     moved = np.tile(plain.skeleton.offsets[knee] + (0.1, 0.0, 0.0), (plain.frame_count, 1, 1))
@@ -45,7 +46,7 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
 
     follows = counted_follows(monkeypatch)
     project.into = "out"
-    result = retarget.run(project, RetargetParams())
+    result = retarget.run(cast(Context, project), RetargetParams())
     assert (result["clips"], result["refused"]) == (2, [])
     checks = {output.item_name: output.parts["info"].get("checks", []) for output in project.staged}
     assert checks["plain"] == []

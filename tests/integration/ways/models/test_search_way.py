@@ -53,8 +53,7 @@ def test_the_same_seed_makes_the_same_tree(lab: ProjectHandle, walk: ModelHandle
     before = walk.item.parts["tree"].document
     params = {"samples": 4000}
     job = JobCreate(kind="tree", inputs={"model": ItemInput(item=walk.id)}, params=params, seed=3, cache="off")
-    done = walk.transport and lab.submit(job)
-    lab.model(done)
+    lab.model(lab.submit(job))
     assert lab.models.get(walk.id).item.parts["tree"].document == before
 
 
