@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
@@ -111,7 +111,7 @@ class SourceInfo:
         dict    one member per field
         """
         return {
-            **asdict(self),
+            **{member.name: getattr(self, member.name) for member in fields(self)},
             "channels": [list(names) for names in self.channels],
             "trimmed_frames": list(self.trimmed_frames),
             "evidence": list(self.evidence),

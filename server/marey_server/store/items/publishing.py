@@ -179,6 +179,9 @@ class _Publication:
                 head = heads.get(one.draft.name_in_batch)
                 if head is not None:
                     self._reuse(one, head)
+                if (published := self.done.get(one.draft.name_in_batch)) is not None:
+                    required = {part: body for part, body in one.bodies.items() if PARTS[kind][part].required}
+                    self._references.know(published, required)
             waiting = [one for one in waiting if one.draft.name_in_batch not in self.done]
             if not waiting:
                 return

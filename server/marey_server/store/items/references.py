@@ -80,6 +80,11 @@ class ReferenceCheck:
         self._project_id = project_row.id
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
+    def know(self, published: Published, bodies: Mapping[str, Tree]) -> None:
+        """Keep the parts of a revision that this write has stored or found, so that they are not read."""
+        for part, body in bodies.items():
+            self._seen[published.item, published.revision, published.kind, part] = body
+
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
         """Raise `InvalidProblem` if a reference in the new parts of an item has no target or does not fit it."""
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
