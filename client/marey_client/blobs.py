@@ -13,7 +13,8 @@ import httpx
 from marey_client.downloads import saved_atomically
 from marey_client.errors import Conflict, DigestMismatch, FileChanged, Unreachable
 from marey_client.one_or_several import several
-from marey_client.transport import OCTETS, Transport, as_json, read_model
+from marey_client.transport import Transport, as_json, read_model
+from marey_schemas.formats import OCTETS
 from marey_schemas.items import BlobsMissing, BlobsQuery, Upload, UploadCreate
 
 CHUNK_BYTES = 1 << 20

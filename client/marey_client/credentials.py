@@ -18,8 +18,9 @@ from urllib.parse import urlsplit
 import httpx
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 
-DEFAULT_URL = "http://127.0.0.1:8460"
+DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 DEFAULT_DATA = "marey-data"
 SETTINGS_FILE = "marey.toml"
 ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file

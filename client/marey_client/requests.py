@@ -18,7 +18,7 @@ from marey_client.imports import LocalFile, Notice
 from marey_client.jobs import job_request
 from marey_client.places import Places, as_inputs, items_at
 from marey_client.project_items import ProjectItems
-from marey_schemas.items import Item
+from marey_schemas.items import LOOP_TAG, Item
 from marey_schemas.job_params import (
     AlignParams,
     AnnotateParams,
@@ -31,8 +31,6 @@ from marey_schemas.job_params import (
 from marey_schemas.jobs import ItemInput, JobCreate
 from marey_schemas.model_pipelines import ModelPlan
 from marey_schemas.options.imports import ImportOptions
-
-LOOP_TAG = "loop"
 
 Clips: TypeAlias = Places[ClipHandle]
 """Clips, folders of clips given by their paths, or several of these."""

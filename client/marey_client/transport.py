@@ -19,7 +19,8 @@ from pydantic import BaseModel, ValidationError
 from marey_client.credentials import as_token, require_address
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
-from marey_schemas.encoding.codecs import CodecError, decode_tree, encode_tree
+from marey_schemas.address import API
+from marey_schemas.encoding.codecs import JSON, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
 from marey_schemas.problems import Problem
 
@@ -27,10 +28,7 @@ Model = TypeVar("Model", bound=BaseModel)
 T = TypeVar("T")
 Params = Mapping[str, str | int | float | bool | None]
 
-JSON = "application/json"
-OCTETS = "application/octet-stream"
 BLOCKS = "application/msgpack; arrays=blocks"
-API = "/api/v1"
 MAX_ANSWER_BYTES = 1 << 28
 
 TRIES_TO_REACH = 3

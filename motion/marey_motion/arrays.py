@@ -18,3 +18,5 @@ Ints32 = NDArray[np.int32]
 AnyInts = NDArray[np.integer]
 Indices = NDArray[np.intp]
 Flags = NDArray[np.bool_]
+
+CM_PER_M = 100.0

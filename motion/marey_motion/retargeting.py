@@ -28,10 +28,9 @@ from marey_motion.errors import ClipError, MappingError
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, JointAxes, JointMapping
 from marey_motion.rigs.standard import SIDES
-from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_motion.skeleton import SAME_SKELETON_M, Skeleton, same_hierarchy
 
 FEWEST_ESSENTIAL = 8  # of the essential joints: a pelvis, and more than the legs or the arms alone
-SAME_SKELETON_M = 1e-5  # by which offsets may differ that went through a file
 SAME_RAD = 1e-6  # by which axes may differ that went through a document
 SAME_DIRECTION = 0.94  # cosine of about 20 degrees: bones of one rig on two people differ by less
 STANDING = 0.7  # cosine between legs and trunk from which a rest pose is taken for one that stands

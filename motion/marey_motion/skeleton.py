@@ -19,6 +19,11 @@ from marey_motion.errors import SkeletonError, UnknownJoint
 
 UNIT_TOLERANCE = 1e-3
 
+SAME_OFFSET_M = 1e-3
+"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
+SAME_SKELETON_M = 1e-5
+"""Largest difference of bone offsets of one skeleton that went through one file."""
+
 _Vector: TypeAlias = tuple[float, float, float]
 _Rotation: TypeAlias = tuple[float, float, float, float]
 

@@ -17,13 +17,29 @@ from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.encoding.arrays import ArrayOf
 from marey_schemas.names import ItemId, JointName
-from marey_schemas.options.evaluation import COVERAGE_LEAST_S, TARGET_PATH_S, Grid, Speed, TurnRate
+from marey_schemas.options.evaluation import (
+    COVERAGE_LEAST_S,
+    LEAST_FRAME_RATE_HZ,
+    MOST_CELLS,
+    MOST_FRAME_RATE_HZ,
+    TARGET_PATH_S,
+    Grid,
+    Speed,
+    TurnRate,
+)
 
-LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
-MOST_CELLS = 2000
 MOST_SECONDS = 1e9
 MOST_FRAMES = 4096
 """Greatest number of frames in a request; a live performance sends 0.1 s to 1 s at a time."""
+
+
+MOST_STREAMS = 64
+"""Greatest number of streams of a project."""
+_GRID = Grid()
+
+
+def _spanned(values: tuple[float, ...]) -> str:
+    return f"{values[0]:g} to {values[-1]:g}"
 
 
 class CoverageStreamCreate(Request):
@@ -41,14 +57,15 @@ class CoverageStreamCreate(Request):
         None,
         min_length=1,
         max_length=200,
-        description="Speeds of the grid, in metres per second. Absent: those of the evaluation, or 1 to 3 m/s.",
+        description="Speeds of the grid, in metres per second. Absent: those of the evaluation, or "
+        f"{_spanned(_GRID.speeds_m_s)} m/s.",
     )
     turn_rates_deg_s: tuple[TurnRate, ...] | None = Field(
         None,
         min_length=1,
         max_length=200,
         description="Turn rates of the grid, in degrees per second, positive to the left. Absent: those of "
-        "the evaluation, or -100 to 100.",
+        f"the evaluation, or {_spanned(_GRID.turn_rates_deg_s)}.",
     )
     least_s: float | None = Field(
         None,

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 ORIGINAL = "original"
 """Export format that returns the imported file itself, independent of its format."""
 OCTETS = "application/octet-stream"
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""The earliest time in a ZIP archive; every file gets it, so that the same content gives the same bytes."""
 
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 

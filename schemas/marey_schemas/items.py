@@ -9,6 +9,9 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Digest, ItemName, Message, Tag
 
+LOOP_TAG = "loop"
+"""Tag of clips that are played as loops."""
+
 
 class CollectionCreate(Request):
     """Request to create a folder; missing parents are created, too."""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+NAMES_SHOWN = 5
+"""Most names that a message lists."""
+
 
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, in the plural unless it is 1: "1 frame", "103,568 trajectories"."""

@@ -12,6 +12,9 @@ from marey_schemas.jobs import ItemInput, JobOutput, JobState, Progress, Resourc
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, ItemName, Tag
 
+FAULT_VARIABLE = "MAREY_FAULT"
+"""Environment variable by which tests make a server or worker fail at a named place."""
+
 PROTOCOL_VERSION = 1
 """Version of the worker protocol; sent with every claim."""
 

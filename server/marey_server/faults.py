@@ -13,7 +13,7 @@ import signal
 import time
 from collections.abc import Iterator
 
-VARIABLE = "MAREY_FAULT"
+from marey_schemas.worker_protocol import FAULT_VARIABLE
 
 
 class _Fault:
@@ -23,7 +23,7 @@ class _Fault:
         self._nth = int(nth) if nth else None
         self._passes: Iterator[int] = itertools.count(1)
         if self.action not in ("kill", "stop", "error"):
-            raise ValueError(f"{VARIABLE}={text}: the action must be kill, stop or error")
+            raise ValueError(f"{FAULT_VARIABLE}={text}: the action must be kill, stop or error")
 
     def act(self) -> None:
         count = next(self._passes)
@@ -38,7 +38,7 @@ class _Fault:
             raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)} (fault point {self.name})")
 
 
-_faults = [_Fault(text) for text in os.environ.get(VARIABLE, "").split(",") if text]
+_faults = [_Fault(text) for text in os.environ.get(FAULT_VARIABLE, "").split(",") if text]
 
 
 def point(name: str) -> None:

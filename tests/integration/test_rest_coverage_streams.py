@@ -10,10 +10,8 @@ import pytest
 from tests.support.rest_server import Server, running
 
 from marey_motion.documents import mapping_to_document, skeleton_to_document
-from marey_motion.evaluation import live_windows, online
 from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
-from marey_schemas import coverage_streams
 from marey_schemas.access import Role
 from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, encode_tree
 
@@ -307,8 +305,3 @@ def test_of_senders_who_send_at_once_one_is_taken(owner) -> None:
     told = {answer.json()["context"]["offset"] for answer in answers if answer.status_code == 409}
     assert told == {taken}
     assert owner.get(f"{STREAMS}/{stream['id']}").json()["offset"] == taken
-
-
-def test_what_is_published_as_a_limit_is_the_limit_of_the_numbers() -> None:
-    published = coverage_streams.LEAST_FRAME_RATE_HZ, coverage_streams.MOST_FRAME_RATE_HZ, coverage_streams.MOST_CELLS
-    assert published == (live_windows.LEAST_RATE_HZ, live_windows.MOST_RATE_HZ, online.MOST_CELLS)

@@ -12,7 +12,8 @@ import signal
 import time
 from collections import Counter
 
-VARIABLE = "MAREY_FAULT"
+from marey_schemas.worker_protocol import FAULT_VARIABLE
+
 SETTLE_S = 0.2
 """Pause after SIGSTOP, which stops the threads of a process one by one; the calling thread must not continue first."""
 ACTIONS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
@@ -22,7 +23,7 @@ _passes: Counter[str] = Counter()
 
 def point(name: str) -> None:
     """Trigger the fault that the environment requests for this point, if any."""
-    wanted = os.environ.get(VARIABLE)
+    wanted = os.environ.get(FAULT_VARIABLE)
     if not wanted:
         return
     _passes[name] += 1

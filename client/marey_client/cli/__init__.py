@@ -5,12 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
+from marey_client.cli.failures import INTERRUPTED
+
 GLOBAL_SWITCHES = ("-v", "--verbose")
 GLOBAL_OPTIONS = ("--server", "--token-file")
-
-
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
 
 
 def main() -> None:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 FAILED, WRONG_USAGE = 1, 2
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
 MOST_SHOWN = 80
 """Greatest number of characters shown of a text that is not valid."""
 

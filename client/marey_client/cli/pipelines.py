@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.failures import INTERRUPTED, Refused, WrongUsage
 from marey_client.cli.following import SEEDED_JOB, clips_at
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_table, progress, tell, tell_refused
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.jobs import Job
 
-INTERRUPTED = 130
 COLUMNS = ("step", "kind", "state", "done", "job", "")
 COUNTED = ("clips", "annotations", "frames", "samples", "nodes")
 REFUSED_SHOWN = 3

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from marey_client.cli.invocation import AsJson
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
 
@@ -40,9 +41,9 @@ def add_to(app: typer.Typer) -> None:
 
 def serve(
     data: DataFolder = None,
-    host: Annotated[str | None, typer.Option(help="Address to listen on; default: 127.0.0.1.")] = None,
+    host: Annotated[str | None, typer.Option(help=f"Address to listen on; default: {DEFAULT_HOST}.")] = None,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free one; default: 8460.")
+        int | None, typer.Option(min=0, max=65535, help=f"Port to listen on; 0: any free one; default: {DEFAULT_PORT}.")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=0, help="Number of worker processes that the server starts; default: 1.")

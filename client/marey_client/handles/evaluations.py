@@ -16,10 +16,9 @@ from marey_client.handles.findings import Findings
 from marey_client.handles.reports import ReportedHandle, saved
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.places import Places, as_inputs
+from marey_schemas.documents.evaluations import COSTS
 from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.jobs import JobCreate
-
-COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
 
 class EvaluationHandle(ReportedHandle):

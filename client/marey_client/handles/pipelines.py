@@ -8,7 +8,7 @@ from contextlib import suppress
 from types import MappingProxyType
 
 from marey_client.errors import Conflict, JobUnsuccessful, WaitedTooLong
-from marey_client.jobs import Jobs
+from marey_client.jobs import LONGEST_WAIT_S, Jobs
 from marey_client.transport import Transport
 from marey_schemas.jobs import FailureReason, Job, JobOutput, JobState
 from marey_schemas.pipelines import Pipeline, PipelineCreate
@@ -16,7 +16,6 @@ from marey_schemas.pipelines import Pipeline, PipelineCreate
 OnProgress = Callable[[Mapping[str, Job]], None]
 
 LOOK_EVERY_S = 1.0
-LONGEST_WAIT_S = 20.0
 SHORTEST_PAUSE_S = 0.2
 """Least time in seconds between two requests for the state of the jobs."""
 

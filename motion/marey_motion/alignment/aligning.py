@@ -34,7 +34,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.mirroring import mirror_clip
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
-from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
 
 LEAST_CLIPS = 2
@@ -43,8 +43,6 @@ MOST_FRAMES = 4000
 """Most frames of one example: the costs of two such examples take 128 MB."""
 MOST_JOINT_FRAMES = 30_000_000
 """Most joints times frames of all examples together: these take about 3 GB."""
-SAME_OFFSET_M = 1e-3
-"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
 MIRRORED = "~mirrored"
 
 Progress = Callable[[float, float | None, str], None]

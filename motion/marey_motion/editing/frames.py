@@ -17,7 +17,7 @@ from marey_motion.looping import LoopSeam, loop_seam, rotated
 from marey_motion.motion import Motion
 from marey_motion.resampling import count_samples, resample_motion
 from marey_motion.root_carrier import body_first, root_first, root_stands
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import SAME_SKELETON_M, same_hierarchy
 from marey_schemas.editing.commands import Concatenate, Resample, Retime, Split, Trim
 
 
@@ -70,9 +70,6 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
         replace(take.moved(take.motion.sliced(start, stop)), pieces=(*take.pieces, number))
         for number, (start, stop) in enumerate(pairwise(bounds), start=1)
     )
-
-
-SAME_SKELETON_M = 1e-5
 
 
 def concatenate(take: Take, command: Concatenate) -> Take:

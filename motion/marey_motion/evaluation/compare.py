@@ -16,7 +16,7 @@ from marey_motion.matching.record import TrialRecord
 
 CONFIDENCE = 0.95
 RESAMPLES = 9_999
-SEED = 0
+BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
 """Changes that differ by no more than this share are the same but for rounding."""
 
@@ -169,7 +169,7 @@ def _interval(change: NDArray[np.float64]) -> tuple[float, float]:
         confidence_level=CONFIDENCE,
         n_resamples=RESAMPLES,
         method="BCa",
-        rng=np.random.Generator(np.random.PCG64(SEED)),
+        rng=np.random.Generator(np.random.PCG64(BOOTSTRAP_SEED)),
     ).confidence_interval
     return float(found.low), float(found.high)
 

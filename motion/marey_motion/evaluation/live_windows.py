@@ -25,8 +25,7 @@ from marey_motion.matching.simulation_root import (
     SHORTEST_WINDOW,
     window_frames,
 )
-
-LEAST_RATE_HZ, MOST_RATE_HZ = 10.0, 240.0
+from marey_schemas.options.evaluation import LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ
 
 
 class LiveTake(NamedTuple):
@@ -61,9 +60,9 @@ class LiveWindows:
     """Windows of one second of a performance at `rate_hz`, take by take."""
 
     def __init__(self, rate_hz: float) -> None:
-        if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
+        if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:
             raise MotionError(
-                f"{rate_hz:g} frames per second, where {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} are measured; "
+                f"{rate_hz:g} frames per second, where {LEAST_FRAME_RATE_HZ:g} to {MOST_FRAME_RATE_HZ:g} are measured; "
                 "send every n-th frame of a faster recording",
                 where="frame_rate_hz",
             )

@@ -29,9 +29,8 @@ from marey_motion.evaluation.scenario import Reference, Trial, reference
 from marey_motion.kinematics import SHORTEST_LATERAL_M, forward_vectors
 from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
-from marey_schemas.options.evaluation import COVERAGE_LEAST_S, TARGET_PATH_S, Grid
+from marey_schemas.options.evaluation import COVERAGE_LEAST_S, MOST_CELLS, TARGET_PATH_S, Grid
 
-MOST_CELLS = 2000
 FARTHEST_M = 1e6
 """Distance from the origin beyond which positions are broken, or too inexact to give speeds."""
 

@@ -14,6 +14,7 @@ from marey_motion.evaluation.result import ClipUsage, Coverage, EvaluationResult
 from marey_motion.evaluation.scenario import Trial
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import TrialRecord
+from marey_schemas.documents.evaluations import COSTS
 from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 EVALUATION_SCHEMA = "marey/evaluation@1"
@@ -139,9 +140,6 @@ def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[Clip
         ClipUsage(clip, ticks, share, entries, trials, tree["popularity"][own.start : own.stop])
         for own, (clip, ticks, share, entries, trials) in zip(clips, columns, strict=True)
     )
-
-
-COSTS = ("match_cost", "continuing_cost", "pose_cost")
 
 
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:

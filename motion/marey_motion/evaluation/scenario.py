@@ -22,6 +22,8 @@ LOOK_AHEAD_S = 1.0
 TIME_TOLERANCE_S = 1e-9
 STRAIGHT_DEG_S = 1e-6
 
+_DEFAULTS = EvaluationOptions()
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -34,10 +36,10 @@ class Trial:
     family: Family
     speed_m_s: float
     turn_rate_rad_s: float
-    approach_s: float = 3.0
-    duration_s: float = 30.0
-    switch_speed_m_s: float = 4.0
-    switch_every_s: float = 5.0
+    approach_s: float = _DEFAULTS.approach_s
+    duration_s: float = _DEFAULTS.duration_s
+    switch_speed_m_s: float = _DEFAULTS.switch_speed_m_s
+    switch_every_s: float = _DEFAULTS.switch_every_s
 
     @property
     def name(self) -> str:

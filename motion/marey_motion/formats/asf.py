@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from marey_motion import quaternions
 from marey_motion.errors import FormatLimit
-from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
+from marey_motion.formats.joint_names import MAX_JOINT_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines, decode_name
 from marey_motion.importing.source import SourceMotion
+from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.formats import UNITS_M
 from marey_schemas.lru import LruCache
 
@@ -247,8 +248,8 @@ class _AsfReader:
                 )
 
     def _end_bone(self, bone: Bone) -> None:
-        if not bone.name or len(bone.name) > MAX_NAME_LENGTH:
-            raise self.lines.error(f"a bone needs a name of at most {MAX_NAME_LENGTH} characters")
+        if not bone.name or len(bone.name) > MAX_JOINT_NAME_LENGTH:
+            raise self.lines.error(f"a bone needs a name of at most {MAX_JOINT_NAME_LENGTH} characters")
         if bone.name in self.bones or bone.name == ROOT:
             raise self.lines.error("a second bone of this name", joint=bone.name)
         if bone.direction is None:

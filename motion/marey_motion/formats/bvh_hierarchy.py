@@ -11,9 +11,10 @@ import re
 from dataclasses import dataclass, field, replace
 
 from marey_motion.errors import FormatLimit
-from marey_motion.formats.joint_names import MAX_JOINTS, MAX_NAME_LENGTH
+from marey_motion.formats.joint_names import MAX_JOINT_NAME_LENGTH
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.text_lines import TextLines, decode_name, read_number
+from marey_schemas.documents.skeletons import MAX_JOINTS
 from marey_schemas.lru import LruCache
 
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
@@ -157,8 +158,10 @@ class _HierarchyReader:
         if len(header.names) == MAX_JOINTS:
             raise FormatLimit(f"more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number)
         name = decode_name(rest) or f"joint{len(header.names)}"
-        if len(name) > MAX_NAME_LENGTH:
-            raise self.lines.error(f"a joint name of {len(name)} characters, more than the limit of {MAX_NAME_LENGTH}")
+        if len(name) > MAX_JOINT_NAME_LENGTH:
+            raise self.lines.error(
+                f"a joint name of {len(name)} characters, more than the limit of {MAX_JOINT_NAME_LENGTH}"
+            )
         self.brace_due = True
         header.parents.append(self.open[-1] if self.open else -1)
         self.open.append(len(header.names))

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-MAX_JOINTS = 4096
-MAX_NAME_LENGTH = 255
+MAX_JOINT_NAME_LENGTH = 255
 
 
 def unique_names(names: Sequence[str], parents: Sequence[int]) -> tuple[str, ...]:

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, FormatLimit
-from marey_motion.formats.joint_names import MAX_JOINTS
 from marey_motion.formats.numeric_text import excerpt
 from marey_motion.formats.quaternion_rows import as_rotations
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.skeletons import MAX_JOINTS
 
 FORMAT = "npz"
 MARK = "marey/clip-npz@1"

@@ -16,7 +16,6 @@ from marey_motion.formats import read_source
 from marey_motion.formats.conversion import convert
 from marey_motion.importing.anatomy import anatomy_of
 from marey_motion.importing.items import (
-    SAME_OFFSET_M,
     FileToImport,
     ImportedFile,
     ImportedItem,
@@ -27,7 +26,7 @@ from marey_motion.importing.items import (
 )
 from marey_motion.importing.plan import PlannedFile
 from marey_motion.importing.source import ImportedMotion, SourceDocument
-from marey_motion.skeleton import Skeleton
+from marey_motion.skeleton import SAME_OFFSET_M, Skeleton
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output

@@ -17,7 +17,6 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 
 SKELETON_COLLECTION = "skeletons"
-SAME_OFFSET_M = 1e-3
 
 Tree = dict[str, Any]
 

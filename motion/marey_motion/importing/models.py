@@ -12,7 +12,6 @@ from marey_motion.formats.predecessor.graph import graph_of_document
 from marey_motion.formats.predecessor.model import PredecessorModel, model_of_document
 from marey_motion.formats.predecessor.tree import read_predecessor_tree
 from marey_motion.importing.items import (
-    SAME_OFFSET_M,
     FileToImport,
     ImportedFile,
     ImportedGraph,
@@ -25,7 +24,7 @@ from marey_motion.importing.source import SourceDocument
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import primitive_to_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 from marey_schemas.documents.originals import original_of
 from marey_schemas.documents.references import PartDigestRef
 from marey_schemas.imports import skeleton_output

@@ -13,7 +13,6 @@ from marey_motion.rigs import JointMapping
 from marey_motion.rigs.mapping import symmetric_joints
 from marey_motion.skeleton import Skeleton
 
-SIDES = ("left", "right")
 POSE_JOINTS = ("pelvis", "spine_2", "head", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints whose distances make up the pose cost of a transition: hips, spine, head, hands, feet."""
 

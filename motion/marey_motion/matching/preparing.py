@@ -19,12 +19,9 @@ from marey_motion.matching.simulation_root import bone_root, raw_root
 from marey_motion.mirroring import mirror_motion
 from marey_motion.motion import Motion
 from marey_motion.resampling import resample_motion
-from marey_motion.skeleton import Skeleton, same_hierarchy
+from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.wording import counted
-
-SAME_OFFSET_M = 1e-3
-"""Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
 
 # The seam of a loop is measured in steps between its frames.
 REPEATED_STEPS = 0.2

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.arrays import Floats
+from marey_motion.arrays import CM_PER_M, Floats
 from marey_motion.modelling.fpca import PrincipalExamples
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
@@ -18,8 +18,6 @@ Progress = Callable[[int, int, str], None]
 
 MOST_DIMENSIONS = 200
 """Most dimensions for leaving examples out; with more examples than that, the smallest components are dropped."""
-
-CM_PER_M = 100.0
 
 
 @dataclass(frozen=True, eq=False)

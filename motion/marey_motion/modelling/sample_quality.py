@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion import kinematics
-from marey_motion.arrays import Floats
+from marey_motion.arrays import CM_PER_M, Floats
 from marey_motion.skeleton import Skeleton
 from marey_schemas.options.contacts import TOE_SPEED_M_S
-
-CM_PER_M = 100.0
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training_report import ExampleReport, TrainingReport
 from marey_schemas.options.modelling import ModelOptions
+from marey_schemas.wording import NAMES_SHOWN
 
 FEW_EXAMPLES_PER_DIMENSION = 2
-NAMES_SHOWN = 5
 DEEP_BELOW_FLOOR_CM = 2.0
 SLIDING_RATIO = 2.0
 SLIDING_M_S = 0.1

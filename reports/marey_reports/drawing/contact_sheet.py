@@ -16,6 +16,7 @@ import numpy as np
 from marey_motion.arrays import AnyFloats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
+from marey_reports.drawing.paper import HAIRLINE, INK
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, Stances, StickFigure, body_of, stances_at
 from marey_schemas.wording import counted
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 MAX_TAKES = 100
 MAX_MOMENTS = 12
 SIDE_COLOURS = {LEFT: "#1f6fb2", CENTRE: "#39414f", RIGHT: "#e07b1a"}
-INK, QUIET, HAIRLINE, TINT, FLOOR = "#1f2430", "#6f7786", "#d5dae1", "#f1f4f8", "#e1e6ec"
+QUIET, TINT, FLOOR = "#6f7786", "#f1f4f8", "#e1e6ec"
 
 # The page, in inches.
 PAGE_WIDTH, MARGIN, HEADER = 15.0, 0.45, 1.10

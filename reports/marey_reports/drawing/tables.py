@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 from marey_reports.drawing.markup import Content, Html, element
 
+MOST_NAMES = 40
+"""Longer lists of names are folded away."""
+
 
 class Number(NamedTuple):
     """A number in a table: its value, which rows are sorted by, and how it is written."""

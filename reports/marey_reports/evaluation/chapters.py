@@ -12,7 +12,7 @@ from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element, joined
 from marey_reports.drawing.page import Section, shown
-from marey_reports.drawing.tables import Cell, Number, facts, folded, number, share, table
+from marey_reports.drawing.tables import MOST_NAMES, Cell, Number, facts, folded, number, share, table
 from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import (
@@ -35,7 +35,6 @@ WALK_GRAPH = (
 )
 LOAD_CLIPS = 15
 MOST_HOLES = 15
-MOST_NAMES = 40  # more unused clips than this are folded away
 
 
 def headline(result: EvaluationResult) -> Html:

@@ -11,7 +11,7 @@ from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import demand
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
-from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
+from marey_reports.drawing.tables import MOST_NAMES, Cell, Number, facts, folded, number, table
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import (
     COVERAGE_FIGURES,
@@ -25,7 +25,6 @@ from marey_schemas.wording import counted
 Figures = Mapping[str, DrawnFigure]
 
 MOST_TRIALS = 15
-MOST_NAMES = 40
 LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 

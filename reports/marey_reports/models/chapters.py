@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from marey_motion.arrays import CM_PER_M
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_report import ExampleReport
@@ -13,14 +14,12 @@ from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import Content, Html, element
 from marey_reports.drawing.page import Section, shown
 from marey_reports.drawing.tables import Cell, Number, facts, folded, number, table
+from marey_reports.models.figures.latent_space import MOST_ROWS
 from marey_reports.models.figures.samples import Reach, reach_of
 from marey_reports.models.figures.subjects import ModelSubject
 from marey_schemas.wording import counted
 
 Figures = Mapping[str, DrawnFigure]
-
-MOST_ROWS = 30
-CM_PER_M = 100.0
 
 
 def headline(trained: TrainedPrimitive) -> Html:

@@ -8,6 +8,9 @@ from pydantic import ConfigDict, Field
 
 from marey_schemas.base import Request
 
+COSTS = ("match_cost", "continuing_cost", "pose_cost")
+"""Costs that the part `trials` holds for each tick."""
+
 
 class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.

@@ -13,6 +13,10 @@ Family = Literal["circle", "switching"]
 Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 
+LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
+"""Frame rates at which coverage is measured while a performer records."""
+MOST_CELLS = 2000
+"""Greatest number of cells of a grid whose coverage is measured while a performer records."""
 COVERAGE_LEAST_S = 1.0
 """Default number of seconds of data that a cell needs to count as covered."""
 TARGET_PATH_S = 4.0

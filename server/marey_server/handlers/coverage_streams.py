@@ -47,7 +47,7 @@ class ProjectCoverageStreams(Resource):
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
         """Start to measure the coverage of a performance, from nothing or from the result of an evaluation.
 
-        A stream that receives no frames for a day is deleted; a project has at most 64.
+        A stream that receives no frames for a day is deleted; the number of streams of a project is limited.
         """
         given = await self.look_up(coverage.read_given, project, body)
         new, state = await self.compute(coverage.begin, body, given)

@@ -6,9 +6,10 @@ from importlib.metadata import version
 
 from pydantic import Field
 
+from marey_schemas.address import API
 from marey_schemas.base import Answer
 from marey_server.http.declarations import Access, Bytes, reads
-from marey_server.http.reply import API, Reply
+from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 
 

@@ -28,7 +28,7 @@ from marey_server.store.jobs import completion, logs, queue, reaper, staging
 from marey_server.store.jobs.staging import PreparedOutput
 from marey_server.store.wakeups import wakeups
 
-LOOK_AGAIN_S = 2.0
+LOOK_FOR_WORK_S = 2.0
 """Interval in seconds at which a waiting claim polls the queue: retries become due, other processes submit jobs."""
 
 MAX_STAGED_BYTES = 256 * MIB
@@ -55,7 +55,7 @@ class Leases(Resource):
                 self.uneventful = not leases
                 if leases or left_s <= 0:
                     return Reply(LeaseList(leases=tuple(leases)))
-                await listener.wait(min(left_s, LOOK_AGAIN_S))
+                await listener.wait(min(left_s, LOOK_FOR_WORK_S))
                 if not self.is_awaited():  # claim nothing for a caller that has gone
                     return Reply(LeaseList())
 

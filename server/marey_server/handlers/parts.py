@@ -18,10 +18,10 @@ from marey_server.http.negotiation import MediaType
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
 from marey_server.http.reply import Lasting, Rendered, Reply, encode
 from marey_server.http.resource import Resource
+from marey_server.http.streaming import IMMUTABLE
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
-IMMUTABLE = "private, max-age=31536000, immutable"
 FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
 
 

@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 from tornado.iostream import StreamClosedError
 from tornado.web import HTTPError, RequestHandler
 
+from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
 from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
-from marey_server.http.reply import API, Rendered
+from marey_server.http.reply import Rendered
 from marey_server.process.observe import request_id
 from marey_server.process.services import Services
 

@@ -9,13 +9,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from marey_schemas.address import API
 from marey_schemas.encoding.codecs import JSON as JSON_NAME
 from marey_schemas.encoding.codecs import encode_tree
 from marey_schemas.lru import LruCache
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.negotiation import MediaType
-
-API = "/api/v1"
 
 AnswerCache = LruCache[tuple[str, str], bytes]
 """Cache of rendered documents that never change, by digest and media type.

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from marey_schemas.coverage_streams import (
-    MOST_FRAME_RATE_HZ,
     CoverageCell,
     CoverageFrames,
     CoverageProgress,
@@ -28,6 +27,7 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
+from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items, projects

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.formats import MotionFormat
+from marey_schemas.formats import ZIP_EPOCH, MotionFormat
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items
@@ -27,8 +27,6 @@ LARGEST_ANSWER_BYTES = 32 * MIB
 """Greatest size in bytes of the poses of all samples in an answer."""
 
 SAMPLES_SCHEMA = "marey/motion-samples@1"
-EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Date of the files in archives; it is constant, so that the same samples give the same bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +146,7 @@ def sample_file(
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name, EPOCH)
+    entry = zipfile.ZipInfo(name, ZIP_EPOCH)
     entry.compress_type = zipfile.ZIP_DEFLATED
     return entry
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from marey_schemas.kinds import Kind
+from marey_schemas.wording import NAMES_SHOWN
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 WalkGraphFormat = Literal["json", "graphml"]
 MEDIA_TYPES: Mapping[WalkGraphFormat, str] = {"json": "application/json", "graphml": "application/graphml+xml"}
 SCHEMA = "marey/walk-graph@1"
-NAMES_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)

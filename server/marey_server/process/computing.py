@@ -25,7 +25,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 THREAD_NAME = "marey-compute"
-LONGEST_WAIT_S = 20.0
+LONGEST_WAIT_FOR_PLACE_S = 20.0
 """Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -55,7 +55,7 @@ class ComputeThreads:
         Raises `UnavailableProblem` if none becomes free in time.
         """
         try:
-            await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_S)
+            await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_FOR_PLACE_S)
         except TimeoutError:
             raise UnavailableProblem(
                 "Other requests are using all computing threads; try again in a few seconds.",

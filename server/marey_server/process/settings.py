@@ -10,6 +10,9 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
+from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_server.store.jobs.policy import QueuePolicy
+
 MIB = 1024 * 1024
 
 
@@ -25,8 +28,8 @@ class Settings(BaseSettings):
     data: Path = Field(
         Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
     )
-    host: str = Field("127.0.0.1", description="Address to listen on; 0.0.0.0 for every network.")
-    port: int = Field(8460, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
+    host: str = Field(DEFAULT_HOST, description="Address to listen on; 0.0.0.0 for every network.")
+    port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0 for any free one.")
     database_url: str | None = Field(
         None, description="SQLAlchemy URL; absent: the file marey.db in the data folder. postgresql://... for Postgres."
     )
@@ -79,13 +82,19 @@ class Settings(BaseSettings):
         description="Greatest number of bytes in an import that runs at once; larger imports become a job.",
     )
     lease_ttl_s: float = Field(
-        60.0, ge=1, le=3600, description="Seconds without a heartbeat after which a worker loses its job."
+        QueuePolicy.lease_ttl_s,
+        ge=1,
+        le=3600,
+        description="Seconds without a heartbeat after which a worker loses its job.",
     )
     heartbeat_s: float = Field(
-        15.0, ge=0.1, le=600, description="Seconds between the heartbeats of a worker; at most half of lease_ttl_s."
+        QueuePolicy.heartbeat_s,
+        ge=0.1,
+        le=600,
+        description="Seconds between the heartbeats of a worker; at most half of lease_ttl_s.",
     )
     cancel_grace_s: float = Field(
-        30.0,
+        QueuePolicy.end_grace_s,
         ge=0,
         le=3600,
         description="Seconds that a worker has to stop a job that was cancelled or whose time limit has passed.",

@@ -11,7 +11,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, delete, func, insert, select, update
 
-from marey_schemas.coverage_streams import CoverageStream
+from marey_schemas.coverage_streams import MOST_STREAMS, CoverageStream
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
@@ -20,7 +20,6 @@ from marey_server.store.ids import new_id
 from marey_server.store.tables import coverage_stream
 from marey_server.store.transaction import Transaction
 
-MOST_STREAMS = 64
 """Greatest number of streams in a project."""
 
 LIFETIME_US = 86400 * 1_000_000

@@ -16,6 +16,9 @@ from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.database.clock import Clock
 from marey_server.store.database.prepared import Prepared
 
+IN_LIST = 1000
+"""Most values of one statement: longer lists are cut, because databases limit the parameters of a statement."""
+
 Event = tuple[str, str | None, str, dict[str, Any]]
 """Kind of an event, project id, id of its subject, and body."""
 

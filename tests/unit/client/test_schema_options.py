@@ -16,6 +16,7 @@ from marey_client.cli.files import UPLOAD
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.job_params import AlignParams, EvaluateParams
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.options.searching import TOLERANCE_DEG, TOLERANCE_M
 
 COMMANDS: Any = get_command(app)
 
@@ -124,3 +125,11 @@ def test_the_parameters_of_a_job_are_the_options_of_its_command() -> None:
     for field in EvaluateParams.model_fields.keys() - set_by_the_command - nested:
         name = field.replace("_", "-")
         assert {f"--{name}", f"--{re.sub('s$', '', name)}"} & options, field
+
+
+def test_the_help_of_a_search_names_the_tolerances_that_requests_have_by_default() -> None:
+    """The command line does not load the schemas before a command runs, so the two numbers are text there."""
+    command = COMMANDS.commands["search"]
+    helps = {option.name: option.help for option in command.get_params(typer.Context(command))}
+    assert helps["tolerance_cm"].endswith(f"default: {100 * TOLERANCE_M:g}.")
+    assert helps["tolerance_deg"].endswith(f"default: {TOLERANCE_DEG:g}.")

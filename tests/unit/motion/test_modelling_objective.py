@@ -20,7 +20,7 @@ from marey_motion.modelling.search.constraints import (
     RootHeading,
     RootPosition,
 )
-from marey_motion.modelling.search.objective import MOST_CONSTRAINTS, build_objective
+from marey_motion.modelling.search.objective import MOST_SOUGHT, build_objective
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 
 PLACEMENT = Placement(0.7, 0.4, -0.3)
@@ -271,7 +271,7 @@ def test_a_heading_needs_hips_and_shoulders():
 
 def test_too_many_constraints_are_refused():
     with pytest.raises(InvalidConstraint, match="more than"):
-        build_objective(sliding(), [RootPosition(0, (0.0, 0.0))] * (MOST_CONSTRAINTS + 1), {})
+        build_objective(sliding(), [RootPosition(0, (0.0, 0.0))] * (MOST_SOUGHT + 1), {})
 
 
 def test_a_joint_may_be_named_as_the_skeleton_names_it():

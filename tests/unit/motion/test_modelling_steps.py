@@ -20,7 +20,7 @@ from marey_motion.modelling.search.constraints import (
 from marey_motion.modelling.search.finishing import finish_motion
 from marey_motion.modelling.search.found_motions import found_motion
 from marey_motion.modelling.search.step_search import search_steps
-from marey_motion.modelling.search.steps import MOST_STEPS, Step
+from marey_motion.modelling.search.steps import MOST_SEARCH_STEPS, Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
@@ -145,7 +145,7 @@ def test_a_constraint_that_is_wrong_is_told_by_step_and_place():
     assert caught.value.where == "steps[1].constraints[1].at"
 
 
-@pytest.mark.parametrize("count", [0, MOST_STEPS + 1])
+@pytest.mark.parametrize("count", [0, MOST_SEARCH_STEPS + 1])
 def test_the_number_of_steps_is_limited(count):
     with pytest.raises(InvalidConstraint, match="steps"):
         search_steps(THREE[:1] * count, [tree()] * count)

@@ -34,7 +34,7 @@ def test_long_computations_leave_a_thread_to_others() -> None:
 
 
 def test_who_waits_too_long_is_told_to_ask_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(computing, "LONGEST_WAIT_S", 0.01)
+    monkeypatch.setattr(computing, "LONGEST_WAIT_FOR_PLACE_S", 0.01)
 
     async def main() -> None:
         threads = ComputeThreads(2)

@@ -11,8 +11,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.selection import source_of
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.database import MatchingDatabase
-from marey_motion.matching.preparing import SAME_OFFSET_M
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind

@@ -12,6 +12,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.formats import ZIP_EPOCH
 from marey_schemas.item_files import ItemToExport, item_as_json, original_of_clip
 from marey_schemas.job_params import ExportParams
 from marey_schemas.kinds import Kind
@@ -19,9 +20,6 @@ from marey_schemas.wording import counted
 from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import present
-
-EPOCH = (1980, 1, 1, 0, 0, 0)
-"""Earliest time of a ZIP archive, used for every file, so that the same clips give the same bytes."""
 
 READABLE_BY_ALL = 0o644 << 16
 
@@ -103,7 +101,7 @@ def _place(pin: PinnedInput) -> str:
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    entry = zipfile.ZipInfo(name, EPOCH)
+    entry = zipfile.ZipInfo(name, ZIP_EPOCH)
     entry.compress_type = zipfile.ZIP_DEFLATED
     entry.create_system = 3  # Unix, whatever this machine is
     entry.external_attr = READABLE_BY_ALL

@@ -15,8 +15,8 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""Distance in metres that the root of a locomotion clip travels within `WINDOW_S`."""
-WINDOW_S = 1.0
+"""Distance in metres that the root of a locomotion clip travels within `TRAVEL_WINDOW_S`."""
+TRAVEL_WINDOW_S = 1.0
 """Time in seconds within which the root travels `TRAVEL_M`, from most frames."""
 OPTIONS: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5, 2.0, 2.5, 3.0),
@@ -45,8 +45,8 @@ class DemoEvaluation:
     def selection(self) -> str:
         """The evaluated clips, and the reason for the choice."""
         return (
-            f"of {self.clips} retargeted clips: those whose root gets {TRAVEL_M:g} m away within {WINDOW_S:g} s, "
-            "in most frames"
+            f"of {self.clips} retargeted clips: those whose root gets {TRAVEL_M:g} m away within "
+            f"{TRAVEL_WINDOW_S:g} s, in most frames"
         )
 
 
@@ -67,9 +67,9 @@ def evaluate_locomotion(
 
 
 def travels(clip: ClipHandle, root: str) -> bool:
-    """Return whether the clip's root travels `TRAVEL_M` within `WINDOW_S`, from most frames."""
+    """Return whether the clip's root travels `TRAVEL_M` within `TRAVEL_WINDOW_S`, from most frames."""
     rate_hz = float(clip.item.summary["frame_rate_hz"])
-    window = round(WINDOW_S * rate_hz)
+    window = round(TRAVEL_WINDOW_S * rate_hz)
     if int(clip.item.summary["frames"]) <= window:
         return False
     places = clip.motion(joints=[root]).root_translations[:, [0, 2]]

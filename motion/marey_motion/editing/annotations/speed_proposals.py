@@ -15,7 +15,8 @@ from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import runs
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import MappingError
-from marey_motion.matching.body import SIDES, MatchingBody
+from marey_motion.matching.body import MatchingBody
+from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.annotations import OUT_OF_REST, VelocityMinimaProposal, WristContactProposal
 
 PAUSE = "pause"

@@ -13,7 +13,8 @@ from marey_motion import kinematics
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.contacts import Stance, find_stances
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
-from marey_motion.matching.body import SIDES, MatchingBody
+from marey_motion.matching.body import MatchingBody
+from marey_motion.rigs.standard import SIDES
 from marey_schemas.options.annotations import ContactOptions, StepsProposal
 
 STANDING = "standing"

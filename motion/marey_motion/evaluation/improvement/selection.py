@@ -15,8 +15,7 @@ import numpy as np
 from marey_motion.arrays import Flags
 from marey_motion.errors import MotionError
 from marey_motion.matching.database import DatabaseClip, MatchingDatabase
-from marey_motion.matching.preparing import SAME_OFFSET_M
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.alignment.warp import LEAST_SLOPE
 from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
 from marey_motion.formats.document_fields import field_of, number_array
+from marey_motion.formats.predecessor.annotation import SECTIONS
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
 
-TIME_FUNCTION, SECTIONS = "time_function", "sections"
-LEAST_SLOPE = 0.01
+TIME_FUNCTION = "time_function"
 MOST_FRAME = 2**31 - 1
 
 

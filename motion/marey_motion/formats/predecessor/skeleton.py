@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats.document_fields import field_of, number_list, text_list
-from marey_motion.formats.joint_names import MAX_JOINTS
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
+from marey_schemas.documents.skeletons import MAX_JOINTS
 
 FORMAT = "predecessor"
 CENTIMETRE_M = 0.01

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.arrays import Floats
-from marey_motion.modelling.reconstruction import CM_PER_M
+from marey_motion.arrays import CM_PER_M, Floats
 from marey_motion.modelling.sample_quality import toe_positions
 from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.step_search import search_steps

@@ -15,9 +15,7 @@ from marey_motion.modelling.search.constraints import InvalidConstraint, Moment,
 from marey_motion.modelling.search.step_search import Sequel
 from marey_motion.modelling.search.steps import Step
 from marey_motion.motion import Motion
-from marey_motion.skeleton import Skeleton, same_hierarchy
-
-SAME_OFFSET_M = 1e-3
+from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ from marey_motion.modelling.search.tracking import (
     track_times,
 )
 
-MOST_CONSTRAINTS = 256
+MOST_SOUGHT = 256
 AT_ORIGIN = Placement(0.0, 0.0, 0.0)
 
 
@@ -184,8 +184,8 @@ def build_objective(
     ------
     InvalidConstraint    naming the constraint and its defect
     """
-    if len(constraints) > MOST_CONSTRAINTS:
-        raise InvalidConstraint(f"{len(constraints)} constraints are more than {MOST_CONSTRAINTS}", where="constraints")
+    if len(constraints) > MOST_SOUGHT:
+        raise InvalidConstraint(f"{len(constraints)} constraints are more than {MOST_SOUGHT}", where="constraints")
     tracked = {one: place for place, one in enumerate(also)}
     moments: dict[float, int] = {}
     rows = []

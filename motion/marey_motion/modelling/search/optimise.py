@@ -20,7 +20,7 @@ from marey_motion.modelling.mixture import LatentMixture
 from marey_schemas.options.searching import RefineOptions
 
 FIRST_DAMPING = 1e-3
-LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e12
+SMALLEST_DAMPING, MOST_DAMPING = 1e-12, 1e12
 EASING, TIGHTENING = 10.0, 4.0
 LEAST_GAIN = 1e-12
 
@@ -111,7 +111,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
         if new_cost < cost:
             gained = cost - new_cost
             here, (residuals, slopes), cost = there, tried, new_cost
-            damping = max(damping / EASING, LEAST_DAMPING)
+            damping = max(damping / EASING, SMALLEST_DAMPING)
             if gained <= LEAST_GAIN * max(cost, 1.0):
                 break
         else:

@@ -25,7 +25,7 @@ from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objec
 from marey_motion.modelling.search.tracking import Chains, Tracked, body_place, facing, track_points
 from marey_schemas.options.searching import TransitionOptions
 
-MOST_STEPS = 32
+MOST_SEARCH_STEPS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +127,8 @@ class SeveralSteps:
         ------
         InvalidConstraint    naming step and constraint
         """
-        if not 1 <= len(steps) <= MOST_STEPS:
-            raise InvalidConstraint(f"{len(steps)} steps are not within 1 to {MOST_STEPS}", where="steps")
+        if not 1 <= len(steps) <= MOST_SEARCH_STEPS:
+            raise InvalidConstraint(f"{len(steps)} steps are not within 1 to {MOST_SEARCH_STEPS}", where="steps")
         joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
         alone = len(steps) == 1
         links: list[_Link] = []

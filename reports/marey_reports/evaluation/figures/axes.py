@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING
 
 from marey_reports.drawing.paper import QUIET, SMALL, write
 
+ROW = 0.235
+"""Inches of the row of a clip."""
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 

@@ -20,6 +20,7 @@ from marey_reports.drawing.paper import (
     name_ticks,
     new_figure,
 )
+from marey_reports.evaluation.figures.axes import ROW
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 from marey_schemas.wording import counted
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-ROW = 0.235
 TRANSITIONS = "Transitions"
 
 

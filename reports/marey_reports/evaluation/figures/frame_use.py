@@ -22,6 +22,7 @@ from marey_reports.drawing.paper import (
     square_root_ticks,
     warm_colours,
 )
+from marey_reports.evaluation.figures.axes import ROW
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 
 STRETCHES = 200
-ROW = 0.235
 
 
 class _Strip(NamedTuple):

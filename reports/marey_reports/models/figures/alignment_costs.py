@@ -16,6 +16,7 @@ from marey_reports.drawing.paper import (
     DARK,
     LIGHT,
     MORE_IS_WORSE,
+    SIDE,
     Place,
     add_colour_bar,
     add_panel,
@@ -26,7 +27,6 @@ from marey_reports.drawing.paper import (
 from marey_reports.models.figures.subjects import evenly
 from marey_schemas.options.alignment import CostOptions
 
-SIDE = 2.7
 MOST_CELLS = 200
 
 
@@ -95,7 +95,7 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
         "clip_frame": np.concatenate([view.clip.time_function for view in views]),
         "distance_cm": np.concatenate([view.along_path_cm for view in views]),
     }
-    return Sketch(figure, {"ways": table}, caption)
+    return Sketch(figure, {"paths": table}, caption)
 
 
 def _chosen(aligned: AlignedSet) -> list[tuple[str, AlignedClip]]:

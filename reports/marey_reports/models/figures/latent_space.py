@@ -14,6 +14,7 @@ from marey_reports.drawing.paper import (
     PAPER,
     QUIET,
     REFERENCE,
+    SIDE,
     Place,
     add_keys,
     add_panel,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 SCATTERED_SAMPLES = 400
 ELLIPSE_DEVIATIONS = 2.0
-SIDE = 2.7
 NAMED = 12
 MOST_ROWS = 30
 ROW = 0.2

@@ -12,9 +12,7 @@ from marey_schemas.jobs import Job, JobState, Progress
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import job, job_dependency, project, user
-from marey_server.store.transaction import Transaction
-
-IN_LIST = 1000
+from marey_server.store.transaction import IN_LIST, Transaction
 
 
 def select_jobs() -> Select[Any]:

@@ -14,10 +14,9 @@ from marey_server.errors import InvalidProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 MOST_INPUTS = 100_000
-IN_LIST = 1000
 
 Pin = dict[str, Any]
 """Stored input: the fields of `PinnedInput`, or `{job}` until that job has produced it."""

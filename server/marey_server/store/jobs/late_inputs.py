@@ -23,9 +23,7 @@ from marey_server.store.jobs.inputs import MOST_INPUTS, Pin, PinnedInputs, items
 from marey_server.store.jobs.layout import NewJob, Submission
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.tables import job
-from marey_server.store.transaction import Transaction
-
-IN_LIST = 1000
+from marey_server.store.transaction import IN_LIST, Transaction
 
 
 class LateInputError(Exception):

@@ -26,15 +26,13 @@ from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
 from marey_server.store.jobs.inputs import Pin, PinnedInputs
 from marey_server.store.tables import job, job_dependency, revision_part
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 SHARED_AT_ONCE = 64
 """Greatest number of jobs that get a cached result at submission; the leading process serves the others later."""
 
 MOST_SHARED_OUTPUTS = 256
 """Greatest number of outputs published from the cache in one transaction; a single job may exceed it."""
-
-IN_LIST = 1000
 
 
 class SharedResult(NamedTuple):

@@ -19,10 +19,9 @@ from marey_server.store.jobs.reading import find_job, require_own
 from marey_server.store.jobs.submission import lock_jobs, submit_checked
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import job, job_dependency
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 MOST_AT_ONCE = 1000
-IN_LIST = 1000
 UNSUCCESSFUL = ("failed", "cancelled")
 
 

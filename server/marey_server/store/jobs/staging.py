@@ -24,10 +24,9 @@ from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.projects import find_by_id
 from marey_server.store.tables import document, job, staged_output
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 MOST_STAGED = 20_000
-IN_LIST = 1000
 _DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 StagedDraft = dict[str, Any]

@@ -31,9 +31,8 @@ from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
 from marey_server.store.tables import job, job_dependency
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
-IN_LIST = 1000
 _INSERT_JOB = Prepared(insert(job))
 
 

@@ -1,0 +1,7 @@
+"""Addresses of a server. Imports nothing, so that the command line starts quickly."""
+
+API = "/api/v1"
+"""Prefix of the paths of all resources but probes."""
+
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 8460
