@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from lint import circles, class_names, docstrings, folders, lengths, lists, small_modules, unused, wording
+from lint import circles, class_names, constants, docstrings, folders, lengths, lists, small_modules, unused, wording
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, read_exceptions, shown, shrink_baseline
 from lint.sources import House, Offence, read_house
 
@@ -21,6 +21,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
     "lengths": lengths.find,
     "docstrings": docstrings.find,
     "lists": lists.find,
+    "constants": constants.find,
 }
 """By name in `exceptions.toml`; the wording has its baseline instead."""
 

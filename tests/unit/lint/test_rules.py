@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from lint import circles, class_names, docstrings, folders, lengths, lists, small_modules, unused, wording
+from lint import circles, class_names, constants, docstrings, folders, lengths, lists, small_modules, unused, wording
 from lint.commit_subject import faults_of
 from lint.exceptions import apply_baseline, apply_exceptions, read_baseline, shrink_baseline
 from lint.sample import draw
@@ -120,6 +120,18 @@ def test_a_list_that_repeats_words_of_a_vocabulary_is_found():
     assert "words of marey_schemas.jobs.State" in offence.message
     other = "OPEN = ('waiting', 'queued', 'opened')\n"
     assert not list(lists.find(house({"marey_schemas.jobs": home, "marey_x.a": other})))
+
+
+def test_a_constant_that_two_modules_declare_is_found():
+    twice = house({"marey_x.a": "LONGEST_S = 20.0\n", "marey_y.b": "MOST, LONGEST_S = 3, 20.0\n"})
+    (offence,) = constants.find(twice)
+    assert offence.subject == "marey_y.b.LONGEST_S"
+    assert offence.message.startswith("LONGEST_S = 20.0 is also in marey_x.a, line 1")
+
+
+def test_constants_of_other_names_values_or_made_by_calls_are_no_offence():
+    fine = {"marey_x.a": "MOST = 3\nLOG = get_log()\nkind = 1\n", "marey_y.b": "MOST = 4\nLOG = get_log()\nkind = 1\n"}
+    assert not list(constants.find(house(fine)))
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_keyframes_are_marked_by_their_labels(figures):
 
 
 def test_costs_show_the_worst_clip_and_a_typical_one_with_their_ways(subject, figures):
-    rows = rows_of(figures["alignment-costs"], "ways")
+    rows = rows_of(figures["alignment-costs"], "paths")
     assert list(dict.fromkeys(row["clip"] for row in rows)) == ["walk006", "walk011"]
     worst = [row["clip_frame"] for row in rows if row["clip"] == "walk011"]
     assert worst == subject.examples.clips[11].time_function.tolist()
@@ -108,7 +108,7 @@ def test_a_clip_that_is_the_reference_played_at_half_speed_costs_nothing_along_i
     aligned = subject.examples
     first, other = aligned.clips[:2]
     slow = replace(other, motion=first.motion, time_function=2.0 * np.arange(FRAMES), source_frames=2 * FRAMES - 1)
-    rows = rows_of(draw_alignment_figures(replace(aligned, clips=(first, slow)))["alignment-costs"], "ways")
+    rows = rows_of(draw_alignment_figures(replace(aligned, clips=(first, slow)))["alignment-costs"], "paths")
     assert max(row["distance_cm"] for row in rows) < 1e-6
 
 
