@@ -5,9 +5,10 @@ from tests.support.interleaving import Step as Half
 from tests.support.interleaving import interleave
 from tests.support.store_fixtures import WRITE, requiring
 
+from marey_schemas.coverage_streams import MOST_STREAMS
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import coverage_streams, garbage
-from marey_server.store.coverage_streams import LIFETIME_US, MOST_STREAMS, CoverageOffset, NewStream, StreamStep
+from marey_server.store.coverage_streams import LIFETIME_US, CoverageOffset, NewStream, StreamStep
 
 SETTINGS = {
     "frame_rate_hz": 60.0, "skeleton": None, "evaluation": None, "speeds_m_s": [1.0], "turn_rates_deg_s": [0.0],
