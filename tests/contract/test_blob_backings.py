@@ -103,7 +103,9 @@ class BlobBackingContract:
         digest = store.write(blobs.put_blob, b"nobody's")
         assert garbage.collect_garbage(store.database).blobs == 0
         clock.advance(OLD_US / 1e6)
+        young = store.write(blobs.put_blob, b"somebody's")
         assert garbage.collect_garbage(store.database).blobs == 1
+        assert store.read(lambda tx: b"".join(tx.blobs.read(tx.connection, young, 0, 10))) == b"somebody's"
         with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest)
         garbage.collect_garbage(store.database, grace_us=-1)

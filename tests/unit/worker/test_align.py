@@ -1,5 +1,6 @@
 """The function behind `align`, with a project in memory instead of a server."""
 
+import numpy as np
 import pytest
 from tests.support.alignment_examples import walk, warped_walks
 from tests.support.project_in_memory import ProjectInMemory, add_clip
@@ -191,6 +192,23 @@ def test_what_cannot_be_done_refuses_the_job(project, params, code, said):
     refused = refusal(project, **params)
     assert refused.code == code
     assert said in refused.detail
+
+
+def test_names_of_results_that_would_be_too_long_refuse_the_job(project):
+    first, *others = project.inputs["clips"]
+    project.inputs["clips"] = (first.model_copy(update={"name": 250 * "n"}), *others)
+    refused = refusal(project, suffix="-aligned")
+    assert (refused.code, refused.detail[-25:]) == ("name-too-long", "has 258 of 255 characters")
+
+
+def test_clips_that_cannot_be_read_refuse_the_job(project):
+    for pin in project.inputs["clips"]:
+        place = (pin.item, pin.revision, "motion")
+        motion = project.parts[place]
+        project.parts[place] = motion | {"poses": motion["poses"] * np.nan}
+    refused = refusal(project)
+    assert refused.code == "too-few-clips"
+    assert "clips can be read" in refused.detail
 
 
 def test_a_job_that_is_left_with_one_clip_says_why_the_others_do_not_fit(project):
