@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,23 @@ def serve(**settings: Any) -> None:
     comfort = {"local_workers": 1, "log_form": usual_form()}
     unset = {name: value for name, value in comfort.items() if name not in chosen.model_fields_set}
     try:
-        asyncio.run(serve_until_stopped(read_settings(**settings, **unset)))
+        with asyncio.Runner(loop_factory=_new_event_loop) as runner:
+            runner.run(serve_until_stopped(read_settings(**settings, **unset)))
     except DatabaseUnusable as error:
         raise CommandFailed(str(error)) from error
     except CannotListen as error:
         raise CommandFailed(f"{error}; choose others with --host and --port, 0 for any free port") from error
     leave()
+
+
+def _new_event_loop() -> asyncio.AbstractEventLoop:
+    """Make an event loop of uvloop, which is not available for Windows; there and without it, one of asyncio."""
+    try:
+        uvloop = import_module("uvloop")
+    except ModuleNotFoundError:
+        return asyncio.new_event_loop()
+    loop: asyncio.AbstractEventLoop = uvloop.new_event_loop()
+    return loop
 
 
 def read_settings(**given: Any) -> Settings:

@@ -1,7 +1,10 @@
-"""The care of a database from the shell: backup, restore, check."""
+"""The care of a database from the shell: backup, restore, check; the event loop of a server."""
 
+import asyncio
 import sqlite3
+import sys
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 
@@ -136,3 +139,19 @@ def test_serve_tells_what_is_wrong_with_its_database(tmp_path, monkeypatch):
     monkeypatch.setattr("marey_server.app.serve", unusable)
     with pytest.raises(commands.CommandFailed, match="is a teapot"):
         commands.serve(data=tmp_path)
+
+
+def test_the_server_runs_on_uvloop_where_that_is_installed(monkeypatch):
+    loop = object()
+    monkeypatch.setitem(sys.modules, "uvloop", SimpleNamespace(new_event_loop=lambda: loop))
+
+    assert commands._new_event_loop() is loop
+
+
+def test_the_server_runs_on_asyncio_where_uvloop_is_not_installed(monkeypatch):
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+
+    loop = commands._new_event_loop()
+
+    assert isinstance(loop, asyncio.SelectorEventLoop)
+    loop.close()
