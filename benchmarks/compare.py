@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.timing import Row
 
-_HEADINGS = ("job", "size", "before", "ratio", "after", "ratio", "goal", "")
+_HEADINGS = ("job", "size", "peer", "before", "ratio", "after", "ratio", "goal", "")
 _VERDICTS = {True: "met", False: "**missed**", None: ""}
 _NUMBER = re.compile(r"\d[\d.,]*")
 
@@ -72,6 +72,7 @@ def _cells(before: Row | None, after: Row | None) -> list[str]:
     return [
         row.job,
         row.size if before is None or before.size == row.size else f"{row.size} (before: {before.size})",
+        row.peer,
         before.ours if before else "(new)",
         _ratio(before),
         after.ours if after else "(absent)",

@@ -25,7 +25,7 @@ def cells(table: str) -> list[list[str]]:
 def test_a_row_of_both_runs_shows_both_figures_and_the_later_verdict() -> None:
     [shown] = cells(compare.as_markdown([SMALL], [Row("DTW", "200 x 200", "1 ms", "librosa", 3.25, "≥ 3x", True)]))
 
-    assert shown == ["DTW", "200 x 200", "2 ms", "", "1 ms", "3.2x", "≥ 3x", "met"]
+    assert shown == ["DTW", "200 x 200", "librosa", "2 ms", "", "1 ms", "3.2x", "≥ 3x", "met"]
 
 
 def test_rows_are_paired_by_size_whatever_their_order() -> None:
@@ -38,7 +38,7 @@ def test_a_size_that_differs_in_its_figures_alone_is_the_same_row() -> None:
     [shown] = cells(compare.as_markdown([READ], [READ_LATER]))
 
     assert shown[1] == f"{READ_LATER.size} (before: {READ.size})"
-    assert shown[2:6] == ["900/s", "0.5x", "1200/s", "0.7x"]
+    assert shown[2:7] == ["bare 1800/s", "900/s", "0.5x", "1200/s", "0.7x"]
 
 
 def test_rows_of_one_run_alone_are_shown_as_new_or_absent() -> None:
@@ -48,8 +48,8 @@ def test_rows_of_one_run_alone_are_shown_as_new_or_absent() -> None:
 
     new, absent = cells(compare.as_markdown([generated], [real]))
 
-    assert new == ["files read", "120 real files", "(new)", "", "1 s", "", "≥ 15x", "**missed**"]
-    assert absent == ["files read", "120 generated files", "1 s", "", "(absent)", "", "≥ 15x", ""]
+    assert new == ["files read", "120 real files", "", "(new)", "", "1 s", "", "≥ 15x", "**missed**"]
+    assert absent == ["files read", "120 generated files", "", "1 s", "", "(absent)", "", "≥ 15x", ""]
 
 
 def test_the_command_prints_the_table_of_two_files(
