@@ -38,7 +38,7 @@ class Retries:
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, tried: int, retry_after_s: float | None) -> float:
-        """Seconds to wait after `tried` tries; never less than the server asked for."""
+        """Return the seconds to wait after `tried` tries, at least as many as the server asked for."""
         backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
 
@@ -47,6 +47,6 @@ ONCE = Retries(tries=1)
 
 
 def retry_after_s(response: httpx.Response) -> float | None:
-    """Seconds the server asks to wait, where it says so in seconds."""
+    """Return the seconds that the server asks to wait, if it gives them as a number."""
     value = response.headers.get("Retry-After", "")
     return float(value) if value.isdigit() else None

@@ -111,11 +111,11 @@ class Transport:
         params: Params | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> Model:
-        """GET one JSON document."""
+        """Request a JSON document by GET."""
         return read_model(answer, self.send("GET", path, params=params, headers=headers))
 
     def post(self, answer: type[Model], path: str, body: BaseModel | None = None, **options: Any) -> Model:
-        """POST one JSON document, with an idempotency key; answer another."""
+        """Send a JSON document by POST, with an idempotency key; return the answer's document."""
         return read_model(answer, self.send("POST", path, content=as_json(body), **options))
 
     def send(
@@ -188,7 +188,7 @@ class Transport:
     # -- documents with arrays -----------------------------------------------------------------------------------------
 
     def get_tree(self, path: str, params: Params | None = None) -> tuple[Any, str | None]:
-        """GET a document; its arrays as numpy arrays, and its ETag."""
+        """Request a document by GET; return it with numpy arrays, and its ETag."""
         response = self.send("GET", path, params=params, headers={"Accept": BLOCKS})
         return read_tree(response), response.headers.get("ETag")
 
@@ -203,7 +203,7 @@ class Transport:
     def stream(
         self, path: str, *, params: Params | None = None, headers: Mapping[str, str] | None = None
     ) -> Iterator[httpx.Response]:
-        """GET an answer whose bytes are read while they arrive. Not repeated: the caller knows how far it came."""
+        """Request bytes by GET and read them while they arrive; not retried, because the caller knows the position."""
         sent_headers = {"Accept": "*/*", **(headers or {})}
         with self._client.stream(
             "GET", _quoted(path), params=_present(params), headers=sent_headers, auth=self._auth
@@ -277,7 +277,7 @@ def raise_for_problem(response: httpx.Response) -> None:
 
 
 def _present(params: Params | None) -> dict[str, str] | None:
-    """Query parameters without those that are None; booleans as the server spells them."""
+    """Return the query parameters that are not None, with booleans in the server's spelling."""
     if not params:
         return None
     return {

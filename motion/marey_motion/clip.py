@@ -92,7 +92,7 @@ class Clip:
             return
         if self.translations.shape != (self.frame_count, len(joints), 3):
             needed = (self.frame_count, len(joints), 3)
-            raise ClipError(f"shape {self.translations.shape} where {needed} is needed", where="translations")
+            raise ClipError(f"shape {self.translations.shape}; {needed} is needed", where="translations")
         if not joints:
             raise ClipError("translations without joints; leave both out", where=where)
         in_order = all(a < b for a, b in pairwise(joints))
@@ -147,7 +147,7 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
     """Make a read-only float32 view of `values`; the caller's own array keeps its flags."""
     array = np.asarray(values)
     if array.ndim != ndim or array.shape[0] == 0:
-        raise ClipError(f"shape {array.shape} where {ndim} axes and at least one frame are needed", where=field)
+        raise ClipError(f"shape {array.shape}; {ndim} axes and at least one frame are needed", where=field)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise ClipError(f"numbers are needed, not {array.dtype}", where=field)
     view = np.asarray(array, dtype=np.float32).view()

@@ -545,7 +545,9 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 
 
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
-    """Half a turn about a perpendicular of `start`, then the small turn left from -start to `end`, all (n, 3)."""
+    """Compute rotations between nearly opposite vectors (n, 3): half a turn about a perpendicular of `start`, then the
+    rest.
+    """
     candidates = [_cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:
         candidates.insert(1, np.asarray(wished, dtype=np.float64))

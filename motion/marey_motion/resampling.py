@@ -121,7 +121,7 @@ def sample_motion(motion: Motion, places: Floats) -> Motion:
 
 
 def _interpolated(values: Floats, places: Floats) -> Floats:
-    """Cubic splines through `values` (F, ...), read at frame numbers `places` (n,): (n, ...)."""
+    """Interpolate `values` (F, ...) by cubic splines at frame numbers `places` (n,); return (n, ...)."""
     from scipy.interpolate import make_interp_spline
 
     columns = values.reshape(len(values), -1)

@@ -372,7 +372,7 @@ def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[in
 def _position_from_root(
     skeleton: Skeleton, rotations: AnyFloats, joint: int, moved: Mapping[int, AnyFloats] = MappingProxyType({})
 ) -> AnyFloats:
-    """Vectors (F, 3) from the root to one joint in the world; `moved` has the offsets (F, 3) that are not constant."""
+    """Compute the vectors (F, 3) from the root to a joint in the world; `moved` has the variable offsets (F, 3)."""
     position: AnyFloats = np.zeros((len(rotations), 3))
     for step in skeleton.path_to_root(joint)[:-1]:
         offset = moved.get(step, skeleton.offsets[step])

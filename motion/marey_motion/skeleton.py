@@ -290,7 +290,7 @@ def _frozen(values: ArrayLike, dtype: DTypeLike, shape: tuple[int, ...], field: 
     """Make a read-only view of `values` as `dtype`; the caller's own array keeps its flags."""
     array = np.asarray(values)
     if array.shape != shape:
-        raise SkeletonError(f"shape {array.shape} where {shape} is needed", where=field)
+        raise SkeletonError(f"shape {array.shape}; {shape} is needed", where=field)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise SkeletonError(f"numbers are needed, not {array.dtype}", where=field)
     if not np.all(np.isfinite(array)):

@@ -237,7 +237,7 @@ def require_apart(things: Sequence[Thing]) -> None:
             if other.id == one.id:
                 raise WrongUsage(f"{one.place} is given twice")
             if other.kind == FOLDER and one.place.startswith(f"{other.place}/"):
-                raise WrongUsage(f"{one.place} is in {other.place}, which is named, too")
+                raise WrongUsage(f"{one.place} is in {other.place}, which is given, too")
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:

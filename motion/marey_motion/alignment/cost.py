@@ -63,7 +63,9 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     """
     options = options or CostOptions()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
-        raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
+        raise MotionError(
+            f"points of shapes {a.shape} and {b.shape}; both must be (frames, points, 3), of the same points"
+        )
     return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 
 
@@ -133,12 +135,12 @@ def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
 def _shares(weights: ArrayLike | None, count: int) -> Floats:
     given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
     if given.shape != (count,):
-        raise MotionError(f"{given.shape} weights where {count} points have one each", where="weights")
+        raise MotionError(f"weights of shape {given.shape}; {count} points need one weight each", where="weights")
     if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
         raise MotionError("weights are finite, not negative, and not all zero", where="weights")
     return np.asarray(given / given.sum())
 
 
 def _boxed(values: Floats, window: int) -> Floats:
-    """Sums over each run of `window` values along the last axis."""
+    """Compute the sums over each run of `window` values along the last axis."""
     return np.asarray(np.lib.stride_tricks.sliding_window_view(values, window, axis=-1).sum(axis=-1))

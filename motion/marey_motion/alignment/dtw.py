@@ -95,7 +95,7 @@ def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
     if not (np.isfinite(matrix.min()) and np.isfinite(matrix.max())):
         raise MotionError("costs must be finite", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}")
     if max_run is not None and not 0 <= max_run <= 60:
-        raise MotionError("a run is 0 to 60 steps long", where="max_run")
+        raise MotionError("the number of equal steps in a row must be in 0 to 60", where="max_run")
     return matrix
 
 
@@ -221,5 +221,7 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """Lay out points with frames first for one, last for the other: the inner loop runs along the latter."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
-        raise MotionError(f"points must be (frames, points, 3), the same points in both, not {a.shape} and {b.shape}")
+        raise MotionError(
+            f"points of shapes {a.shape} and {b.shape}; both must be (frames, points, 3), of the same points"
+        )
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

@@ -158,7 +158,7 @@ def _residuals(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Fl
 def _clusters(
     skeleton: Skeleton, constraints: Sequence[Constraint], together: bool
 ) -> tuple[tuple[Constraint, ...], ...]:
-    """Constraints that must be solved together: of which one turns a joint that turns or carries another's target."""
+    """Group the constraints that must be solved together, because one turns a joint that affects another."""
     clusters: list[tuple[set[int], set[int], list[Constraint]]] = []
     for constraint in constraints:
         turning = set(constraint.joints)

@@ -135,14 +135,14 @@ class _Rig:
         return self._axes
 
     def axes_of(self, joint: int) -> JointAxes:
-        """Axes of a joint. Raises `MappingError` where it is not mapped."""
+        """Return the axes of a joint. Raises `MappingError` if the joint is not mapped."""
         name = self.take.skeleton.joint_names[joint]
         if name not in self.axes:
             raise MappingError("the mapping does not name this joint, so its axes are unknown", where=name)
         return self.axes[name]
 
     def axes_if_known(self) -> dict[str, JointAxes] | None:
-        """Axes of the mapped joints; None where the mapping does not suffice for them."""
+        """Return the axes of the mapped joints; None if the mapping is not sufficient to compute them."""
         try:
             return self.axes
         except MappingError:
@@ -240,7 +240,7 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Toes as given; heels where they are slow meanwhile."""
+    """Return the given contacts of the toes; the heels are in contact if they are slow in the same frames."""
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):

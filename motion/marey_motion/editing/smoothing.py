@@ -66,7 +66,7 @@ def smooth(take: Take, command: Smooth) -> Take:
 
 
 def _weights(take: Take, command: Smooth) -> Floats:
-    """Symmetric weights (2 n + 1,) that sum to 1; a motion that is shorter than the window gets a shorter one."""
+    """Compute symmetric weights (2 n + 1,) that sum to 1; a window longer than the motion is shortened."""
     asked = max(1, int(0.5 * command.window_s * take.frame_rate_hz + 1e-9))
     reach = min(asked, take.frame_count - 1)
     if command.method == "gaussian":
@@ -86,7 +86,7 @@ def _weights(take: Take, command: Smooth) -> Floats:
 
 
 def _smooth_positions(values: Floats, weights: Floats) -> Floats:
-    """Weighted means over time of positions (F, ...)."""
+    """Compute the weighted means over time of positions (F, ...)."""
     reach = len(weights) // 2
     before = 2.0 * values[0] - values[reach:0:-1]
     after = 2.0 * values[-1] - values[-2 : -reach - 2 : -1]
@@ -94,7 +94,7 @@ def _smooth_positions(values: Floats, weights: Floats) -> Floats:
 
 
 def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Sequence[int]) -> Floats:
-    """Weighted means over time of rotations (F, J, 4), of unit length."""
+    """Compute the weighted means over time of rotations (F, J, 4), normalised."""
     reach = len(weights) // 2
     before = _reflected(rotations[0], rotations[reach:0:-1])
     after = _reflected(rotations[-1], rotations[-2 : -reach - 2 : -1])
@@ -118,7 +118,7 @@ def _reflected(end: Floats, rotations: Floats) -> Floats:
 
 
 def _averaged(padded: Floats, weights: Floats) -> Floats:
-    """Weighted means (F, ...) of values (n + F + n, ...), by weights (2 n + 1,)."""
+    """Compute the weighted means (F, ...) of values (n + F + n, ...), by weights (2 n + 1,)."""
     from scipy.ndimage import correlate1d
 
     reach = len(weights) // 2

@@ -216,7 +216,9 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
 
 
 def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
-    """Per result and trial (T, 2): which clip, numbered alike for all results, and which frame of it was displayed."""
+    """Compute clip and frame displayed at each tick (T, 2), per result and trial; clips are numbered alike in all
+    results.
+    """
     numbers: dict[str, int] = {}
     return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
 

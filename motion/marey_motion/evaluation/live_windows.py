@@ -62,7 +62,7 @@ class LiveWindows:
     def __init__(self, rate_hz: float) -> None:
         if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:
             raise MotionError(
-                f"{rate_hz:g} frames per second, where {LEAST_FRAME_RATE_HZ:g} to {MOST_FRAME_RATE_HZ:g} are measured; "
+                f"{rate_hz:g} frames per second; {LEAST_FRAME_RATE_HZ:g} to {MOST_FRAME_RATE_HZ:g} are possible; "
                 "send every n-th frame of a faster recording",
                 where="frame_rate_hz",
             )

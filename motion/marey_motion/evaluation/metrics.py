@@ -180,7 +180,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
 
 
 def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
-    """Standard deviation about the mean of each regime, all regimes together."""
+    """Compute the standard deviation about the mean of each regime, over all regimes together."""
     if not len(values):
         return None
     squares = 0.0
@@ -223,7 +223,7 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
 
 
 def _stretches(pieces: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Half-open ranges of equal pieces."""
+    """Find the half-open ranges of equal values."""
     bounds = [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist(), len(pieces)]
     return list(pairwise(bounds))
 
@@ -242,7 +242,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
 
 
 def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Transitions are chosen; that a clip ended or began again is not one."""
+    """Compute the metrics of transitions that were chosen; jumps forced by the end of a clip do not count."""
     status = record.status[1:][window]
     transitions = float(np.count_nonzero(status == Status.REPLACING))
     return {
@@ -253,7 +253,7 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 
 
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Pool the costs of steps; those of a step belong to its first tick, whose choice is displayed after it."""
+    """Pool the costs of steps; a step's cost is that of its first tick, whose choice is displayed after it."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
         "pose_cost": record.pose_cost[:-1][window],
@@ -271,7 +271,9 @@ def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]
 
 
 def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
-    """Equations 1 to 4 as printed: a sum of m + 1 terms over m, and the square of a sum over a count of settings."""
+    """Compute equations 1 to 4 as printed: a sum of m + 1 terms divided by m, and the square of a sum divided by a
+    count.
+    """
     metrics: dict[str, float | None] = {}
     for name, recorded, wanted, settings in (
         ("v", series.speeds_m_s, series.wanted_speeds_m_s, grid.speeds_m_s),

@@ -92,10 +92,10 @@ class OnlineCoverage:
         self.turn_rate_edges_deg_s = cell_edges(self.grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
         shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
         if shape[0] * shape[1] > MOST_CELLS:
-            raise MotionError(f"{shape[0]} x {shape[1]} cells, over {MOST_CELLS}", where="grid")
+            raise MotionError(f"{shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are possible", where="grid")
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:
-            raise MotionError(f"shape {self._before.shape} where the grid has {shape} cells", where="seconds")
+            raise MotionError(f"shape {self._before.shape}, but the grid has {shape} cells", where="seconds")
         self._live = LiveWindows(rate_hz)
         self.counts = np.zeros(shape, dtype=np.int64)
         self.frame_count = 0
@@ -141,7 +141,9 @@ class OnlineCoverage:
         MotionError    where a value is invalid or too far away; none of them is added
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
-            raise MotionError(f"{len(headings)} headings for positions of shape {positions.shape}", where="roots")
+            raise MotionError(
+                f"{len(headings)} headings do not match positions of shape {positions.shape}", where="roots"
+            )
         _require_near(positions)
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
 

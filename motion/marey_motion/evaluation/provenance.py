@@ -99,7 +99,7 @@ def _digest(value: Any) -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """Plain values with one spelling per number: 3 and 3.0 are the same option, and -0.0 is 0.0."""
+    """Convert to plain values with one spelling per number: 3 and 3.0 are the same option, and -0.0 is 0.0."""
     if isinstance(value, Options):
         return _canonical(value.model_dump())
     if is_dataclass(value) and not isinstance(value, type):

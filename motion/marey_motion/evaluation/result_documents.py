@@ -215,7 +215,7 @@ def _listed(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Tuples as lists, mappings as dictionaries."""
+    """Convert tuples to lists, and mappings to dictionaries."""
     if isinstance(value, Mapping):
         return {key: _plain(member) for key, member in value.items()}
     if isinstance(value, list | tuple):

@@ -58,7 +58,7 @@ def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) ->
 
 
 def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
-    """First tick, first row and length of each run of consecutive frames of one clip."""
+    """Find the first tick, first row and length of each run of consecutive frames of one clip."""
     rows = record.rows.astype(np.int64)
     owners = clips_of_rows(clips, rows)
     firsts = np.concatenate(([0], np.flatnonzero((np.diff(rows) != 1) | (np.diff(owners) != 0)) + 1))

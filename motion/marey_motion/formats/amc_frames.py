@@ -131,7 +131,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
 
 @compiled
 def _next_word(text, state):  # type: ignore[no-untyped-def]
-    """The first byte of the next word, counting the lines on the way."""
+    """Find the first byte of the next word, counting the lines on the way."""
     i = state[_POSITION]
     while i < text.size and text[i] <= 32:
         if text[i] == 10 or (text[i] == 13 and not (i + 1 < text.size and text[i + 1] == 10)):
@@ -164,7 +164,7 @@ def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore[no-untyped-def]
-    """Index of the bone named at `text[start:stop]`, tried from `expected` on; -1 when there is none."""
+    """Return the index of the bone named at `text[start:stop]`, searched from `expected` on; -1 if there is none."""
     bones = name_ends.size
     for step in range(bones):
         bone = expected + step

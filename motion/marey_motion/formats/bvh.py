@@ -133,7 +133,7 @@ def _read_frames(
         lines.number = table.ragged_line
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
-            f"{counted(table.ragged_count, 'value')} where the channels need {width}"
+            f"{counted(table.ragged_count, 'value')}; the channels need {width}"
             + ("; the file is cut off in its last line" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )

@@ -34,7 +34,7 @@ class TextLines:
         self.position = len(_BYTE_ORDER_MARK) if data.startswith(_BYTE_ORDER_MARK) else 0
 
     def __iter__(self) -> Iterator[bytes]:
-        """Every further line that is not blank, without surrounding whitespace."""
+        """Yield every further line that is not blank, without surrounding whitespace."""
         while (line := self.next()) is not None:
             if line:
                 yield line

@@ -225,7 +225,7 @@ def _bend_leg(
 
 
 def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, AnyFloats]) -> None:
-    """Lean into speed and turns, shoulders against the legs, a head that looks ahead."""
+    """Pose the trunk: lean into speed and turns, shoulders against the legs, a head that looks ahead."""
     root = moments.root
     forward = moments.settled(root.speeds * np.cos(root.travel_angles))
     bank = style.lean * moments.settled(styles.bank_rad(root.speeds, root.turn_rates))
@@ -245,7 +245,7 @@ def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, Any
 
 
 def _pose_arm(style: GaitStyle, moments: GaitMoments, side: str, sign: int, rotations: dict[str, AnyFloats]) -> None:
-    """Arms that swing against the legs from hanging shoulders; elbows bend with speed."""
+    """Pose an arm that swings against the leg; the elbow bends with speed."""
     speeds = moments.settled(moments.root.speeds)
     swing = style.arm_swing * sign * np.sin(2.0 * np.pi * moments.phases)
     angle = swing * styles.blended(0.38 * eased(speeds / 1.4), 0.55, speeds) - styles.blended(0.04, 0.10, speeds)
@@ -269,13 +269,13 @@ def _shoulder_twist(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
 
 
 def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
-    """A slow wave (n,) between -1 and 1, each with its own period and phase."""
+    """Compute a slow wave (n,) between -1 and 1, each with its own period and phase."""
     period_s = (9.1, 6.7, 4.9)[which]
     return np.asarray(np.sin(2.0 * np.pi * moments.times_s / period_s + style.wander_phases_rad[which]))
 
 
 def _turned(axes: str, *angles: AnyFloats) -> AnyFloats:
-    """Rotations (n, 4) about the axes of the moving frame, in the order written; angles (n,) in radians."""
+    """Compute rotations (n, 4) about the axes of the moving frame, in the order given; angles (n,) in radians."""
     result: AnyFloats = quaternions.identity()
     for axis, angle in zip(axes, angles, strict=True):
         result = quaternions.multiply(result, quaternions.from_axis_angle(np.eye(3)["xyz".index(axis)], angle))

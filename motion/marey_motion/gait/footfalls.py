@@ -243,7 +243,7 @@ class Footfalls:
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
-        """The loaded foot: rolls about the heel, stands, rolls about the ball."""
+        """Compute the foot on the ground: it rolls about the heel, is flat, and rolls about the ball."""
         share = (times_s - self.strikes_s[stance]) / (self.leaves_s - self.strikes_s)[stance]
         landing = 1.0 - eased(share / LANDING_SHARE)
         pushing = np.clip((share - PUSH_OFF_START) / (1.0 - PUSH_OFF_START), 0.0, 1.0)
@@ -266,7 +266,7 @@ class Footfalls:
         return self.lifts_m[np.minimum(stance, len(self.lifts_m) - 1)]
 
     def _swinging(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
-        """The free foot, from the end of `stance` to the beginning of the next."""
+        """Compute the foot in the air, from the end of `stance` to the beginning of the next."""
         following = np.minimum(stance + 1, len(self.strikes_s) - 1)
         duration = self.strikes_s[following] - self.leaves_s[stance]
         share = np.clip((times_s - self.leaves_s[stance]) / np.where(duration > 0.0, duration, 1.0), 0.0, 1.0)
@@ -298,7 +298,7 @@ class Footfalls:
     def _swing_ground(
         self, times_s: AnyFloats, stance: NDArray[np.intp], following: NDArray[np.intp], share: AnyFloats
     ) -> Complexes:
-        """Way of the ball over the floor: a cubic in the root's frame that starts and ends at rest on the floor."""
+        """Compute the path of the ball over the floor: a cubic in the root's frame, at rest at both ends."""
         path = self.cadence.path
         leaving, landing = path.at(self.leaves_s[stance]), path.at(self.strikes_s[following])
         pitches, rates = self._leaving_pitches[stance], self._leaving_pitch_rates[stance]
@@ -320,7 +320,7 @@ def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tup
 
 
 def _cubic(share: AnyFloats, start: Any, start_rate: Any, end: Any, end_rate: Any) -> Any:
-    """Hermite's cubic over `share` in 0 to 1; rates are per unit of `share`."""
+    """Compute Hermite's cubic over `share` in 0 to 1; rates are per unit of `share`."""
     s, r = share, 1.0 - share
     return (
         r * r * (1.0 + 2.0 * s) * start + r * r * s * start_rate + s * s * (3.0 - 2.0 * s) * end - s * s * r * end_rate

@@ -249,14 +249,14 @@ def start_and_stop(
 
 
 def _moment_0(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:
-    """∫ e^(i·turn_rate·s) ds from 0 to `elapsed`."""
+    """Compute ∫ e^(i·turn_rate·s) ds from 0 to `elapsed`."""
     half_angle = 0.5 * turn_rate * elapsed
     result: Complexes = elapsed * np.exp(1j * half_angle) * np.sinc(half_angle / np.pi)
     return result
 
 
 def _moment_1(turn_rate: AnyFloats, elapsed: AnyFloats) -> Complexes:
-    """∫ s·e^(i·turn_rate·s) ds from 0 to `elapsed`."""
+    """Compute ∫ s·e^(i·turn_rate·s) ds from 0 to `elapsed`."""
     angle = np.asarray(turn_rate * elapsed)
     # The closed form cancels to nothing for small angles, where the power series converges in a few terms.
     small = np.abs(angle) < 1.0

@@ -159,7 +159,7 @@ def game_skeleton() -> Skeleton:
 def _both_sides(
     table: Mapping[str, _Bone], tips: Mapping[str, Point], sides: tuple[str, str]
 ) -> tuple[dict[str, tuple[str | None, AnyFloats]], dict[str, AnyFloats]]:
-    """Joints depth first as {name: (parent, position)} and tips as {name: position}, left and mirrored right."""
+    """Return joints depth first as {name: (parent, position)} and tips as {name: position}, left and mirrored right."""
 
     def expanded(name: str) -> list[tuple[str, int, str]]:
         if "{side}" not in name:
@@ -186,7 +186,7 @@ def _both_sides(
 
 
 def _rotation_along(direction: AnyFloats, *, against: bool) -> AnyFloats:
-    """Global rotation whose x axis is `direction` or its opposite and whose y axis is as near to forward as can be."""
+    """Compute the global rotation with x axis along ±`direction` and y axis as close to forward as possible."""
     x = direction / np.linalg.norm(direction) * (-1.0 if against else 1.0)
     hint = (0.0, 1.0, 0.0) if abs(x[2]) > 0.8 else (0.0, 0.0, 1.0)
     y = quaternions.perpendicular(hint, x)
@@ -196,7 +196,7 @@ def _rotation_along(direction: AnyFloats, *, against: bool) -> AnyFloats:
 def _assembled(
     bones: Mapping[str, tuple[str | None, AnyFloats]], tips: Mapping[str, AnyFloats], rotations: Mapping[str, AnyFloats]
 ) -> Skeleton:
-    """A skeleton from global rest positions and global rest rotations."""
+    """Build a skeleton from global rest positions and global rest rotations."""
     index = {name: joint for joint, name in enumerate(bones)}
     offsets, rest_rotations = [], []
     for name, (parent, position) in bones.items():

@@ -321,7 +321,7 @@ def _is_leg(length_m: float) -> bool:
 
 
 def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
-    """Median height of the hips above the ground, in the file's unit; 0 without feet."""
+    """Compute the median height of the hips above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
     return float(np.median(hip_heights(body.positions, body.landmarks, up_axis)))

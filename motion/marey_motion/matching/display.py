@@ -100,7 +100,9 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 def _inertialised(
     database: MatchingDatabase, rows: NDArray[np.int32], joints: NDArray[np.int64], half_life_s: float
 ) -> tuple[Floats, Floats]:
-    """Displayed poses (T, 3 + 4·K) of K joints in the frame of the root, and local translations (T, M, 3) of theirs."""
+    """Compute displayed poses (T, 3 + 4·K) of K joints in the frame of the root, and their local translations (T, M,
+    3).
+    """
     from marey_motion.matching import display_kernels
 
     rate_hz = database.options.rate_hz

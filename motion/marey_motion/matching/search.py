@@ -161,7 +161,7 @@ def _by_sixteen(count: int) -> NDArray[np.int32]:
 
 
 def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Sides (K, D') as sixteens (M, D', 2, 16), each of which begins at one of starts (M + 1,)."""
+    """Compute the sides (K, D') of boxes in groups of sixteen (M, D', 2, 16), which begin at the starts (M + 1,)."""
     lanes = np.minimum(starts[:-1, None] + np.arange(_SIXTEEN), starts[1:, None] - 1)
     return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))
 

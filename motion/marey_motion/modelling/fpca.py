@@ -133,7 +133,9 @@ def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: I
 def _inner_products(
     basis: SplineBasis, deviations: Floats, mean: Floats, weights: Floats, inner_product: InnerProduct
 ) -> tuple[Floats, float]:
-    """Inner products (m, m) of weighted deviations (m, n, D), and the size of all examples, with their mean (n, D)."""
+    """Compute the inner products (m, m) of weighted deviations (m, n, D), the size of all examples, and their mean (n,
+    D).
+    """
     weighted, weighted_mean = deviations * weights, mean * weights
     if inner_product == "l2":
         root = np.linalg.cholesky(basis.products).T
@@ -144,7 +146,7 @@ def _inner_products(
 
 
 def _decompose(products: Floats, size: float) -> tuple[Floats, Floats]:
-    """Singular values (r,), falling, and left singular vectors (m, r) of examples with inner products (m, m)."""
+    """Compute singular values (r,), descending, and left singular vectors (m, r) from inner products (m, m)."""
     squares, vectors = np.linalg.eigh(products)
     lengths = np.sqrt(np.maximum(squares[::-1], 0.0))
     floor = max(SMALLEST_RELATIVE_DEVIATION * float(lengths[0]), SMALLEST_RELATIVE_SPREAD * size)

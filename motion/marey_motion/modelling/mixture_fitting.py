@@ -180,7 +180,7 @@ class _Fitting:
         raise ModelError("one component is always possible")
 
     def _held_out(self, count: int) -> Floats | None:
-        """ln p of each example under a mixture of `count` components fitted without its fold."""
+        """Compute ln p of each example under a mixture of `count` components fitted without the example's fold."""
         examples = len(self.latents)
         if self.options.folds < LEAST_FOLDS or examples <= self.options.folds:
             return None

@@ -109,7 +109,7 @@ def comparison_frames(basis: SplineBasis) -> NDArray[np.int64]:
 
 
 def _left_out(scores: Floats, example: int, count: int) -> Floats:
-    """Scores (count, r) of an example's reconstruction by 0, 1, ... components of the others."""
+    """Compute the scores (count, r) of an example's reconstruction by 0, 1, ... components of the other examples."""
     examples = len(scores)
     own = scores[example]
     if examples < 2:

@@ -194,7 +194,7 @@ class _PosedBody:
     rotations: Floats
 
     def way(self, start: str, end: str) -> Floats | None:
-        """Unit directions (K, 3) between standard joints; zero where they coincide, None where one is not mapped."""
+        """Compute unit directions (K, 3) between standard joints; zero if they coincide, None if one is not mapped."""
         if start not in self.joints or end not in self.joints:
             return None
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
@@ -291,7 +291,7 @@ def _part(standard: str) -> str:
 
 
 def _twist(standard: str, body: _PosedBody) -> Floats:
-    """Unit direction (3,) of a joint's bone in its frame."""
+    """Compute the unit direction (3,) of a joint's bone in its frame."""
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     for target in _TOWARDS.get(joint, ()):
@@ -310,7 +310,7 @@ def _twist(standard: str, body: _PosedBody) -> Floats:
 
 
 def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
-    """Offset (3,) of the farthest child or end site that can be the end of the joint's bone."""
+    """Return the offset (3,) of the farthest child or end site that can be the end of the joint's bone."""
     ends = [skeleton.offsets[child] for child in skeleton.children[joint]]
     ends += [site.offset for site in skeleton.end_sites if site.joint == joint]
     # The joint's own offset is short where it lies just below an ankle.
@@ -321,7 +321,7 @@ def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
 
 
 def _swing(standard: str, body: _PosedBody) -> Floats:
-    """Global directions (K, 3) whose mean in the joint's frame is its swing axis."""
+    """Compute global directions (K, 3) whose mean in the joint's frame is its swing axis."""
     side, _, joint = standard.partition("_")
     if side not in SIDES:
         if standard in ("spine_2", "neck", "head"):

@@ -147,19 +147,19 @@ def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
 
 
 def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
-    """Cosine between two bones in the rest pose."""
+    """Compute the cosine of the angle between two bones in the rest pose."""
     positions = skeleton.rest_global_positions
     return float(unit(positions[b] - positions[a]) @ unit(positions[c] - positions[b]))
 
 
 def _branches(tree: BoneTree, joint: int) -> list[int]:
-    """Children without those that are small beside the largest."""
+    """Return the children without those whose subtree is small compared with the largest."""
     extents = {child: tree.extent(child) for child in tree.skeleton.children[joint]}
     return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
 
 
 def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int]) -> Floats | None:
-    """Cross up with the direction of the feet, in the rest pose; None where that pose is too degenerate."""
+    """Compute the cross product of up and the direction of the feet in the rest pose; None if that is degenerate."""
     positions = skeleton.rest_global_positions
     up = positions[joints.get("head", joints["pelvis"])] - positions[joints["pelvis"]]
     forward = sum((_foot(skeleton, legs.joint(side, 2), legs.joint(side, 3)) for side in range(2)), start=np.zeros(3))

@@ -61,7 +61,7 @@ def _alternatives(names: Names) -> tuple[str, ...]:
 
 
 def _fingers(pattern: str, fingers: tuple[str, ...], levels: tuple[str, ...]) -> dict[str, Names]:
-    """Templates of thumb and fingers, from a pattern with <finger> and <level>; the last levels may be missing."""
+    """Build templates of thumb and fingers from a pattern with <finger> and <level>; the last levels are optional."""
     named = zip(("thumb", *(f"{finger}_finger" for finger in FINGERS)), fingers, strict=True)
     return {
         f"{standard}_{part}": pattern.replace("<finger>", finger).replace("<level>", level)
@@ -76,7 +76,7 @@ def _finger_roots(pattern: str, fingers: tuple[str, ...]) -> dict[str, Names]:
 
 
 def _everyday_fingers() -> dict[str, Names]:
-    """Thumb and fingers numbered (Index1, HandIndex1, Index01) or by their bones, as Unity and VRM have them."""
+    """Build templates of fingers numbered (Index1, HandIndex1, Index01) or named by bones, as in Unity and VRM."""
     bones = {"base": ("1", "Proximal"), "mid": ("2", "Intermediate", "Medial"), "tip": ("3", "Distal")}
     thumb = {"base": ("1", "Metacarpal", "Proximal"), "mid": ("2", "Intermediate"), "tip": ("3", "Distal")}
     words = {

@@ -70,7 +70,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: str = "", grid: bool = True) -> Axes:
-    """Axes at a place, in the house's look, with their labels."""
+    """Add labelled axes at a place, in the common style."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height), facecolor="none")
@@ -126,7 +126,7 @@ def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others
 
 
 def tick_whole_numbers(axis: Axis) -> None:
-    """Ticks at whole numbers only, of what is counted."""
+    """Put ticks at whole numbers only, for axes of counts."""
     from matplotlib.ticker import MaxNLocator
 
     axis.set_major_locator(MaxNLocator(nbins="auto", integer=True, steps=[1, 2, 5, 10]))
@@ -208,7 +208,7 @@ def warm_colours() -> Colormap:
 
 
 def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
-    """Ticks for a colour bar whose colours follow the square root of the value, which is 0 to `ceiling`."""
+    """Return ticks for a colour bar whose colours follow the square root of the value, from 0 to `ceiling`."""
     return ceiling * np.array((0.0, 0.05, 0.25, 0.5, 1.0))
 
 
@@ -221,7 +221,7 @@ def nice_levels(largest: float) -> NDArray[np.float64]:
 
 
 def luminance(colours: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Relative luminance in [0, 1] of sRGB colours (..., 3 or 4), to choose the text on them."""
+    """Compute the relative luminance in [0, 1] of sRGB colours (..., 3 or 4), to choose the colour of text."""
     linear = np.where(
         colours[..., :3] <= 0.04045, colours[..., :3] / 12.92, ((colours[..., :3] + 0.055) / 1.055) ** 2.4
     )

@@ -122,7 +122,7 @@ class _StripCell:
 def _scale(
     body: StickFigure, rows: Sequence[StripRow], moments: StripMoments, camera: Camera, cell_in: tuple[float, float]
 ) -> float:
-    """Inches per metre: the highest point fits, and most figures fit from side to side."""
+    """Compute the scale in inches per metre at which the highest point fits, and most figures fit from side to side."""
     middles = np.stack((moments.middles[:, 0], np.zeros(len(moments.middles)), moments.middles[:, 1]), axis=1)
     drawn = np.unique(np.append(body.bones, body.pelvis))
     seen = np.concatenate([camera.seen(row.bodies[:, :, drawn] - middles[:, None]).reshape(-1, 3) for row in rows])
@@ -132,7 +132,7 @@ def _scale(
 
 
 def _label_width(rows: Sequence[StripRow]) -> float:
-    """Inches that the labels take."""
+    """Compute the width in inches of the labels."""
     longest = max([0, *(max(1.15 * len(row.label), 0.9 * len(row.note)) for row in rows)])
     return 0.2 + 0.078 * longest
 

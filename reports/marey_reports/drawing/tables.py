@@ -82,5 +82,5 @@ def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:
 
 
 def folded(summary: str, content: Content) -> Html:
-    """Something that is opened by a click."""
+    """Return HTML that shows its content after a click."""
     return element("details", element("summary", summary), content)

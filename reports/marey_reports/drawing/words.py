@@ -9,7 +9,7 @@ def span(low: float, high: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Seconds, or minutes and seconds."""
+    """Write a duration in seconds, or in minutes and seconds."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)

@@ -13,7 +13,7 @@ DIGESTS = ("dataset", "normaliser", "options", "scenarios")
 
 
 def provenance(results: Sequence[EvaluationResult], labels: Sequence[str]) -> Html:
-    """Digests, versions and options of one result, or of two beside each other with what differs marked."""
+    """Write digests, versions and options of one result, or of two side by side with their differences marked."""
     heads = ("what", *labels)
     digests = [_row(name, [getattr(result.provenance, name) for result in results], code=True) for name in DIGESTS]
     versions = _row("version of the code", [result.provenance.code_version for result in results], code=True)
@@ -48,7 +48,7 @@ def _row(name: str, values: Sequence[str], *, code: bool) -> list[Cell]:
 
 
 def _flat(prefix: str, value: object) -> Iterator[tuple[str, str]]:
-    """Options as names with dots and texts."""
+    """Return options as text by dotted name."""
     if isinstance(value, Options):
         for name, member in value:
             yield from _flat(f"{prefix}.{name}" if prefix else name, member)

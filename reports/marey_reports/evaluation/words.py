@@ -74,7 +74,7 @@ def _centres(edges: Floats) -> Floats:
 
 
 def _runs(lacking: NDArray[np.bool_], sides: Floats) -> list[tuple[int, int]]:
-    """First and last of each run of lacking cells that lie on one side."""
+    """Find the first and last cell of each run of cells without data on one side."""
     runs: list[tuple[int, int]] = []
     for column in np.flatnonzero(lacking).tolist():
         if runs and runs[-1][1] == column - 1 and sides[column] == sides[column - 1]:

@@ -58,7 +58,7 @@ _NUMBERS = (
 
 
 def definitions() -> Html:
-    """Words, then numbers; and whose method this is."""
+    """Write the definitions of terms and numbers, and the references of the method."""
     return joined(
         (
             table("Words", ("word", "meaning"), _WORDS, numbers=(), sortable=False),

@@ -141,5 +141,5 @@ class AnnotationImport(Request):
 
 
 def command_arguments(command: Request) -> dict[str, Any]:
-    """Parameters of a command."""
+    """Return the parameters of a command."""
     return command.model_dump(exclude={"command"})

@@ -58,15 +58,15 @@ class _Layout:
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
-        """The number of frames in a block."""
+        """Return the number of frames in a block."""
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
 
     def group(self, index: int) -> slice:
-        """The number of columns in a group of tiles."""
+        """Return the number of columns in a group of tiles."""
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:
-        """The number of columns of a group before its first quaternion; None if the shape excludes quaternions.
+        """Return the number of columns of a group before its first quaternion; None if the shape excludes quaternions.
 
         Poses have 3 + 4k columns, a translation and a quaternion per joint; rotations have a last axis of four.
         """

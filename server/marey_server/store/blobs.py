@@ -234,7 +234,7 @@ def require_readable(tx: Transaction, digest: str) -> int:
 
 
 def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, int]:
-    """Sizes of blobs in bytes, by digest. Raises `NotFoundProblem` where there is one that the caller may not read."""
+    """Return the sizes of blobs in bytes, by digest. Raises `NotFoundProblem` if the caller may not read one."""
     allowed = readable(tx, digests)
     sizes: dict[str, int] = {}
     for some in _batched(allowed):

@@ -118,7 +118,7 @@ def test_annotations_are_made_corrected_and_exchanged_from_the_command_line(
         {"label": "e", "start": 50, "end": 110},
     ]
     refused = run("annotation", "split", place, 300, status=1)
-    assert "frame 300: no segment holds this frame" in refused.stderr
+    assert "frame 300: no segment contains this frame" in refused.stderr
 
     file = run("annotation", "export", place, "-o", "out", "--end-index", "exclusive").stdout.strip()
     written = json.loads((tmp_path / file).read_text(encoding="utf-8"))

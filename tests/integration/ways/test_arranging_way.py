@@ -90,7 +90,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run, lab):
         (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot move into itself"),
         (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),
         (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: confirm with --yes"),
-        (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is named, too"),
+        (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is given, too"),
         (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is given twice"),
         (["rm", "lab/raw/a/", "--yes"], 2, "there is nothing at lab/raw/a"),
         (["restore", "lab/raw/a"], 2, "there is nothing deleted at lab/raw/a; marey ls --deleted lab shows"),

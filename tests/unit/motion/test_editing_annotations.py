@@ -40,7 +40,7 @@ def test_a_segment_is_not_split_before_its_first_frame():
 
 
 def test_a_new_segment_over_others_is_refused_by_the_name_of_the_first_in_the_way():
-    with pytest.raises(AnnotationError, match=r"'turn' 16:24: segment 'right' 10:18 has some of its frames"):
+    with pytest.raises(AnnotationError, match=r"'turn' 16:24: segment 'right' 10:18 overlaps it"):
         annotations.create_segment(WALK, "turn", 16, 24, overwrite=False)
 
 
@@ -102,7 +102,7 @@ def test_a_boundary_does_not_pass_the_other_end_of_its_segment():
 def test_segments_are_relabelled_and_removed_by_any_of_their_frames():
     assert annotations.relabel_segment(WALK, 9, "swing").segments[0] == Segment("swing", 5, 10)
     assert annotations.remove_segment(WALK, 29).segments == WALK.segments[:2]
-    with pytest.raises(AnnotationError, match="frame 20: no segment holds this frame") as refused:
+    with pytest.raises(AnnotationError, match="frame 20: no segment contains this frame") as refused:
         annotations.remove_segment(WALK, 20)
     assert refused.value.code == "no-segment"
 
@@ -136,7 +136,7 @@ def test_what_was_cleared_is_empty():
 
 
 def test_a_layer_cannot_hold_overlapping_segments():
-    with pytest.raises(AnnotationError, match=r"'b' 4:6: segment 'a' 0:5 has some of its frames") as refused:
+    with pytest.raises(AnnotationError, match=r"'b' 4:6: segment 'a' 0:5 overlaps it") as refused:
         Layer(FRAMES, (Segment("b", 4, 6), Segment("a", 0, 5)))
     assert refused.value.code == "segments-overlap"
 
@@ -144,7 +144,7 @@ def test_a_layer_cannot_hold_overlapping_segments():
 def test_a_piece_knows_its_own_segment_and_the_keyframes_within_it():
     piece = piece_of(WALK, WALK.segments[1], 6, 20)
     assert piece == Layer(14, (Segment("right", 4, 12),), (Keyframe("lift", 7), Keyframe("strike", 7)))
-    with pytest.raises(AnnotationError, match="the frames 11:20 of 30 do not hold it"):
+    with pytest.raises(AnnotationError, match="the frames 11:20 of 30 do not contain it"):
         piece_of(WALK, WALK.segments[1], 11, 20)
 
 

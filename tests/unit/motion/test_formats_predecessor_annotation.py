@@ -72,7 +72,7 @@ def test_sections_that_share_their_ends_are_refused_with_a_hint():
 
 def test_labels_that_overlap_can_be_read_one_by_one():
     document = {"semantic_annotation": {"left": [1, 2, 3], "both": [3, 4]}}
-    with pytest.raises(FormatError, match="has some of its frames") as refused:
+    with pytest.raises(FormatError, match="overlaps it") as refused:
         read(document)
     assert refused.value.code == "segments-overlap"
     assert read(document, labels=["both"]).segments == (Segment("both", 3, 5),)
@@ -87,7 +87,7 @@ def test_labels_that_overlap_can_be_read_one_by_one():
         ({"sections": {"a": {"start_idx": 1}}}, "'a' must be list"),
         ({"sections": "{"}, "'sections' cannot be read"),
         ({"sections": [{"start_idx": 1, "end_idx": 99}]}, "the clip has the frames 0:40"),
-        ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "its end must lie after its start"),
+        ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "its end must be after its start"),
         ({"semantic_annotation": {"a": [1.5]}}, "whole numbers"),
         ({"semantic_annotation": {"a": ["x"]}}, "'a'"),
         ({"semantic_annotation": {"a": [True]}}, "list of frames"),

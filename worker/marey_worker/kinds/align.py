@@ -192,9 +192,9 @@ class _Job:
         if len(known) != 1:
             layers = ", ".join(sorted({one.annotation.layer for one in known}))
             raise MotionError(
-                f"it has {len(known)} annotations to go by (layers: {layers}); name one layer"
+                f"it has {len(known)} suitable annotations (layers: {layers}); name one layer"
                 if known
-                else "none of the annotations is of this clip" + self._of_layer(),
+                else "none of the annotations belongs to this clip" + self._of_layer(),
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known

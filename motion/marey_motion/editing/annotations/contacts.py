@@ -72,7 +72,7 @@ def _stances(speed: Floats, frame_rate_hz: float, options: ContactOptions) -> li
 
 
 def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool_]:
-    """True (F,) from where the values fall below `low` until they rise above `high`."""
+    """Compute a mask (F,) that is true from where the values fall below `low` until they rise above `high`."""
     decided = (values < low) | (values > high)
     latest = np.maximum.accumulate(np.where(decided, np.arange(len(values)), -1))
     return np.asarray(np.where(latest >= 0, values[latest] < low, values < high))

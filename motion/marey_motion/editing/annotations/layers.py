@@ -65,7 +65,7 @@ class Layer:
     def _index_at(self, frame: int) -> int:
         index = bisect_right(self.segments, frame, key=_start) - 1
         if index < 0 or frame >= self.segments[index].end:
-            raise AnnotationError("no segment holds this frame", code="no-segment", where=f"frame {frame}")
+            raise AnnotationError("no segment contains this frame", code="no-segment", where=f"frame {frame}")
         return index
 
     def _among(self, start: int, end: int) -> tuple[int, int]:
@@ -124,7 +124,7 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     first, stop = layer._among(start, end)
     covered = layer.segments[first:stop]
     if covered and not overwrite:
-        raise _wrong(made, "segments-overlap", f"{covered[0]} has some of its frames; overwrite, or move it first")
+        raise _wrong(made, "segments-overlap", f"{covered[0]} overlaps it; set overwrite, or move that segment first")
     _require_segments((made,), layer.frame_count)  # what is no segment must not cut others
     before = [one._replace(end=start) for one in covered if one.start < start]
     after = [one._replace(start=end) for one in covered if one.end > end]
@@ -389,7 +389,7 @@ def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
     Layer    with frames counted from `start`
     """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
-        raise _wrong(segment, "outside-clip", f"the frames {start}:{end} of {layer.frame_count} do not hold it")
+        raise _wrong(segment, "outside-clip", f"the frames {start}:{end} of {layer.frame_count} do not contain it")
     return Layer(
         end - start,
         (Segment(segment.label, segment.start - start, segment.end - start),),
@@ -418,12 +418,12 @@ def _require_segments(segments: Sequence[Segment], frame_count: int) -> None:
     for segment in segments:
         _require_label(segment.label, str(segment))
         if segment.end <= segment.start:
-            raise _wrong(segment, "empty-segment", "its end must lie after its start")
+            raise _wrong(segment, "empty-segment", "its end must be after its start")
         if segment.start < 0 or segment.end > frame_count:
             raise _wrong(segment, "outside-clip", f"the clip has the frames 0:{frame_count}")
     for before, after in pairwise(segments):
         if after.start < before.end:
-            raise _wrong(after, "segments-overlap", f"{before} has some of its frames")
+            raise _wrong(after, "segments-overlap", f"{before} overlaps it")
 
 
 def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:

@@ -134,7 +134,7 @@ class _Travel(NamedTuple):
         return cls(ground[:, body.hips], ground[:, list(body.feet)], heading, clip.frame_rate_hz)
 
     def is_step(self, step: _Step, options: StepsProposal) -> bool:
-        """Whether the movement is one step ahead and not a turn."""
+        """Return whether the movement is one step forward and not a turn."""
         if not options.shortest_s <= (step.end - step.start) / self.frame_rate_hz <= options.longest_s:
             return False
         way = self.hips[step.end] - self.hips[step.start]

@@ -293,10 +293,12 @@ def solve_two_bone(
 
     targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
     if limb_targets(targets, limb) is None:
-        raise EditError("the targets must be of the limb's end, the position in all axes", where="targets")
+        raise EditError("all targets must be for the end of the limb, and the position in all axes", where="targets")
     path = skeleton.path_to_root(limb.end)
     if not {limb.middle, limb.start} <= set(path) or not limb.start < limb.middle < limb.end:
-        raise EditError("start, middle and end must hang from one another", code="chain-invalid", where="limb")
+        raise EditError(
+            "start, middle and end must be a chain of joints from the root outwards", code="chain-invalid", where="limb"
+        )
     problem = pose_problem(skeleton, motion, targets, Freedom(limb.joints))
     found = problem.found
     _measure(problem, options, found.before, found)

@@ -241,7 +241,9 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
     path = skeleton.path_to_root(effector)
     if top not in path:
         names = skeleton.joint_names
-        raise EditError(f"{names[effector]} does not hang from {names[top]}", code="chain-invalid", where=names[top])
+        raise EditError(
+            f"{names[effector]} is not a descendant of {names[top]}", code="chain-invalid", where=names[top]
+        )
     return path[: path.index(top) + 1]
 
 

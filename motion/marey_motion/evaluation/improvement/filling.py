@@ -188,7 +188,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Deficit of each cell with `seconds` of data; half a frame is rounding."""
+    """Compute the deficit of each cell with `seconds` of data; half a frame is ignored as rounding."""
     left = np.maximum(missing - seconds, 0.0)
     left[left < 0.5 / options.database.rate_hz] = 0.0
     return left

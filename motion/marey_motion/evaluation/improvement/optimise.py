@@ -194,7 +194,7 @@ class _Search:
         return candidates
 
     def _additions(self, absent: Sources) -> list[str]:
-        """Absent sources that fit into the budget of data, those first that fill most of what is lacking."""
+        """List absent sources that fit into the budget of data, sorted by how much of the deficit they fill."""
         limit = self._options.max_data_s
         room = np.inf if limit is None else limit - self._simulation.seconds(absent)
         fitting = [source for source in sorted(absent) if self._simulation.seconds_of(source) <= room]

@@ -110,7 +110,7 @@ def _redundant_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
-    """Cells without a value have 0 there, and 0 in `measured` or fewer than two in `sources`."""
+    """Convert to plain values; cells without a value get 0, and are marked by `measured` 0 or `sources` below 2."""
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
     return {name: np.nan_to_num(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
@@ -134,7 +134,7 @@ def optimisation_to_tree(optimisation: Optimisation) -> Tree:
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses as dictionaries, tuples as lists."""
+    """Convert dataclasses to dictionaries, and tuples to lists."""
     if hasattr(value, "__dataclass_fields__"):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):

@@ -148,7 +148,7 @@ def _needed(
 
 
 def _gaps(needed: NDArray[np.bool_], before: int, after: int, least: int) -> list[tuple[int, int]]:
-    """Half-open ranges of at least `least` frames beyond the margins about every needed frame."""
+    """Find half-open ranges of at least `least` frames that are outside the margins of every needed frame."""
     count = len(needed)
     edges = np.zeros(count + 1, dtype=np.int64)
     frames = np.flatnonzero(needed)

@@ -141,7 +141,7 @@ def write_predecessor_annotation(
 
 
 def _parsed(text: str, file: str) -> Any:
-    """Sections that stand as a text in the document."""
+    """Parse sections that are stored as text in the document."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -168,7 +168,7 @@ def _section(section: Any, label: str, end_index: EndIndex, file: str) -> Segmen
 
 
 def _frames_by_label(by_label: Mapping[str, Any], file: str) -> list[Segment]:
-    """Unbroken runs of each label's frames."""
+    """Group frames by label into contiguous runs."""
     found: list[Segment] = []
     for label, given in by_label.items():
         frames = np.unique(np.array(_frames(given, label, file), dtype=np.int64))

@@ -284,7 +284,7 @@ def _constant_speed(frames: int) -> PredecessorTime:
 
 
 def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Floats, Floats]:
-    """Basis, mean (n, D) and components (k, n, D) of space or time."""
+    """Read basis, mean (n, D) and components (k, n, D) of the spatial or temporal functions."""
     basis = _basis(part, what, file)
     start, stop = basis.span
     if start != 0.0 or abs(stop - round(stop)) > 1e-6 or stop < 2.0:
@@ -421,7 +421,7 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
 
 
 def _numbers(values: Any, file: str, name: str) -> Floats:
-    """Nested lists as an array; what is made of numbers that no body has could not be computed with."""
+    """Convert nested lists to an array. Raises `FormatError` for numbers too large for a motion of a body."""
     numbers = number_array(values, file, name)
     if np.abs(numbers).max(initial=0.0) > LARGEST:
         raise FormatError(f"field {name!r} holds numbers beyond {LARGEST:g}", code="bad-number", file=file)
@@ -429,7 +429,7 @@ def _numbers(values: Any, file: str, name: str) -> Floats:
 
 
 def _variances(mixture: LatentMixture) -> Floats:
-    """Variance (L,) of each number of the latent vectors."""
+    """Compute the variance (L,) of each number of the latent vectors."""
     mean = mixture.weights @ mixture.means
     squares = np.diagonal(mixture.covariances, axis1=1, axis2=2) + mixture.means**2
     return np.asarray(np.maximum(mixture.weights @ squares - mean**2, 0.0))

@@ -171,10 +171,7 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
-    """Temporal parts (m, k) of latent vectors that the model draws, and their time functions (m, N).
-
-    What keeps a model's motions within its examples' range would bend the linear function that is fitted.
-    """
+    """Draw temporal parts (m, k) of latent vectors from the model, and compute their time functions (m, N)."""
     free = replace(primitive, duration_range_s=None, log_slope_range=None)
     latents = free.sample(DRAWN, SEED)
     return latents[:, free.spatial.count :], free.time_functions(latents)
@@ -200,7 +197,7 @@ def _basis_over(steps: int) -> SplineBasis:
 
 
 def _spline_fit(basis: SplineBasis, values: Floats) -> Floats:
-    """Coefficients (m, n) of functions with values (m, N) at each canonical frame, by systems of few diagonals."""
+    """Fit the coefficients (m, n) of functions with values (m, N) at each canonical frame, by banded systems."""
     from scipy.interpolate import make_interp_spline, make_lsq_spline
 
     frames = np.arange(values.shape[1], dtype=np.float64)

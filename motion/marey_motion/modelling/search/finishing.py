@@ -72,7 +72,7 @@ def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMappi
 
 
 def _axes_if_known(found: FoundMotion, mapping: JointMapping) -> dict[str, JointAxes] | None:
-    """Axes of the mapped joints by name; None where the mapping does not suffice for them."""
+    """Return the axes of the mapped joints by name; None if the mapping is not sufficient to compute them."""
     try:
         return guess_axes(found.skeleton, mapping, found.motion.as_clip(found.skeleton, found.frame_rate_hz))
     except MappingError:

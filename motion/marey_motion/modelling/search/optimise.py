@@ -151,7 +151,7 @@ class _Prior:
         return -self._weight * sum(float(mixture.log_density(stacked[None, part])[0]) for mixture, part in pairs)
 
     def quadratic(self, stacked: Floats) -> _Quadratic:
-        """JᵀJ and Jᵀr of the residuals of the most likely components."""
+        """Compute JᵀJ and Jᵀr of the residuals of the most likely components."""
         curvature, gradient = np.zeros((len(stacked), len(stacked))), np.zeros(len(stacked))
         for mixture, part in zip(self._mixtures, self._parts, strict=True):
             likeliest = int(np.argmax(mixture.component_log_densities(stacked[None, part])[0]))
@@ -163,7 +163,7 @@ class _Prior:
 
 
 def _precisions(mixture: LatentMixture) -> Floats:
-    """Inverse variance (L,) of each number; steps are damped in proportion, so that units do not matter."""
+    """Compute the inverse variance (L,) of each number, to which the damping is proportional."""
     centre = mixture.weights @ mixture.means
     spread = np.diagonal(mixture.covariances, axis1=1, axis2=2) + (mixture.means - centre) ** 2
     return np.asarray(1.0 / (mixture.weights @ spread))

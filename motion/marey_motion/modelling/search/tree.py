@@ -156,7 +156,7 @@ def feature_frames(primitive: MotionPrimitive) -> list[float]:
 def _features(
     primitive: MotionPrimitive, samples: Floats, options: TreeOptions, end_effectors: Sequence[int]
 ) -> Floats:
-    """(n, D) what is clustered."""
+    """Compute the features (n, D) of samples by which they are clustered."""
     if options.features == "latent":
         return np.ascontiguousarray(samples[:, : primitive.spatial.count])
     if not end_effectors:

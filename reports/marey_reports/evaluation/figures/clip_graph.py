@@ -76,7 +76,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
 
 
 def _popularity(subject: Subject, trial: str | None) -> dict[str, Ints]:
-    """Ticks of every frame, by clip."""
+    """Count the ticks of every frame, by clip."""
     return {subject.result.clips[usage.clip].uid: usage.popularity for usage in subject.usage(trial)}
 
 
@@ -137,7 +137,7 @@ def _per_dot(popularity: Ints, circle: Circle) -> Ints:
 
 
 def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tuple[float, float]) -> None:
-    """Limits that hold all circles and their names, at one scale in both directions."""
+    """Compute axis limits that contain all circles and their names, at one scale in both directions."""
     reach = max([1.0, *(float(np.linalg.norm(circle.centre)) + circle.radius for circle in circles.values())])
     aside = 0.2 + longest_name * LETTER_IN
     above = aside if len(circles) > RADIAL_NAMES else 0.4
@@ -184,7 +184,7 @@ def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], m
 
 
 def _labels(subjects: Sequence[Subject], uids: Collection[str], longest: int) -> list[dict[str, str]]:
-    """Per subject the labels of its clips; a clip has the same one everywhere."""
+    """Return the labels of the clips of each subject; a clip has the same label in all figures."""
     held = [{clip.uid: clip.name for clip in subject.result.clips if clip.uid in uids} for subject in subjects]
     names = {uid: name for each in reversed(held) for uid, name in each.items()}
     labels = dict(zip(names, labels_of(list(names.values()), longest), strict=True))

@@ -94,7 +94,7 @@ def _ring(radii: Floats) -> Floats:
 
 
 def _dots(frames: Sequence[int]) -> Ints:
-    """Dots per circle: one per frame while they fit, else as many as its share of all frames earns."""
+    """Compute the number of dots per circle: one per frame if they fit, else a number proportional to its frames."""
     counts = np.asarray(frames, dtype=np.float64)
     earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
     return np.asarray(np.maximum(1, np.minimum(counts, earned)), dtype=np.int64)

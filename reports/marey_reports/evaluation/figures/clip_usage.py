@@ -40,7 +40,7 @@ class _Use(NamedTuple):
 
 
 def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Bars for the most used clips, one for the others, one for transitions; of the suite, or of one trial."""
+    """Draw bars for the most used clips, one for the others, and one for transitions, for the suite or one trial."""
     uses = [_use(subject, trial) for subject in subjects]
     order = _order(uses)
     shown, others = order[: options.most_clips], order[options.most_clips :]

@@ -64,7 +64,7 @@ def draw_points(subjects: Sequence[Subject], _trial: str | None, options: Figure
 
 
 def _choose(subjects: Sequence[Subject], most_clips: int) -> list[_Points]:
-    """Windows at even intervals of the whole, and the clips with most data of all, which get a look of their own."""
+    """Select windows at even intervals, and the clips with most data, which get their own colour and marker."""
     held: dict[str, int] = {}
     for subject in subjects:
         for clip, windows in enumerate(np.bincount(subject.result.coverage.clip).tolist()):
@@ -103,7 +103,7 @@ def _draw(panel: Axes, subject: Subject, points: _Points, styles: dict[str, int]
 
 
 def _look(style: int) -> dict[str, Any]:
-    """Neighbours differ in colour and in marker."""
+    """Return colour and marker of a clip; neighbours differ in both."""
     row = style // len(COLOURS)
     return {"c": COLOURS[style % len(COLOURS)], "marker": MARKERS[(style + row) % len(MARKERS)]}
 

@@ -76,7 +76,7 @@ DIRECTIONS = _Plane(
 
 
 def draw_density(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Figure 6: over turn rate and speed."""
+    """Draw the density of the data over turn rate and speed (Figure 6)."""
     return _draw(subjects, SPEEDS)
 
 
@@ -124,7 +124,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
 
 
 def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
-    """Edges of the fine cells along both axes: the grid of trials and the windows, but for a few far ones."""
+    """Compute the edges of the fine cells along both axes, which contain all trials and all but a few windows."""
     spans = []
     for axis, values in enumerate((plane.x, plane.y)):
         found = np.concatenate([values(subject.result.coverage) for subject in subjects])

@@ -68,7 +68,7 @@ def _field(subject: Subject, family: str) -> _Field:
 
 
 def _largest(field: _Field) -> float:
-    """Offset or change of it, whatever its sign; 0 where nothing is known."""
+    """Compute the largest absolute offset or change of it; 0 if none is known."""
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
@@ -122,7 +122,7 @@ def _draw_two(
 
 
 def _change(before: _Field, after: _Field) -> _Field:
-    """after - before on the grid points that both have."""
+    """Compute after - before on the grid points that both results have."""
     turn_rates = np.intersect1d(before.turn_rates_deg_s, after.turn_rates_deg_s)
     speeds = np.intersect1d(before.speeds_m_s, after.speeds_m_s)
     first, second = (
@@ -141,7 +141,7 @@ def _draw_field(
     levels: Floats,
     colours: str,
 ) -> Any:
-    """Filled contours and one dot per trial; dots alone where trials span no area. None for no trials."""
+    """Draw filled contours and one dot per trial; only dots if the trials span no area. Return None without trials."""
     panel = add_panel(figure, place, title=title, grid=False, **labels)
     known = np.isfinite(field.offset_m)
     if not known.any():

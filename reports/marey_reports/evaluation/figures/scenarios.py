@@ -24,12 +24,12 @@ NUMBER_PLACES = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)
 
 
 def draw_circle(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Figure 4a: one speed throughout."""
+    """Draw a trial with one speed throughout (Figure 4a)."""
     return _draw(subjects, trial, "circle")
 
 
 def draw_switching(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Figure 4b: the speed switches from section to section."""
+    """Draw a trial whose speed switches from section to section (Figure 4b)."""
     return _draw(subjects, trial, "switching")
 
 
@@ -62,7 +62,7 @@ def _followed(subject: Subject, trial: Trial) -> Floats | None:
 
 
 def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, float]]:
-    """First and end tick of each section and its speed; the first is the approach."""
+    """Return first and end tick of each section and its speed; the first section is the approach."""
     bounds = [0.0, trial.approach_s]
     end_s = ticks / rate_hz
     if trial.family == "switching":

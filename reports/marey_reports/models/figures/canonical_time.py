@@ -18,7 +18,7 @@ LONGEST_LABEL = 24
 
 
 def percents(frame_count: int) -> NDArray[np.float64]:
-    """Canonical frames (N,) as percent of canonical time."""
+    """Convert canonical frames (N,) to percent of canonical time."""
     return np.linspace(0.0, 100.0, frame_count)
 
 

@@ -39,7 +39,7 @@ FARTHEST = 20.0
 
 
 def draw_latent_space(subject: ModelSubject) -> Sketch | None:
-    """Examples, samples and the mixture in pairs of latent dimensions; None where there are none."""
+    """Draw examples, samples and the mixture in pairs of latent dimensions; return None if there are none."""
     primitive = subject.primitive
     pairs = _pairs(primitive.spatial.count, primitive.temporal.count)
     if not pairs:

@@ -108,7 +108,7 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
-    """Evenly spaced canonical frames; a keyframe takes the place of the one that is nearest to it."""
+    """Choose evenly spaced canonical frames; a keyframe replaces the nearest of them."""
     last = subject.primitive.frame_count - 1
     frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
     labels = [""] * len(frames)
