@@ -108,7 +108,7 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
     if partners.shape != (count,) or not np.array_equal(np.sort(partners), np.arange(count)):
         raise MotionError(f"each of the {count} joints needs one partner that no other joint has", where="partners")
     if partners[0] != 0 or not np.array_equal(partners[partners], np.arange(count)):
-        raise MotionError("partners must name each other, and the root is its own partner", where="partners")
+        raise MotionError("partners must be mutual, and the root must be its own partner", where="partners")
     sources = partners.astype(np.int64)
     carried = np.zeros(count, np.bool_)
     for joint in range(1, count):

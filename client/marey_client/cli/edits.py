@@ -93,7 +93,7 @@ def save_edit(
     """Keep commands as an edit, or change one."""
     place = Address.parse(address)
     if not place.path:
-        raise WrongUsage(f"{address!r} names no edit; write project/folder/name")
+        raise WrongUsage(f"{address!r} is not the address of an edit; write project/folder/name")
     folder = place.path.rpartition("/")[0]
     with connect(context) as marey:
         commands = _given(marey, place.project, do, file)

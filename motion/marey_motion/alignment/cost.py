@@ -64,7 +64,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     options = options or CostOptions()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"points of shapes {a.shape} and {b.shape}; both must be (frames, points, 3), of the same points"
+            f"points must be (frames, points, 3), of the same points in both, not {a.shape} and {b.shape}"
         )
     return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 

@@ -222,6 +222,6 @@ def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, F
     """Lay out points with frames first for one, last for the other: the inner loop runs along the latter."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"points of shapes {a.shape} and {b.shape}; both must be (frames, points, 3), of the same points"
+            f"points must be (frames, points, 3), of the same points in both, not {a.shape} and {b.shape}"
         )
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

@@ -132,12 +132,7 @@ class LiveWindows:
         return Windows(*windows[:count].T)
 
     def as_tree(self) -> dict[str, Any]:
-        """Save the state for `from_tree`.
-
-        Returns
-        -------
-        dict    plain values and arrays
-        """
+        """Return the state as a tree that `from_tree` reads."""
         return {"rate_hz": self.rate_hz, **{name: value.copy() for name, value in self._take._asdict().items()}}
 
     @classmethod

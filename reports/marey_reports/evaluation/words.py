@@ -1,4 +1,4 @@
-"""Words of an animator for speeds, turn rates and missing data."""
+"""Descriptions of speeds, turn rates and missing data in an animator's words."""
 
 from __future__ import annotations
 

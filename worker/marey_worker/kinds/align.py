@@ -300,7 +300,7 @@ class _Job:
 
 
 def _row(one: AlignedClip) -> dict[str, Any]:
-    """Return the rows of the table of examples."""
+    """Return the row of an aligned clip in the table of examples."""
     slopes = np.diff(one.time_function)
     return {
         "name": one.name,

@@ -226,7 +226,7 @@ def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags,
     may_turn = set(joints if freedom.joints is None else freedom.joints)
     movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
     if not movable.any() and not freedom.root_moves:
-        raise EditError("no target moves with any of the joints that may move", code="chain-invalid", where="joints")
+        raise EditError("none of the joints that may move affects a target", code="chain-invalid", where="joints")
     limits, limited, stiffness = np.zeros((count, 14)), np.zeros(count, np.bool_), np.zeros(count)
     for k, joint in enumerate(joints):
         stiffness[k] = freedom.stiffness.get(joint, 0.0)

@@ -138,7 +138,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """The contents of every layout, under one name each."""
+    """Contents of a model document, with the same names for all layouts."""
 
     name: str
     space: Document
