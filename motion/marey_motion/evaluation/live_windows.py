@@ -132,7 +132,7 @@ class LiveWindows:
         return Windows(*windows[:count].T)
 
     def as_tree(self) -> dict[str, Any]:
-        """Return the state as a tree that `from_tree` reads."""
+        """Save the state as a tree, which `from_tree` reads."""
         return {"rate_hz": self.rate_hz, **{name: value.copy() for name, value in self._take._asdict().items()}}
 
     @classmethod

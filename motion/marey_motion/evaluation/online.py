@@ -233,7 +233,7 @@ class OnlineCoverage:
     # -- what is kept --------------------------------------------------------------------------------------------------
 
     def as_tree(self) -> dict[str, Any]:
-        """Return the state as a tree that `from_tree` reads."""
+        """Save the state as a tree, which `from_tree` reads."""
         return {
             "speeds_m_s": list(self.grid.speeds_m_s),
             "turn_rates_deg_s": list(self.grid.turn_rates_deg_s),
