@@ -132,7 +132,12 @@ class LiveWindows:
         return Windows(*windows[:count].T)
 
     def as_tree(self) -> dict[str, Any]:
-        """Save the state as a tree, which `from_tree` reads."""
+        """Save the state for `from_tree`.
+
+        Returns
+        -------
+        dict    plain values and arrays
+        """
         return {"rate_hz": self.rate_hz, **{name: value.copy() for name, value in self._take._asdict().items()}}
 
     @classmethod

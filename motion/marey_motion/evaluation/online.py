@@ -233,7 +233,12 @@ class OnlineCoverage:
     # -- what is kept --------------------------------------------------------------------------------------------------
 
     def as_tree(self) -> dict[str, Any]:
-        """Save the state as a tree, which `from_tree` reads."""
+        """Save the state for `from_tree`.
+
+        Returns
+        -------
+        dict    plain values and arrays, less than 64 kB
+        """
         return {
             "speeds_m_s": list(self.grid.speeds_m_s),
             "turn_rates_deg_s": list(self.grid.turn_rates_deg_s),

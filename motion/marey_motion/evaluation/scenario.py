@@ -201,7 +201,11 @@ def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[
 
 
 def _arc(speed: Floats, turn_rate: Floats, heading: Floats, elapsed: Floats) -> tuple[Floats, Floats]:
-    """Compute the displacement (..., 2) and heading after moving for `elapsed` seconds from `heading`."""
+    """Compute the displacement (..., 2) and heading after moving for `elapsed` seconds from `heading`.
+
+    The chord of an arc of angle a is its length times sin(a/2)/(a/2), in the direction half-way through the turn; this
+    form needs no case for a turn rate of zero.
+    """
     turn = turn_rate * elapsed
     chord = speed * elapsed * np.sinc(turn / (2.0 * np.pi))
     direction = heading + 0.5 * turn

@@ -94,7 +94,10 @@ def _selectable(frames: int, ticks: NDArray[np.int64], options: DatabaseOptions,
 
 
 def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: MatchingBody) -> NDArray[np.float32]:
-    """Compute poses (F, 3 + 4·J) relative to the root, as `MatchingDatabase` describes them."""
+    """Compute poses (F, 3 + 4·J) relative to the root, as `MatchingDatabase` describes them.
+
+    `carrier` (F, 1, 3) is the position of the joint that carries the body.
+    """
     poses = motion.poses
     rotations = poses[:, 3:].reshape(motion.frame_count, -1, 4)
     facing = about_vertical(-root.headings)

@@ -231,7 +231,10 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
 
 
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
-    """Compute the range of the logarithms of the examples' time steps, extended by a twentieth of a step."""
+    """Compute the range of the logarithms of the examples' time steps, extended by a twentieth of a step.
+
+    Examples rebuilt from the kept components count as well, so that each example is rebuilt as it is.
+    """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T
     given = np.log(np.diff(aligned.time_functions, axis=1))

@@ -171,7 +171,11 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
 
 def _drawn(primitive: MotionPrimitive) -> tuple[Floats, Floats]:
-    """Draw temporal parts (m, k) of latent vectors from the model, and compute their time functions (m, N)."""
+    """Draw temporal parts (m, k) of latent vectors from the model, and compute their time functions (m, N).
+
+    The limits that keep a model's motions within its examples' range are not applied: they would bend the linear
+    function that is fitted.
+    """
     free = replace(primitive, duration_range_s=None, log_slope_range=None)
     latents = free.sample(DRAWN, SEED)
     return latents[:, free.spatial.count :], free.time_functions(latents)
