@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from marey_schemas.base import Options
+from marey_schemas.base import Options, Tagged
 from marey_schemas.names import JointName
 from marey_schemas.options.contacts import STANCE_SPEED_M_S
 
@@ -44,7 +44,11 @@ class ContactOptions(Options):
     )
 
 
-class StepsProposal(Options):
+class _Proposal(Tagged):
+    tag: ClassVar[str] = "method"
+
+
+class StepsProposal(_Proposal):
     """Steps of a walk or run, from the contact of one foot to that of the other, named after the foot that swings."""
 
     method: Literal["steps"] = Field("steps", description="Name of the method that proposes segments and keyframes.")
@@ -78,7 +82,7 @@ class StepsProposal(Options):
         return self
 
 
-class VelocityMinimaProposal(Options):
+class VelocityMinimaProposal(_Proposal):
     """Movements from one minimum of the speed of joints to the next, with a keyframe `pause` at each minimum."""
 
     method: Literal["velocity_minima"] = Field(
@@ -98,7 +102,7 @@ class VelocityMinimaProposal(Options):
     )
 
 
-class WristContactProposal(Options):
+class WristContactProposal(_Proposal):
     """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
 
     method: Literal["wrist_contact"] = Field(

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ValidationError
 import marey_schemas.options as room
 from marey_schemas.base import Options
 from marey_schemas.job_kinds import BUILT_IN, KindDeclaration
+from marey_schemas.job_params import AnnotateParams
+from marey_schemas.options.annotations import StepsProposal, VelocityMinimaProposal, WristContactProposal
 
 UNITS = {
     "_m_s": "metres per second", "_deg_s": "degrees per second", "_s": "second", "_hz": "hertz", "_cm": "centimetre",
@@ -23,7 +25,7 @@ def declared() -> list[type[Options]]:
         value
         for module in modules
         for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Options) and value is not Options
+        if isinstance(value, type) and issubclass(value, Options) and value.model_fields
     }
     return sorted(found, key=lambda one: one.__name__)
 
@@ -57,3 +59,11 @@ def test_parameters_of_a_job_repeat_no_option_that_they_extend(kind: KindDeclara
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda one: one.name)
 def test_every_parameter_of_a_job_has_a_description(kind: KindDeclaration) -> None:
     assert [name for name, field in kind.params.model_fields.items() if not field.description] == []
+
+
+@pytest.mark.parametrize(
+    "proposal", [StepsProposal(), VelocityMinimaProposal(joints=("Head",)), WristContactProposal()]
+)
+def test_a_proposal_that_was_made_in_python_is_understood_by_the_server(proposal: Options) -> None:
+    params = AnnotateParams(proposal=proposal)
+    assert AnnotateParams.model_validate(params.model_dump(mode="json", exclude_unset=True)) == params
