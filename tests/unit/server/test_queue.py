@@ -1,6 +1,7 @@
 """How jobs get a worker, keep it, and end."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from tests.support.queue_desk import Desk
@@ -359,6 +360,29 @@ def test_many_jobs_are_claimed_and_completed_at_once_each_with_its_own_answer(de
     assert results[3].answer is not None
     assert [one.name for one in results[3].answer.outputs] == ["staged"]
     assert desk.database.write(desk.user, completion.complete_many, asked) == results
+
+
+def test_many_completions_find_their_attempts_by_index(desk: Desk) -> None:
+    if not desk.database.is_sqlite:
+        return  # Postgres chooses a plan by the sizes of tables, and small ones it reads whole
+    desk.submit_many(*(JobCreate(kind="errand") for _ in range(3)))
+    leases = desk.claim_many()
+    for number, lease in enumerate(leases):
+        desk.stage(lease, f"staged {number}")
+    asked = [BatchCompletion(job=one.job, fence=one.fence, write_id="write-many") for one in leases]
+    run: list[str] = []
+
+    def complete(tx: Transaction) -> list[str]:
+        driver: Any = tx.connection.connection.driver_connection
+        driver.set_trace_callback(run.append)
+        completion.complete_many(tx, asked)
+        driver.set_trace_callback(None)
+        read = [text for text in run if text.startswith(("SELECT", "UPDATE", "DELETE"))]
+        return [str(step[3]) for text in read for step in driver.execute(f"EXPLAIN QUERY PLAN {text}")]
+
+    plan = desk.database.write(desk.user, complete)
+    assert any("SEARCH staged_output" in step for step in plan)
+    assert not [step for step in plan if step.startswith(("SCAN staged_output", "SCAN attempt", "SCAN job"))]
 
 
 def test_one_result_that_names_unknown_bytes_is_refused_and_the_others_are_not(desk: Desk) -> None:
