@@ -1,4 +1,4 @@
-"""What every backing of the blob store must do, on every database."""
+"""Contract of blob backings, checked for every backing on every database."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""What every media type promises. A new codec passes this class or is not one."""
+"""Contract of media types, checked for every codec."""
 
 import datetime
 import math

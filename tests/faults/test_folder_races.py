@@ -1,4 +1,4 @@
-"""Folders that are moved, deleted and brought back while others put things into them."""
+"""Folders that are moved, deleted and restored while other requests write to them."""
 
 from __future__ import annotations
 

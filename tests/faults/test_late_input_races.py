@@ -1,4 +1,4 @@
-"""Two transactions at once where a job gets what another made: it gets it once and whole, or has ended before."""
+"""Concurrent transactions on late inputs: a job gets them once and completely, or has ended before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes die in the middle of things; nothing is lost, nothing is there twice, and what is stored is sound."""
+"""Processes die at every fault point: nothing is lost or duplicated, and the store is consistent."""
 
 from __future__ import annotations
 

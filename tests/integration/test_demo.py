@@ -1,4 +1,4 @@
-"""The demonstration, as somebody sees it who has just installed Marey."""
+"""The demonstration, run as a new user runs it."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Previews of edits over HTTP: what a job would make, and a precise answer where it could make nothing."""
+"""Previews of edits over HTTP: equal to the result of a job, or a precise error."""
 
 from math import degrees
 from typing import Any

@@ -1,4 +1,4 @@
-"""Motion files in and out through the API."""
+"""Import and export of motion files over HTTP."""
 
 import hashlib
 import io

@@ -1,4 +1,4 @@
-"""Jobs and the worker protocol, as they look over HTTP."""
+"""Jobs and the worker protocol over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pipelines, as they look over HTTP."""
+"""Pipelines over HTTP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the server speaks HTTP: forms of answers, states and preconditions, pages, bytes, errors."""
+"""HTTP protocol of the server: media types, preconditions, pages, byte ranges, errors."""
 
 import errno
 import gzip

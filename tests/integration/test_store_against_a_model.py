@@ -1,4 +1,4 @@
-"""Items, whatever is done to them in whatever order, are what a simple model in memory says they are."""
+"""Random operations on items, compared with a simple model in memory."""
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""BVH files as an independent reader sees them."""
+"""Independent reader of BVH files, for comparison."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line, as somebody in a folder of their own runs it."""
+"""Command line, run as a user in a separate folder."""
 
 from __future__ import annotations
 

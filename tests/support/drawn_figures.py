@@ -1,4 +1,4 @@
-"""Figures taken apart: can they be read, do their tables hold together, is anything cut off?"""
+"""Checks of drawn figures: readable text, consistent tables, nothing cut off."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""A project with a queue, for tests: short words for what submitters and workers do."""
+"""Project with a queue, and short functions for submitters and workers."""
 
 import itertools
 from collections.abc import Iterator, Mapping

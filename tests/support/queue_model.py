@@ -1,4 +1,4 @@
-"""The queue in memory, as its rules say it behaves: what the property test compares the real one with."""
+"""Model of the queue in memory, with which the property test compares the real one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages of reports taken apart: are they sound, what do they say, and what would they fetch or run?"""
+"""Checks of report pages: valid HTML, expected text, no external resources or scripts."""
 
 import re
 from collections import Counter

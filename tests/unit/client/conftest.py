@@ -1,4 +1,4 @@
-"""A server in the test itself: a function from request to response."""
+"""In-process server: a function from request to response."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Bytes by digest."""
+"""Blobs: upload and download by digest."""
 
 import hashlib
 

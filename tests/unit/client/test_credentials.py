@@ -1,4 +1,4 @@
-"""Which server and which token."""
+"""Lookup of the server's address and the token."""
 
 import json
 import resource

@@ -1,4 +1,4 @@
-"""Which clips the demonstration takes for locomotion."""
+"""Recognition of locomotion clips in the demonstration."""
 
 from types import SimpleNamespace
 

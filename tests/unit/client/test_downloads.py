@@ -1,4 +1,4 @@
-"""Files that arrive: what they are called on the disk of whoever asked for them."""
+"""Downloaded files and their names on disk."""
 
 from pathlib import Path
 

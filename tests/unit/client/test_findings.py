@@ -1,4 +1,4 @@
-"""What jobs found out about evaluations, as the SDK asks for it and the command line tells it."""
+"""Findings of jobs on evaluations in the SDK and on the command line."""
 
 import json
 

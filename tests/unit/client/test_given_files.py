@@ -1,4 +1,4 @@
-"""Files of JSON that commands are given."""
+"""JSON files given to commands."""
 
 import io
 import sys

@@ -1,4 +1,4 @@
-"""Folders of files on their way to the server."""
+"""Import of folders of files."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Waiting for jobs, and saying why they wait."""
+"""Waiting for jobs, and explanations of their states."""
 
 from datetime import UTC, datetime, timedelta
 

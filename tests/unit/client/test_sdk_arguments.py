@@ -1,4 +1,4 @@
-"""What the SDK takes from people who write a few lines in a notebook."""
+"""Arguments of the SDK: one value or several, in short forms."""
 
 import errno
 import json

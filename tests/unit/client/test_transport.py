@@ -1,4 +1,4 @@
-"""What is sent again, what is not, and what becomes of answers."""
+"""Requests of the client: retries, and errors of answers."""
 
 import logging
 import pickle

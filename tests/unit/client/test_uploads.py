@@ -1,4 +1,4 @@
-"""Large files in pieces."""
+"""Resumable uploads of large files."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""Bodies and motions made up for tests."""
+"""Synthetic bodies and motions."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Which example the others are aligned with."""
+"""Choice of the reference example of an alignment."""
 
 import numpy as np
 import pytest

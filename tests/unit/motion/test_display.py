@@ -1,4 +1,4 @@
-"""What a viewer sees of a trial."""
+"""Displayed motion of a trial."""
 
 from dataclasses import replace
 

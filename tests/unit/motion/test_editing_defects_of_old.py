@@ -1,4 +1,4 @@
-"""What editors of the kind got wrong before, and must be right here: one test for each published defect."""
+"""Published defects of motion editors, one test for each."""
 
 from math import degrees
 

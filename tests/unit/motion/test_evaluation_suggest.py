@@ -1,4 +1,4 @@
-"""What an evaluation suggests holds: on clips made by hand, and on real ones."""
+"""Suggestions of evaluations hold on synthetic and on real clips."""
 
 import json
 from dataclasses import replace

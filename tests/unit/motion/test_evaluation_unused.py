@@ -1,4 +1,4 @@
-"""What no trial needs can go without changing a single bit of any trial."""
+"""Removal of unused ranges does not change any trial."""
 
 from dataclasses import replace
 from typing import Any

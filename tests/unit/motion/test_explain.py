@@ -1,4 +1,4 @@
-"""Why motion matching chose what it chose."""
+"""Explanations of the choices of motion matching."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Feet that stay where they stand."""
+"""Planted feet keep their position on the ground."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What the predecessor keeps beside aligned clips."""
+"""The predecessor's documents for aligned clips."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The decay of what a switch leaves over."""
+"""Decay of offsets by inertialisation."""
 
 import numpy as np
 import pytest

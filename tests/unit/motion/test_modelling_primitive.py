@@ -1,4 +1,4 @@
-"""How long motions of a model last, whatever latent vector is asked for."""
+"""Duration of motions of a model, for any latent vector."""
 
 from dataclasses import replace
 

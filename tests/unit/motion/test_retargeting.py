@@ -1,4 +1,4 @@
-"""One body's motion on another body."""
+"""Retargeting of a motion to another body."""
 
 from dataclasses import replace
 from itertools import permutations

@@ -1,4 +1,4 @@
-"""What may be asked of an evaluation, and how its trials are spread."""
+"""Parameters of evaluations, and the division of trials into tasks."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What stands beside the numbers of a model: what is read again is checked, anything else is kept."""
+"""Notes of a model: members that are read again are validated, others are kept."""
 
 import pytest
 from pydantic import ValidationError

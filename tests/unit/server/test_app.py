@@ -1,4 +1,4 @@
-"""What a server makes before it first serves."""
+"""Files and tables that a server creates before it first serves."""
 
 import socket
 import stat

@@ -1,4 +1,4 @@
-"""Possession: who may read and refer to which bytes."""
+"""Possession of blobs: access to bytes and references to them."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Rows of coverage streams: moved on by one sender at a time, answered once and for all, dropped after a day."""
+"""Rows of coverage streams: compare-and-swap, repeated requests, deletion after a day."""
 
 import pytest
 from tests.support.interleaving import Step as Half

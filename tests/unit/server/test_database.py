@@ -1,4 +1,4 @@
-"""Transactions: what is retried, what is translated, what the clock says."""
+"""Transactions: retries, translation of errors, and the clock."""
 
 import sqlite3
 import threading

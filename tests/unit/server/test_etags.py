@@ -1,4 +1,4 @@
-"""Entity tags, and what a writer must say about the state he changes."""
+"""Entity tags and preconditions of writes."""
 
 import pytest
 

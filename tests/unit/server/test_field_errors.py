@@ -1,4 +1,4 @@
-"""What is wrong with a field is told alike, whether it stands in a body, a document or the parameters of a job."""
+"""Errors of fields have the same form in bodies, documents and parameters of jobs."""
 
 import pytest
 from pydantic import ValidationError

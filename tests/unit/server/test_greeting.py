@@ -1,4 +1,4 @@
-"""What a server says first."""
+"""Output of a server at its start."""
 
 from contextlib import closing
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a server does by itself, and when."""
+"""Periodic chores of a server."""
 
 import asyncio
 

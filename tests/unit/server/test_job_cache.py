@@ -1,4 +1,4 @@
-"""What a result depends on besides inputs and parameters: place, newest revisions, and how things are meanwhile."""
+"""Cache keys of jobs: place of results, newest revisions, and kinds without a key."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Labels as one text."""
+"""Labels stored as one text."""
 
 from itertools import combinations
 

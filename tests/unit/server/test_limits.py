@@ -1,4 +1,4 @@
-"""How often sign-in may be tried."""
+"""Limit of sign-in attempts."""
 
 import pytest
 

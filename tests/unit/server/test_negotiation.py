@@ -1,4 +1,4 @@
-"""What form of an answer a caller gets."""
+"""Negotiation of the media type of an answer."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What is given back of files of the predecessor, and what is written anew."""
+"""Exports to the predecessor's formats: unchanged originals and newly written files."""
 
 import json
 

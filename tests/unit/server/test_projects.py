@@ -1,4 +1,4 @@
-"""Who may do what in a project."""
+"""Rights of roles in a project."""
 
 import pytest
 from tests.support.store_fixtures import declared, requiring

@@ -1,4 +1,4 @@
-"""How jobs get a worker, keep it, and end."""
+"""Claims, leases and ends of jobs."""
 
 from dataclasses import replace
 from typing import Any

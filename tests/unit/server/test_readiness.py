@@ -1,4 +1,4 @@
-"""Whether the store can serve."""
+"""Readiness checks of the store."""
 
 import shutil
 

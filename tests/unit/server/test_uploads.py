@@ -1,4 +1,4 @@
-"""Uploads that come in pieces."""
+"""Resumable uploads."""
 
 import os
 

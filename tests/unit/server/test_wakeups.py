@@ -1,4 +1,4 @@
-"""Waiting requests hear of what they wait for."""
+"""Wake-ups of waiting requests."""
 
 import asyncio
 import threading

@@ -1,4 +1,4 @@
-"""Inputs kept on disk."""
+"""Cache of inputs on disk."""
 
 import os
 import resource

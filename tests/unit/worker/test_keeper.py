@@ -1,4 +1,4 @@
-"""When a lease is renewed, and what is believed about it."""
+"""Renewal of leases, and checks before results are published."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""What a worker loads before it takes its first job: what most jobs need, and nothing that takes seconds for a few."""
+"""Modules that a worker loads before its first job."""
 
 import subprocess
 import sys

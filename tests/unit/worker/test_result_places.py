@@ -1,4 +1,4 @@
-"""Where the results of jobs of many clips go, and what one clip that cannot be used does to the others."""
+"""Places of results of jobs with many clips, and effects of a clip that cannot be used."""
 
 from math import radians
 

@@ -1,4 +1,4 @@
-"""What a retargeted clip says of bones that translations of its source moved."""
+"""Checks of a retargeted clip whose source has joint translations."""
 
 from dataclasses import replace
 from typing import cast

@@ -1,4 +1,4 @@
-"""What form a worker's log has."""
+"""Format of a worker's log."""
 
 import pytest
 
