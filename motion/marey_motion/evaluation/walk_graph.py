@@ -22,7 +22,7 @@ from marey_motion.matching.record import TrialRecord
 
 @dataclass(frozen=True, eq=False)
 class WalkGraph:
-    """Frames that were displayed, jumps between them, and the order of it all.
+    """Displayed frames as nodes, jumps between them as edges, and the order of the frames in each trial.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ _PRINTED_DIGITS = 1e-6
 
 @dataclass(frozen=True)
 class ChannelColumns:
-    """Columns of the numbers by channel.
+    """Columns of the number table that hold each channel.
 
     `turns` and `axes` are (J, 3): column and axis of each joint's turns; `positions` is (J, 3): column of x, y, z.
     `NO_COLUMN` stands where a joint has no such channel. `labels` name each column for messages.

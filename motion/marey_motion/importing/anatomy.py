@@ -79,7 +79,7 @@ _KNOWN: LruCache[bytes, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
 
 
 def anatomy_of(skeleton: Skeleton) -> Anatomy:
-    """Find the anatomy of a skeleton among those of equal skeletons seen last, or begin a new one.
+    """Return the anatomy of a skeleton, from a cache by equal skeletons, or new.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class MatchingBody:
 
     @cached_property
     def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
-        """The pose joints and those that carry them (K,), in the skeleton's order, and the skeleton of these alone."""
+        """The pose joints with their ancestors (K,), in the skeleton's order, and the skeleton of these joints."""
         needed = {0}
         for joint in self.pose_joints:
             while joint > 0:
