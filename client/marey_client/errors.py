@@ -46,7 +46,7 @@ class DigestMismatch(MareyError):
 
 
 class FileChanged(MareyError):
-    """A file became another one while it was being sent."""
+    """A file changed while it was being sent."""
 
 
 class NothingToUpload(MareyError):

@@ -274,7 +274,7 @@ class _AsfReader:
             words
         ):
             raise self.lines.error(
-                f"{excerpt(b' '.join(words))!r} must be different ones of TX TY TZ RX RY RZ", joint=joint
+                f"{excerpt(b' '.join(words))!r} must be distinct names from TX TY TZ RX RY RZ", joint=joint
             )
         return channels
 

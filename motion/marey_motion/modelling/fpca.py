@@ -34,7 +34,7 @@ class Keep:
 
 @dataclass(frozen=True, eq=False)
 class PrincipalExamples:
-    """The principal components of m examples, before any is dropped.
+    """All principal components of m examples, from which a model keeps the first ones.
 
     Parameters
     ----------

@@ -169,7 +169,7 @@ def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 
 
 def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: PinnedInputs) -> dict[str, StagedDraft]:
-    """Return the drafts of an identical job with this job's inputs as sources: equal content of the same items."""
+    """Return the drafts of an identical job, with the revisions in their sources replaced by this job's inputs."""
     revisions = {
         (role, their["item"], their["revision"]): our["revision"]
         for role, many in theirs.items()
