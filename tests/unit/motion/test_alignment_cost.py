@@ -114,7 +114,7 @@ def test_both_directions_cost_the_same():
         ({"a": np.zeros((3, 4, 2))}, "points must be"),
         ({"b": np.zeros((3, 5, 3))}, "of the same points"),
         ({"a": np.full((3, 4, 3), np.nan)}, "frame 0: positions must be finite"),
-        ({"weights": (1, 2)}, "weights: .* weights where 4 points"),
+        ({"weights": (1, 2)}, "weights: .*; 4 points need one weight each"),
         ({"weights": (1, 1, 1, -1)}, "not negative"),
         ({"weights": (0, 0, 0, 0)}, "not all zero"),
     ],

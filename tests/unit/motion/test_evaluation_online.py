@@ -317,7 +317,7 @@ def test_rates_beyond_those_of_recordings_are_refused(rate_hz):
 
 
 def test_grids_that_do_not_fit_are_refused():
-    with pytest.raises(MotionError, match="over 2000"):
+    with pytest.raises(MotionError, match="at most 2000"):
         OnlineCoverage(
             RATE_HZ, Grid(speeds_m_s=tuple(0.1 * n for n in range(1, 102)), turn_rates_deg_s=tuple(range(20)))
         )

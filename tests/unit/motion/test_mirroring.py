@@ -172,7 +172,7 @@ def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
     [
         ([0, 1], "one partner that no other joint has"),
         ([0, 2, 2], "one partner that no other joint has"),
-        ([1, 0, 2], "the root is its own partner"),
+        ([1, 0, 2], "the root must be its own partner"),
     ],
 )
 def test_what_is_no_pairing_is_refused(partners, message) -> None:
