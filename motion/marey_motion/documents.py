@@ -65,7 +65,7 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
 
     Raises
     ------
-    SkeletonError    where its numbers describe none
+    SkeletonError    if its numbers describe none
     """
     return Skeleton(
         joint_names=tuple(joint.name for joint in document.joints),
@@ -140,7 +140,7 @@ def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Cl
 
     Raises
     ------
-    ClipError    where the document belongs to another skeleton or its numbers are no motion
+    ClipError    if the document belongs to another skeleton or its numbers are no motion
     """
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
@@ -203,7 +203,7 @@ def layer_from_document(document: annotation_documents.Annotation, frame_count: 
 
     Raises
     ------
-    AnnotationError    where it exceeds the clip
+    AnnotationError    if it exceeds the clip
     """
     return Layer(
         frame_count,
@@ -253,7 +253,7 @@ def mapping_from_document(
 
     Raises
     ------
-    MappingError    where a standard name is unknown, a joint is missing from the skeleton, or an axis has no direction
+    MappingError    if a standard name is unknown, a joint is missing from the skeleton, or an axis has no direction
     """
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:

@@ -57,7 +57,7 @@ def write_clip_file(
 
     Raises
     ------
-    FormatError    where the format cannot hold the clip
+    FormatError    if the format cannot hold the clip
     """
     row = format_named(file_format)
     options: dict[str, Any] = {}
@@ -92,7 +92,7 @@ def write_motion_file(
 
     Raises
     ------
-    MotionError    where the documents are not valid, or the format cannot hold the motion
+    MotionError    if the documents are not valid, or the format cannot hold the motion
     """
     try:
         if skeleton is None:

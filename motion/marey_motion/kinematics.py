@@ -98,7 +98,7 @@ def forward_kinematics(
 
     Raises
     ------
-    MotionError    where `poses` has another shape
+    MotionError    if `poses` has another shape
 
     Examples
     --------
@@ -151,7 +151,7 @@ def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
 
     Raises
     ------
-    MotionError    where the shape is another one
+    MotionError    if the shape is another one
     """
     from marey_motion import kinematics_kernels
 
@@ -174,7 +174,7 @@ def as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
 
     Returns
     -------
-    ndarray    a view where the layout fits, else a copy
+    ndarray    a view if the layout fits, else a copy
     """
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)

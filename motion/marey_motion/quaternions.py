@@ -90,7 +90,7 @@ def normalise(q: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    where one has no length
+    RotationError    if one has no length
     """
     (q,), dtype = _widened((q, 4))
     return _unit(q, "quaternion").astype(dtype, copy=False)
@@ -188,7 +188,7 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    where an axis has no length
+    RotationError    if an axis has no length
     """
     (axis,), dtype = _widened((axis, 3))
     half = 0.5 * np.asarray(angle_rad, dtype=np.float64)[..., None]
@@ -361,7 +361,7 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
 
     Raises
     ------
-    RotationError    where a direction has no length
+    RotationError    if a direction has no length
     """
     (start, end), dtype = _widened((start, 3), (end, 3))
     start, end = np.broadcast_arrays(_unit(start, "start direction"), _unit(end, "end direction"))
@@ -388,7 +388,7 @@ def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
 
     Raises
     ------
-    RotationError    where the two are parallel
+    RotationError    if the two are parallel
     """
     (vector, direction), dtype = _widened((vector, 3), (direction, 3))
     direction = _unit(direction, "direction")
@@ -545,9 +545,8 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 
 
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
-    """Compute rotations between nearly opposite vectors (n, 3): half a turn about a perpendicular of `start`, then the
-    rest.
-    """
+    """Compute rotations between nearly opposite vectors (n, 3): half a turn about a normal of `start`, then the
+    rest."""
     candidates = [_cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:
         candidates.insert(1, np.asarray(wished, dtype=np.float64))

@@ -187,7 +187,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
     Raises
     ------
-    ClipError    where the clip belongs to another skeleton than the plan's source
+    ClipError    if the clip belongs to another skeleton than the plan's source
 
     Examples
     --------

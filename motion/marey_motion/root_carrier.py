@@ -1,7 +1,8 @@
 """Joints above the one that carries the body: a static reference on the floor, or a root that moves with the body.
 
-They only move the whole body: the carrier may undo their motion. Blended one by one, the two no longer cancel and the
-body leaves its path. Therefore the body takes the root's place here, and the root follows.
+Joints above the carrier only move the whole body, and the carrier may undo their motion. If both are blended
+separately, their motions no longer cancel and the body leaves its path. These functions therefore exchange the two: the
+body takes the root's place, and the root follows it.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def root_stands(motion: Motion, skeleton: Skeleton, carrier: int) -> bool:
 
     Returns
     -------
-    bool    False where the root is the carrier
+    bool    False if the root is the carrier
     """
     above = motion.rotations[:, skeleton.path_to_root(carrier)[1:]]
     return above.size > 0 and bool(np.ptp(above, axis=0).max() < STILL)

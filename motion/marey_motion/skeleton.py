@@ -226,7 +226,7 @@ def same_hierarchy(a: Skeleton, b: Skeleton, *, tolerance_m: float = 0.0) -> boo
 
     Returns
     -------
-    bool    True where they are interchangeable
+    bool    True if clips of one are clips of the other
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Compiles every kernel once, so that the first real file does not wait: `python -m marey_motion.warm_up`.
+"""Compilation of all kernels in advance, so that the first real file does not wait: `python -m marey_motion.warm_up`.
 
 The compiled code is kept on disk; later processes load it in a fraction of a second.
 """
@@ -91,7 +91,7 @@ def _origin() -> str:
 
 
 def _recorded_origin() -> str:
-    """Origin of the compiled code on disk; empty where none is recorded."""
+    """Read the recorded origin of the compiled code on disk; empty if none is recorded."""
     return STAMP.read_text("utf-8").partition(" ")[0] if STAMP.is_file() else ""
 
 
@@ -101,7 +101,7 @@ def _is_done() -> bool:
 
 
 def _record(state: str) -> None:
-    """Record the origin of the compiled code beside it, and its state; without the right to write there, do not."""
+    """Record the origin and state of the compiled code beside it, if that folder is writable."""
     if os.access(STAMP.parent, os.W_OK):
         STAMP.write_text(f"{_origin()} {state}", "utf-8")
 
@@ -200,7 +200,7 @@ def _compare(points: NDArray[np.float32]) -> None:
 
 
 def _align(clip: Clip) -> None:
-    """Align a clip with itself by every cost, as quickly and as slowly as it likes."""
+    """Align a clip with itself by every cost, with and without a slope limit."""
     from marey_motion.alignment.aligning import SourceExample, align_clips
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
@@ -230,7 +230,7 @@ def _measure(clip: Clip) -> None:
 
 
 def _model(clip: Clip) -> None:
-    """Find what two motions have in common, and how well that rebuilds them."""
+    """Compute the components of two motions, and the errors of reconstruction from them."""
     from marey_motion.modelling.fpca import Keep, find_components
     from marey_motion.modelling.reconstruction import reconstruction_errors
     from marey_motion.modelling.scaled_fpca import optimised_weights
@@ -289,8 +289,8 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
 def main() -> None:
     """Compile everything, or the stages that are named."""
     parser = argparse.ArgumentParser(prog="python -m marey_motion.warm_up", description=__doc__)
-    parser.add_argument("stages", nargs="*", metavar="stage", help=f"of {', '.join(STAGES)}; all when absent")
-    parser.add_argument("--processes", type=int, default=1, help="that compile side by side; default 1")
+    parser.add_argument("stages", nargs="*", metavar="stage", help=f"stages to run: {', '.join(STAGES)}; default: all")
+    parser.add_argument("--processes", type=int, default=1, help="number of processes; default: 1")
     arguments = parser.parse_args()
     if unknown := set(arguments.stages) - set(STAGES):
         parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")

@@ -1,1 +1,1 @@
-"""Bringing motions into step with each other: which frame of one belongs to which frame of another."""
+"""Alignment of motions in time: which frame of one motion corresponds to which frame of another."""

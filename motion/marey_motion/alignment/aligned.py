@@ -14,7 +14,7 @@ from marey_motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class Placement:
-    """Start of a clip on the ground, which moving it to the canonical frame removed.
+    """Position and heading at the start of a clip, which the move to the canonical frame removed.
 
     A point p of the canonical frame was at R(heading) p + (x, y, z), R rotating about the vertical.
 

@@ -105,7 +105,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
     Raises
     ------
-    MotionError    where there are none; or naming the first example that was aligned with others, has another
+    MotionError    if there are no examples; otherwise names the first one that belongs to another set, has another
         skeleton, or is repeated
     """
     if not examples:
@@ -141,7 +141,7 @@ def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
 
     Raises
     ------
-    MotionError    where the two do not belong together
+    MotionError    if the two do not belong together
     """
     example = _example(StoredExample("", clip, info))
     return restore(example, clip.skeleton).as_clip(clip.skeleton, clip.frame_rate_hz)

@@ -133,7 +133,7 @@ def align_clips(
 
     Raises
     ------
-    MotionError    for options that do not fit the clips, and where fewer than two examples are left
+    MotionError    for options that do not fit the clips, or if fewer than two examples are left
     """
     run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
@@ -315,7 +315,7 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
     Raises
     ------
-    MotionError    for a name that is none of a joint
+    MotionError    for a name that no joint has
     """
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
     weights = np.array([float(body.carrier in path) for path in paths])

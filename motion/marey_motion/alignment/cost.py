@@ -35,7 +35,7 @@ class CostPoints(NamedTuple):
 def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weights: ArrayLike | None = None) -> Floats:
     """Compute the cost of each pair of frames of two motions.
 
-    The weighted mean over points of their squared distances (and over the frames of the window, if there is one).
+    The cost is the weighted mean of the points' squared distances, also over the frames of the window if there is one.
 
     Parameters
     ----------

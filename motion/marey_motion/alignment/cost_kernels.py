@@ -12,7 +12,7 @@ from marey_motion.kernels import compiled
 
 @compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
-    """Sums over points (P, 3), for each frame of others (P, 3, m): of z·z̄ on the ground, of squared rises."""
+    """Fill sums over points (P, 3) for each frame of others (P, 3, m): of z·z̄ on the ground, of squared rises."""
     real[:] = 0.0
     imaginary[:] = 0.0
     heights[:] = 0.0
@@ -40,7 +40,7 @@ def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-u
 
 @compiled
 def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (n, m) of windows: sums along diagonals of what single frames have."""
+    """Fill costs (n, m) of windows: the terms of single frames, summed along diagonals."""
     n, m = costs.shape
     width = m + window - 1
     sums = np.zeros((3, m))
@@ -93,7 +93,7 @@ def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
-    """As `plain`, the mean over windows."""
+    """Fill costs (n, m) like `plain`, as means over windows."""
     n, m = costs.shape
     sums = np.zeros((1, m))
     history = np.empty((window, 1, m + window - 1))

@@ -50,7 +50,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
     Raises
     ------
-    MotionError    for costs that are not finite, and where no path keeps the limit
+    MotionError    for costs that are not finite, or if no path keeps the limit
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -79,7 +79,7 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 
     Returns
     -------
-    float    in the unit of the costs; infinite where no path keeps the limit
+    float    in the unit of the costs; infinite if no path keeps the limit
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -131,7 +131,7 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
 
     Returns
     -------
-    float    metres; infinite where it exceeds `limit`
+    float    metres; infinite if it exceeds `limit`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 

@@ -31,7 +31,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals and its step, without branches, which the processor could not predict."""
+    """Find the least of three totals and its step, without branches that the processor could not predict."""
     least = min(both, first, second)
     alone = least < both
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
@@ -68,7 +68,7 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
 
 @compiled
 def _walk_back(steps, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards from the end; the number of cells."""
+    """Fill `path` backwards from the end; return the number of cells."""
     i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
     while True:
         path[length, 0], path[length, 1] = i, j
@@ -84,7 +84,7 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total(costs):  # type: ignore[no-untyped-def]
-    """The least total alone, in memory for one row."""
+    """Compute only the least total, with memory for one row."""
     n, m = costs.shape
     totals = np.empty(m)
     for i in range(n):
@@ -113,7 +113,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
-    """Compute the least total alone, with memory for a few rows; infinite where no path keeps the limit."""
+    """Compute only the least total, with memory for a few rows; infinite if no path keeps the limit."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
@@ -125,7 +125,7 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """One row of totals from the row before it; runs (max_run, m) are totals after 1, 2, ... steps 1-0 in a row.
+    """Fill a row of totals from the row before it; runs (max_run, m) are totals after 1, 2, ... steps 1-0 in a row.
 
     A step 0-1 begins a run only where none goes on, and those totals depend on the row before alone: nothing has to
     wait for its left neighbour, and every loop runs over whole vectors.
@@ -262,7 +262,7 @@ def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # type: ignore[no-untyped-def]
-    """Fill out (K,) with what aligning a range of frames with each of K others costs at least, or more than `limit`.
+    """Fill out (K,) with lower bounds of the costs of aligning a range with K others, unrefined above `limit`.
 
     points (N, P, 3); range r is [starts[r], stops[r]); low, high (R, P, 3) are the boxes about the frames of each;
     costs are means per frame of the longer range.
@@ -291,7 +291,7 @@ def _mean_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
-    """Sum over frames of the mean distance of their points from a box; ends where it is more than `most`."""
+    """Sum the mean distances of the points of frames from a box; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):
         cost = 0.0

@@ -95,7 +95,7 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
 
     Raises
     ------
-    AnnotationError    where a section would have fewer than two frames
+    AnnotationError    if a section would have fewer than two frames
     """
     last = frame_count - 1
     bounds: dict[int, tuple[str, ...]] = {0: (), last: ()}
@@ -137,7 +137,7 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
 
     Raises
     ------
-    AnnotationError    where they differ
+    AnnotationError    if they differ
     """
     if own != common:
         raise AnnotationError(

@@ -28,7 +28,7 @@ def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: f
 
     Raises
     ------
-    EditError    where the frames do not exist
+    EditError    if the frames do not exist
     """
     start, stop = take.frames(frames)
     count = stop - start

@@ -1,6 +1,6 @@
 """Limit of the work of an edit: computed in advance, so that the same edit is always made or always refused.
 
-Work is about nanoseconds of one thread, with measured weights.
+Work is estimated in nanoseconds of one thread, with measured weights.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ComputeBudget:
 
         Raises
         ------
-        EditError    where less is left
+        EditError    if less is left
         """
         self.left -= work
         if self.left < 0.0:

@@ -46,7 +46,7 @@ class Constraint:
     ----------
     target : its values are for all of these frames, or one for each
     joints : indices of the joints that may turn for it
-    limb : the limb among these that ends at the target, where there is one: it is tried alone before the others turn
+    limb : the limb among these joints that ends at the target, if any; it is tried alone before other joints turn
     """
 
     target: Target
@@ -63,7 +63,7 @@ class ConstrainedMotion:
     Parameters
     ----------
     motion : the whole motion
-    residuals_before, residuals_after : what each constraint is missed by in each of its frames: metres, or radians
+    residuals_before, residuals_after : error of each constraint in each of its frames: metres, or radians
     """
 
     motion: Motion
@@ -94,7 +94,7 @@ def constrain_motion(
         may turn
     solver : str    "auto" takes the two-bone solver for limbs and least squares for everything else
     options : SolverOptions, optional    tolerances and iterations
-    budget : budget, optional    the work that this may take, spent as it goes
+    budget : budget, optional    remaining work; reduced by the work of this call
 
     Returns
     -------
@@ -102,7 +102,7 @@ def constrain_motion(
 
     Raises
     ------
-    EditError    naming the constraint that is invalid, and where the budget is too small
+    EditError    naming the invalid constraint; also if the budget is too small
     """
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):
@@ -117,7 +117,7 @@ def constrain_motion(
 
 
 def current_values(skeleton: Skeleton, motion: Motion, target: PositionTarget | OrientationTarget) -> Floats:
-    """Compute the values with which a position or an orientation is met already.
+    """Compute the target values that the motion meets as it is.
 
     Parameters
     ----------
@@ -188,8 +188,8 @@ class _Cluster:
     def constrained(self, motion: Motion, blend_frames: int) -> Motion:
         """Solve the constraints and blend the motion in and out of the solution.
 
-        Those of different ranges are first met in turn, each blended in and out on its own, until they hardly disturb
-        each other: what is left for solving them together changes little from where one is active to where it is not.
+        Constraints on different ranges are first solved one range after another, each blended in and out, until the
+        remaining errors are small. Solving all of them together then changes little at the borders of a range.
         """
         spans: dict[tuple[int, int], list[Constraint]] = {}
         for one in self.constraints:

@@ -58,7 +58,7 @@ def constrain(take: Take, command: Constrain) -> Take:
     Raises
     ------
     UnknownJoint    naming a joint that does not exist
-    MappingError    where limits or a look need axes that cannot be determined
+    MappingError    if joint limits or a look-at constraint need axes that cannot be determined
     EditError    naming the constraint that is invalid
     """
     take.budget.spend(PER_RIG)
@@ -88,7 +88,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : PlantFeet    contacts, which are detected by speed where they are None, and the blending around them
+    command : PlantFeet    contacts, detected by speed if None, and the blending around them
 
     Returns
     -------
@@ -96,8 +96,8 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
 
     Raises
     ------
-    MappingError    where legs are not known
-    EditError    where the frames do not exist
+    MappingError    if legs are not known
+    EditError    if the frames do not exist
     """
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
     rig = _Rig(take)
@@ -193,7 +193,7 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
-    """Choose the axis that looks: the front of head and trunk, the direction of other bones, in the joint's frame."""
+    """Choose the axis of gaze in the joint's frame: the front of head and trunk, the direction of other bones."""
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:

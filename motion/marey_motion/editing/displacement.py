@@ -1,10 +1,10 @@
 """Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
 
 A displacement is a rotation vector for each local rotation, q·exp(d), and a shift of the root (Lee and Shin 1999). Its
-control points lie on the frames: of all curves that meet what given frames in a row have in common, it is the one that
-bends least. It would carry the slope of the last two of them, noise above all, far over the surroundings; what single
-frames add is met by a second curve, which is so tense that it hardly goes beyond them. Near a smooth end of the window
-the control points are zero, so that value, slope and curvature end there at exactly zero.
+control points lie on the frames. The curve of least bending passes through values that are smoothed along consecutive
+given frames: without smoothing, it would continue the slope of the last two frames, which is mostly noise, far into the
+surroundings. A second curve under high tension adds the rest of each given frame and hardly extends beyond them. Near a
+smooth end of the window the control points are zero, so that value, slope and curvature are exactly zero there.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 
     Raises
     ------
-    EditError    where a frame is not inside a window, or a window holds none
+    EditError    if a frame is not inside a window, or a window holds none
     """
     _check_windows(frames, windows)
     rotations, roots = motion.rotations.copy(), motion.root_translations.copy()

@@ -24,7 +24,7 @@ class FinishedMotion:
     Parameters
     ----------
     motion : the whole motion
-    residual_before, residual_after : (C,) the most each constraint is missed by in its frames: metres, or radians
+    residual_before, residual_after : (C,) largest error of each constraint in its frames: metres, or radians
     far : (C,) positions that were missed by more than `FAR_M` before
     """
 

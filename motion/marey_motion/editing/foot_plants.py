@@ -59,7 +59,7 @@ class PlantedMotion:
     motion : the whole motion
     contacts : of each foot
     slide_before_m, slide_after_m : ground that toes cover per contact, mean over contacts; 0 without contacts
-    lowered_m : the most that the root came down
+    lowered_m : largest distance by which the root is lowered
     """
 
     motion: Motion
@@ -103,7 +103,7 @@ def plant_feet(
 
     Raises
     ------
-    EditError    where the contacts are not as long as the motion
+    EditError    if the contacts are not as long as the motion
     """
     options = options or PlantOptions()
     positions = motion.positions(skeleton)
@@ -175,7 +175,7 @@ def _slide(positions: Floats, feet: Sequence[Foot], contacts: Sequence[FootConta
 
 
 def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, blend: int) -> _Plan:
-    """Compute ankle and toe: the toe at its targets, the ankle with it, and at its own while the heel is planted."""
+    """Compute the targets of a foot: planted toes and heels stay in place, and the ankle follows the toe otherwise."""
     ankle, toe = positions[:, foot.leg.end], positions[:, foot.toe]
     places = toe.copy()
     for start, stop in runs(contacts.toe):
@@ -203,8 +203,8 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
     """Find the frames (F,) in which a heel stays in place, up to the last one before its toe takes a new place.
 
-    The ankle goes with the toe, so that it has a place of its own for each contact of the toe; a heel that stands
-    through several would otherwise be in the one until a frame, and in the next one after it.
+    The ankle follows the toe, so that each contact of the toe gives it another place. A heel that stays planted over
+    several contacts of its toe would otherwise jump from one place to the next.
     """
     heel = contacts.heel.copy()
     for (_, lifted), (landed, _) in pairwise(runs(contacts.toe)):
@@ -258,7 +258,7 @@ def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], z
 def _enveloped(values: Floats, blend: int) -> Floats:
     """Compute a smooth curve (F,) not below the values, and zero farther than 2·`blend` frames from them.
 
-    Values are wanted up to `blend` frames beyond contacts; it is as slow as it is so that the body does not bob.
+    The curve keeps the values up to `blend` frames beyond contacts. It changes slowly, so that the body does not bob.
     """
     weights = np.hanning(2 * blend + 3)[1:-1]
     highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")

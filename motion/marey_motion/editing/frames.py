@@ -35,7 +35,7 @@ def trim(take: Take, command: Trim) -> Take:
 
     Raises
     ------
-    EditError    where they do not exist
+    EditError    if they do not exist
     """
     first, last = take.frames((command.start, command.stop))
     return take.moved(take.motion.sliced(first, last))
@@ -55,7 +55,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
 
     Raises
     ------
-    EditError    where a cut lies outside the motion or would leave a piece without frames
+    EditError    if a cut lies outside the motion or would leave a piece without frames
     """
     bounds = [0, *command.at, take.frame_count]
     for before, after in pairwise(bounds):
@@ -89,7 +89,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     Raises
     ------
     EditError    for an unknown source, another skeleton, and a result that is too long
-    MotionError    where the body has no facing direction at the seam
+    MotionError    if the body has no facing direction at the seam
     """
     added = _same_rate(take, command.source)
     first, second = with_equal_joints(take.motion, added.motion, take.skeleton)
@@ -186,7 +186,7 @@ def resample(take: Take, command: Resample) -> Take:
 
     Raises
     ------
-    EditError    where it becomes too long
+    EditError    if it becomes too long
     """
     rate_hz = command.frame_rate_hz
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, rate_hz))
@@ -208,7 +208,7 @@ def retime(take: Take, command: Retime) -> Take:
 
     Raises
     ------
-    EditError    where it becomes too long
+    EditError    if it becomes too long
     """
     slowed_hz = take.frame_rate_hz / command.speed
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))

@@ -48,7 +48,7 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
 
     Raises
     ------
-    MappingError    where the feet are not known
+    MappingError    if the feet are not known
     """
     ground = estimate_ground(take) if command.height_m is None else Ground(command.height_m, 0)
     moved = take.moved(shifted(take.motion, np.array((0.0, -ground.height_m, 0.0))))
@@ -71,7 +71,7 @@ def find_ground(take: Take, _command: FindGround) -> Take:
 
     Raises
     ------
-    MappingError    where the feet are not known
+    MappingError    if the feet are not known
     """
     return take.with_finding(EditFinding("find_ground", estimate_ground(take)._asdict()))
 
@@ -90,7 +90,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 
     Raises
     ------
-    MappingError    where the feet are not known
+    MappingError    if the feet are not known
     """
     stances = _stances(take, command)
     if command.height_limit_m is not None:
@@ -125,7 +125,7 @@ def estimate_ground(take: Take) -> Ground:
 
     Raises
     ------
-    MappingError    where the feet are not known
+    MappingError    if the feet are not known
     """
     return _ground_of(sole_heights(take), _stances(take, ContactOptions()))
 
@@ -143,7 +143,7 @@ def sole_heights(take: Take) -> Floats:
 
     Raises
     ------
-    MappingError    where the feet are not known
+    MappingError    if the feet are not known
     """
     motion, skeleton = take.motion, take.skeleton
     positions = forward_kinematics(

@@ -113,7 +113,7 @@ def rotate_joint(take: Take, command: RotateJoint) -> Take:
     Raises
     ------
     UnknownJoint    naming a joint that does not exist
-    EditError    where the frames do not exist
+    EditError    if the frames do not exist
     """
     index = take.joint(command.joint)
     span, shares = range_weights(take, command.frames, command.border_s)

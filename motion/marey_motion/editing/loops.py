@@ -37,7 +37,7 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
     Raises
     ------
     EditError    for fewer than four frames
-    MotionError    where the body never has a facing direction
+    MotionError    if the body never has a facing direction
     """
     frames = take.frame_count
     if frames < FEWEST_FRAMES:

@@ -75,7 +75,7 @@ def face(take: Take, command: Face) -> Take:
 
     Raises
     ------
-    MotionError    where the body has no facing direction in that frame, as when it lies on its side
+    MotionError    if the body has no facing direction in that frame, as when it lies on its side
     """
     place, heading = body_at(take, command.frame)
     turn = about_vertical(np.asarray(radians(command.heading_deg) - heading))
@@ -206,7 +206,7 @@ def pelvis_track(take: Take, start: int, stop: int) -> Floats:
 
     Raises
     ------
-    EditError    where the frames do not exist
+    EditError    if the frames do not exist
     """
     return _positions(take, start, stop)[:, take.body.pelvis]
 
@@ -226,7 +226,7 @@ def body_at(take: Take, frame: int) -> tuple[Floats, float]:
 
     Raises
     ------
-    MotionError    where the body has no facing direction
+    MotionError    if the body has no facing direction
     """
     places, headings = body_track(take, frame, frame + 1)
     return places[0], float(headings[0])
@@ -247,7 +247,7 @@ def body_track(take: Take, start: int, stop: int) -> tuple[Floats, Floats]:
 
     Raises
     ------
-    MotionError    where the body has no facing direction
+    MotionError    if the body has no facing direction
     """
     positions = _positions(take, start, stop)
     directions = kinematics.forward_directions(positions, take.body.matching.lefts, take.body.matching.rights)
@@ -295,7 +295,7 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
 
     Raises
     ------
-    EditError    where the frames do not exist or are only one
+    EditError    if the frames do not exist or are only one
     """
     start, stop = take.frames(command.frames)
     if stop - start < 2:

@@ -98,11 +98,11 @@ def edit_clip(
 
     Returns
     -------
-    tuple of EditedClip    one, or several where it was split
+    tuple of EditedClip    one, or several if it was split
 
     Raises
     ------
-    MotionError    where a command cannot be applied; `where` names the command and the parameter
+    MotionError    if a command cannot be applied; `where` names the command and the parameter
     """
     body = body or EditedBody(clip.skeleton)
     first = Take(
@@ -137,7 +137,7 @@ def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip
 
     Raises
     ------
-    EditError    where there are several
+    EditError    if there are several
     """
     edited = edit_clip(clip, commands, **given)
     if len(edited) > 1:
@@ -159,7 +159,7 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
 
     Raises
     ------
-    MotionError    where it cannot be applied
+    MotionError    if it cannot be applied
     """
     take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, command))
     made = COMMANDS[command.command](take, command)

@@ -33,8 +33,8 @@ def smooth(take: Take, command: Smooth) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : Smooth    the filter, its width (for a gaussian, six standard deviations), joints, range and borders; with
-        the path of the root, joints between root and pelvis are smoothed where those move
+    command : Smooth    the filter, its width (for a gaussian, six standard deviations), joints, range and borders. If
+        the path of the root is smoothed, so are the translations of joints between root and pelvis.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def smooth(take: Take, command: Smooth) -> Take:
     Raises
     ------
     UnknownJoint    naming a joint that does not exist
-    EditError    where the frames do not exist, where the window is too short for the polynomials, and where a joint
+    EditError    if the frames do not exist, if the window is too short for the polynomials, or if a joint
         spins so fast that its rotations have no mean
     """
     motion = take.motion
@@ -78,7 +78,7 @@ def _weights(take: Take, command: Smooth) -> Floats:
     if order > 2 * asked:
         raise EditError(
             f"a window of {2 * asked + 1} frames is too short for polynomials of degree {order}; at "
-            f"{take.frame_rate_hz:g} Hz it takes {2 * ((order + 1) // 2) / take.frame_rate_hz:.3g} s",
+            f"{take.frame_rate_hz:g} Hz it needs at least {2 * ((order + 1) // 2) / take.frame_rate_hz:.3g} s",
             code="window-too-short",
             where="window_s",
         )

@@ -53,7 +53,7 @@ class EditedBody:
 
     @cached_property
     def pelvis(self) -> int:
-        """The joint that stands for where the body is; the root where no pelvis is known."""
+        """The joint whose position is that of the body: the pelvis, or the root if no pelvis is known."""
         return self.skeleton.index_of(self.mapping.joints.get("pelvis", self.skeleton.joint_names[0]))
 
     @cached_property
@@ -97,7 +97,7 @@ class Take:
     findings : what commands found out so far
     pieces : for each split that this take went through, which of its pieces it is, from 1
     most_numbers : numbers that its motion may grow to
-    budget : the work that the whole edit may still be
+    budget : remaining work of the whole edit
     """
 
     motion: Motion
@@ -164,7 +164,7 @@ class Take:
 
         Raises
         ------
-        EditError    where there is none
+        EditError    if there is none
         """
         if name not in self.sources:
             known = ", ".join(sorted(self.sources)) or "none"
@@ -184,7 +184,7 @@ class Take:
 
         Raises
         ------
-        EditError    where the take has no such frames
+        EditError    if the take has no such frames
         """
         start, stop = bounds or (0, None)
         stop = self.frame_count if stop is None else stop
@@ -233,7 +233,7 @@ class Take:
 
         Raises
         ------
-        EditError    where that exceeds the limit
+        EditError    if that exceeds the limit
         """
         width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
         most = self.most_numbers // width

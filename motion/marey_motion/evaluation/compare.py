@@ -45,7 +45,7 @@ class MetricChange:
     before, after : means over the trials in which both sides define the metric, in the metric's own unit
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
-    trials : how many trials that is; of a single one nothing is known about the spread, and the bounds are its change
+    trials : number of these trials; a single one shows no spread, and both bounds are its change
     """
 
     metric: str
@@ -70,9 +70,9 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """A trial whose records differ in anything: from which tick on, and its mean offset on both sides.
+    """Trial whose two records differ, with the first tick that differs and its mean offset on both sides.
 
-    `same_motion`: only other names were displayed, as of a clip that is there twice; every number stayed the same.
+    `same_motion`: only the names of displayed clips differ, such as those of two equal clips; all numbers are the same.
     """
 
     trial: str
@@ -216,9 +216,7 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
 
 
 def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
-    """Compute clip and frame displayed at each tick (T, 2), per result and trial; clips are numbered alike in all
-    results.
-    """
+    """Compute clip and frame displayed at each tick (T, 2), per result and trial, with clips numbered alike."""
     numbers: dict[str, int] = {}
     return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
 

@@ -81,7 +81,7 @@ def is_followed(outcome: TrialResult) -> bool:
 
     Returns
     -------
-    bool    True where it does
+    bool    True if the trial keeps all three
     """
     return strain(outcome).worst <= 1.0 + TOLERANCE
 

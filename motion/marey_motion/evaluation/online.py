@@ -71,7 +71,7 @@ class OnlineCoverage:
     rate_hz : of the performance's frames, 10 to 240
     grid : the cells are those of `coverage.measure_coverage`
     least_s : seconds wanted in each cell
-    seconds : (V, O) what there is already, for example an evaluation's `Coverage.seconds`
+    seconds : (V, O) seconds of data that exist already, for example an evaluation's `Coverage.seconds`
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class OnlineCoverage:
 
         Raises
         ------
-        MotionError    where the frames lie too far away; none of them is added
+        MotionError    if the frames lie too far away; none of them is added
         """
         positions = Motion.of(clip).positions(body.skeleton)
         _require_near(positions)
@@ -138,7 +138,7 @@ class OnlineCoverage:
 
         Raises
         ------
-        MotionError    where a value is invalid or too far away; none of them is added
+        MotionError    if a value is invalid or too far away; none of them is added
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(

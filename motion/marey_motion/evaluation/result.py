@@ -1,4 +1,4 @@
-"""An evaluation as it is kept: what was asked, what every trial did, and what follows from it."""
+"""Content of an evaluation: its conditions, the record of every trial, and the measures computed from them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Coverage:
     speed_m_s, turn_rate_rad_s, forward_m_s, strafe_m_s : (W,) float64    strafe positive to the left
     speed_edges_m_s, turn_rate_edges_deg_s : (V + 1,), (O + 1,)    cells centred on the trial grid
     seconds : (V, O) float64    seconds of data in each cell
-    deficit_s : (V, O) float64    what each cell lacks of the least wanted
+    deficit_s : (V, O) float64    seconds that each cell lacks
     index : share of target cells with enough
     symmetry : 1 where turning left and right are covered alike, 0 where only one is
     too_short : indices of clips under a second

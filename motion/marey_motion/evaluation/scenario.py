@@ -128,7 +128,7 @@ def require_names(trials: Iterable[Trial]) -> None:
 
     Raises
     ------
-    MotionError    where two have one name
+    MotionError    if two trials have the same name
     """
     seen: set[str] = set()
     for trial in trials:

@@ -330,7 +330,7 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
     """
     clips, notes = baseline_clips(options)
     if not clips:
-        raise MotionError("no generated clip can do what the grid asks", where="grid")
+        raise MotionError("no clip can be generated for any speed and turn rate of the grid", where="grid")
     skeleton = clips[0].clip.skeleton
     body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
     return build_database(clips, body, options.database.replace(mirroring="none")), notes

@@ -1,7 +1,7 @@
 """The walk of characters through the frames of a set of clips, as a directed graph.
 
-After Kovar et al. (2002) for the vocabulary: clips that lead to each other and back form a strongly connected
-component; a dead end is a component that is never left again.
+The terms are those of Kovar et al. (2002): clips that lead to each other and back form a strongly connected component;
+a dead end is a component that is never left again.
 """
 
 from __future__ import annotations

@@ -60,9 +60,9 @@ def read_motion(
 
     Raises
     ------
-    UnknownFormat    where no reader knows the file
-    AmbiguousUnits    where the user has to choose a unit of length or an axis
-    FormatError    with file, line and joint, where the file is wrong
+    UnknownFormat    if no reader knows the file
+    AmbiguousUnits    if the user has to choose a unit of length or an axis
+    FormatError    with file, line and joint, if the file is wrong
 
     Examples
     --------
@@ -104,8 +104,8 @@ def read_source(
 
     Raises
     ------
-    UnknownFormat    where no reader knows the file
-    FormatError    with file, line and joint, where the file is wrong
+    UnknownFormat    if no reader knows the file
+    FormatError    with file, line and joint, if the file is wrong
     """
     content = bytes(data)
     row = detect_format(content, name)
@@ -137,7 +137,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
     Raises
     ------
     UnknownFormat    for any other format
-    FormatError    where the format cannot hold the clip
+    FormatError    if the format cannot hold the clip
 
     Examples
     --------

@@ -45,7 +45,7 @@ def read_amc(
 
     Raises
     ------
-    FormatError    with the line, and the bone where there is one
+    FormatError    with the line, and the bone if there is one
     """
     if companion is None:
         message = "an AMC holds angles alone; import it together with its ASF"

@@ -185,7 +185,7 @@ def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore
 
 @compiled
 def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
-    """Read the numbers up to the end of the line; where they end, or -1 at one that is malformed."""
+    """Read the numbers up to the end of the line; return where they end, or -1 if one is malformed."""
     bone, frame = state[_BONE], state[_FRAME]
     state[_FOUND] = 0
     while i < text.size and text[i] != 10 and text[i] != 13:

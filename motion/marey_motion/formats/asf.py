@@ -36,7 +36,7 @@ class Bone:
     """A bone as the file has it.
 
     `vector` is direction times length in the file's unit, world axes; `frame` the quaternion of its `axis`;
-    `channels` its degrees of freedom in order ("rx", "tz"); `line` where it stands.
+    `channels` its degrees of freedom in order ("rx", "tz"); `line` its line in the file.
     """
 
     name: str
@@ -104,7 +104,7 @@ def read_asf(data: bytes, file: str) -> SourceMotion:
 
     Raises
     ------
-    FormatError    with the line, and the bone where there is one
+    FormatError    with the line, and the bone if there is one
     """
     return skeleton_source(parse_asf(data, file))
 
@@ -159,7 +159,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
 
     Raises
     ------
-    FormatError    with the line, and the bone where there is one
+    FormatError    with the line, and the bone if there is one
     """
     if len(data) > _LONGEST_KEPT:
         return _AsfReader(TextLines(data, file)).read()

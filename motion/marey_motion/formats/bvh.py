@@ -35,7 +35,7 @@ class ChannelColumns:
     """Columns of the number table that hold each channel.
 
     `turns` and `axes` are (J, 3): column and axis of each joint's turns; `positions` is (J, 3): column of x, y, z.
-    `NO_COLUMN` stands where a joint has no such channel. `labels` name each column for messages.
+    `NO_COLUMN` marks a channel that the joint lacks. `labels` name each column for messages.
     """
 
     turns: NDArray[np.int64]
@@ -59,7 +59,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Raises
     ------
-    FormatError    with the line, and the joint where there is one
+    FormatError    with the line, and the joint if there is one
     """
     lines = TextLines(data, file)
     header = read_header(lines)

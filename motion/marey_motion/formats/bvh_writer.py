@@ -144,7 +144,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
 
 @compiled
 def _format(values, text):  # type: ignore[no-untyped-def]
-    """Write `values` into `text`; the number of bytes written."""
+    """Write `values` into `text`; return the number of bytes written."""
     digits = np.empty(24, np.uint8)
     at = 0
     for frame in range(values.shape[0]):

@@ -39,7 +39,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
 
     Raises
     ------
-    FormatError    where no valid rate follows, naming the option that sets it
+    FormatError    if no valid rate follows, naming the option that sets it
     """
     if frame_time_s is None:
         raise _no_rate("the file has no Frame Time", file)

@@ -84,7 +84,7 @@ class TextLines:
 
         Raises
         ------
-        FormatError    where there are more, fewer or others
+        FormatError    if there are more, fewer or others
         """
         if len(words) != count:
             raise self.error(f"{what} has {counted(len(words), 'value')}, {count} are needed", joint=joint)
@@ -105,7 +105,7 @@ class TextLines:
 
         Raises
         ------
-        FormatError    where it is something else
+        FormatError    if it is something else
         """
         value = read_number(word)
         if value is None:

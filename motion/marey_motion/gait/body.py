@@ -67,7 +67,8 @@ class GaitMoments:
     def settled_below(self, limits: AnyFloats, window_s: float = SETTLING_S) -> AnyFloats:
         """Compute a smooth curve that is nowhere above given limits.
 
-        The curve is an average of minima, each of which includes its moment.
+        Each value averages minima of the limits over windows that contain its moment, so that it cannot exceed the
+        limit there.
 
         Parameters
         ----------
@@ -119,7 +120,7 @@ def pose_body(
 
     Raises
     ------
-    MotionError    where a step is longer than the leg
+    MotionError    if a step is longer than the leg
     """
     root = moments.root
     rotations = {"Hips": _pelvis(style, moments)}

@@ -138,7 +138,7 @@ def foot_motions(
 
 
 def _at_studio_size(path: RootPath, times_s: AnyFloats, size: float) -> tuple[RootPath, AnyFloats]:
-    """Path and times at which the studio skeleton moves like one of `size` times its stature on `path`.
+    """Compute path and times at which the studio skeleton moves like one of `size` times its stature on `path`.
 
     Bodies of all sizes move alike when times grow with the root of their lengths (equal Froude numbers, Alexander and
     Jayes 1983).
@@ -181,7 +181,7 @@ def generate_dataset(seed: int = 0, frame_rate_hz: float = 60.0) -> list[Generat
 
 
 def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
-    """Names, paths and tags of the generated data set."""
+    """List names, paths and tags of the generated data set."""
 
     def arc(speed: float, turn_deg: float = 0.0, travel_deg: float = 0.0, seconds: float = 6.0) -> RootPath:
         return straight_or_arc(speed, radians(turn_deg), seconds, travel_angle_rad=radians(travel_deg))
@@ -215,7 +215,7 @@ def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
 
 
 def _slalom(speed_m_s: float, turn_rate_rad_s: float, bend_s: float, bends: int) -> RootPath:
-    """Bends to the left and to the right, the first and last of half length, so that it ends as it heads."""
+    """Make bends to the left and right, the first and last of half length, so that it ends with its first heading."""
     durations: Sequence[float] = [0.5 * bend_s, *[bend_s] * bends, 0.5 * bend_s]
     return RootPath(
         tuple(
@@ -239,7 +239,7 @@ def _frame_count(path: RootPath, frame_rate_hz: float) -> int:
 
 
 def _foot_shape(skeleton: Skeleton) -> FootShape:
-    """Lengths of the left foot in the rest pose; the right one mirrors it."""
+    """Measure the left foot in the rest pose; the right one mirrors it."""
     rest = skeleton.rest_global_positions
     hip, ankle, ball = (rest[skeleton.index_of(f"Left{joint}")] for joint in ("UpLeg", "Foot", "ToeBase"))
     tip = next(site.offset for site in skeleton.end_sites if site.joint == skeleton.index_of("LeftToeBase"))

@@ -21,7 +21,7 @@ KEPT_SKELETONS = 256
 
 
 class Anatomy:
-    """Everything that follows from a skeleton alone, found when it is asked for and kept."""
+    """Properties that follow from a skeleton alone, computed on first use and cached."""
 
     def __init__(self, skeleton: Skeleton) -> None:
         self.skeleton = skeleton
@@ -93,7 +93,7 @@ def anatomy_of(skeleton: Skeleton) -> Anatomy:
 
 
 def _content_key(skeleton: Skeleton) -> bytes:
-    """Digest of everything that a skeleton consists of, to the bit."""
+    """Compute a digest of every name and number of a skeleton."""
     digest = hashlib.sha256(repr((skeleton.joint_names, skeleton.display_names)).encode())
     for array in (skeleton.parents, skeleton.offsets, skeleton.rest_rotations):
         digest.update(np.ascontiguousarray(array).tobytes())

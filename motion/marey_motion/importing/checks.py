@@ -315,7 +315,7 @@ def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
 
 
 def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
-    """Feet that slide under a body that travels (skating) or under one that does not (walking in place).
+    """Find feet that slide under a body that travels (skating), or under one that does not (walking in place).
 
     The slide of a standing foot is weighted 2 − 2^(h/H) by its height h above the ground up to H = 2.5 cm (Zhang et
     al., Mode-adaptive neural networks for quadruped control, 2018, section 7.3).
@@ -341,7 +341,7 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
 
 
 def _travel_speed(hips: NDArray[np.float32], frame_rate_hz: float) -> float:
-    """Mean speed on the ground of hips (F, 3) over spans of a second, which leaves out their swaying, m/s."""
+    """Compute the mean speed (m/s) of hips (F, 3) on the ground over seconds, which excludes their swaying."""
     span = min(max(1, round(frame_rate_hz)), len(hips) - 1)
     ways = np.linalg.norm(hips[span:, [0, 2]] - hips[:-span, [0, 2]], axis=1)
     return float(ways.mean()) / span * frame_rate_hz

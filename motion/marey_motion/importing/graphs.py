@@ -1,4 +1,4 @@
-"""Graphs of the predecessor become graphs of models of the project, which are found by their names."""
+"""Conversion of the predecessor's graphs to graphs of the project's models, which are found by name."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
 
     Raises
     ------
-    FormatError    where a model is missing or ambiguous, and where the graph is inconsistent
+    FormatError    if a model is missing or ambiguous, or if the graph is inconsistent
     """
     models = {name: _find_model(find, name, graph.collection) for _, name in graph.graph.nodes}
     actions: dict[str, Any] = {}

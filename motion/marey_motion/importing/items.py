@@ -1,4 +1,4 @@
-"""Values of an import: the file with its options, and the items, graph or refusal that come of it."""
+"""Values of an import: the file with its options, and the resulting items, graph or refusal."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FileToImport:
     Parameters
     ----------
     planned : its plan
-    data, digest : its bytes and their name, for the record of where a clip comes from
+    data, digest : its bytes and their digest, recorded as the origin of a clip
     companion, companion_digest : the same of the file that the plan names as its companion
     options : of the user
     skeleton : that the clips must use
@@ -80,7 +80,7 @@ class ImportedItem:
 
 @dataclass(frozen=True)
 class ImportedGraph:
-    """A graph whose models are not found yet, since that takes the project: see `importing.graphs`."""
+    """Graph whose models are not looked up yet, which requires the project: see `importing.graphs`."""
 
     name: str
     collection: str
@@ -100,7 +100,7 @@ class ImportedFile:
         no part `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
     frames : of the clip
-    graph : what a file of a graph holds instead of items
+    graph : content of a file that holds a graph instead of items
     """
 
     name: str

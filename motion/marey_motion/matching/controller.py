@@ -39,11 +39,11 @@ class Trajectory(Protocol):
 
     @property
     def speeds_m_s(self) -> Floats:
-        """Values (T + L,)."""
+        """Speeds (T + L,), in metres per second."""
 
     @property
     def turn_rates_rad_s(self) -> Floats:
-        """Values (T + L,)."""
+        """Turn rates (T + L,), in radians per second."""
 
 
 class TrajectoryArrays(NamedTuple):
@@ -57,7 +57,7 @@ class TrajectoryArrays(NamedTuple):
 
 
 class ControllerConstants(NamedTuple):
-    """Options as compiled code takes them: durations in ticks, what happens in one tick worked out."""
+    """Options for compiled code: durations in ticks, and factors of one tick."""
 
     follow: int
     by_distance: bool
@@ -115,7 +115,7 @@ def run_trial(
 
     Raises
     ------
-    MotionError    for invalid options, and where index, trajectory and database do not belong together
+    MotionError    for invalid options, or if index, trajectory and database do not belong together
     """
     from marey_motion.matching import controller_kernels as kernels
 
@@ -159,7 +159,7 @@ def controller_constants(options: ControllerOptions, rate_hz: float) -> Controll
 
     Raises
     ------
-    MotionError    where searches are less than a tick apart
+    MotionError    if searches are less than a tick apart
     """
     if options.search_every_s * rate_hz < 0.5:
         raise MotionError("the period of searches must be at least one tick", where="search_every_s")

@@ -1,6 +1,6 @@
 """The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
 
-Ground positions are (x, z) metres, headings radians growing to the left; `when` is a moment of the wished path, in
+Ground positions are (x, z) metres, headings radians growing to the left; `when` is a moment of the desired path, in
 ticks. `index` is a `search.SearchIndex`, `wish`, `rules`, `playback` and `record` are the tuples of `controller`.
 """
 
@@ -31,7 +31,7 @@ PATH_WINDOW_S = 0.5
 
 @compiled
 def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
-    """Steps to the left and forward, and turn, after `elapsed` seconds at constant speed and turn rate."""
+    """Compute the steps left and forward, and the turn, after `elapsed` seconds at constant speed and turn rate."""
     half = 0.5 * turn_rate * elapsed
     chord = speed * elapsed * (np.sin(half) / half if half != 0.0 else 1.0)
     return chord * np.sin(half), chord * np.cos(half), 2.0 * half
@@ -39,14 +39,14 @@ def _arc(speed, turn_rate, elapsed):  # type: ignore[no-untyped-def]
 
 @compiled
 def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
-    """A step in a root's frame as (x, z) in the world."""
+    """Rotate a step from a root's frame to (x, z) in the world."""
     sine, cosine = np.sin(heading), np.cos(heading)
     return left * cosine + forward * sine, forward * cosine - left * sine
 
 
 @compiled
 def _wished(wish, when):  # type: ignore[no-untyped-def]
-    """Position and heading of the wished path at `when` ticks; beyond its end it goes on with its last arc."""
+    """Compute position and heading of the desired path at `when` ticks; beyond its end it continues its last arc."""
     last = wish.headings.shape[0] - 1
     if when >= last:
         left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)
@@ -82,13 +82,13 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
-    """The moment of the wished path, in ticks, that counts as now."""
+    """Compute the moment of the desired path, in ticks, that counts as the present."""
     return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
 @compiled
 def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (T,) with the moment of the wished path that counted as now at each tick of a trial."""
+    """Fill `out` (T,) with the moment of the desired path that counted as the present at each tick of a trial."""
     when = 0.0
     for tick in range(positions.shape[0]):
         if tick > 0:
@@ -98,7 +98,7 @@ def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
-    """Fill the normalised query (D,): the pose of `row`, and the wish seen from a root at (x, z) with `heading`."""
+    """Fill the normalised query (D,): the pose of `row`, and the desired path in the frame of a root."""
     horizons = playback.horizons_s.shape[0]
     first = query.shape[0] - 4 * horizons
     query[:first] = index.rows[row, :first]
@@ -122,9 +122,9 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 @compiled
 def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
-    """Trajectory cost of the `other` row plus its pose joints' summed distance in metres to those of `row`.
+    """Compute the trajectory cost of `other` plus the summed distance (m) of its pose joints to those of `row`.
 
-    Something above `limit` where the whole would be.
+    If the sum exceeds `limit`, any value above `limit` is returned.
     """
     cost = 0.0
     for d in range(first, query.shape[0]):
@@ -162,9 +162,9 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 @compiled
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
-    """The row to go on from, its cost, and that of going on from `row` itself; NaN where its clip has ended.
+    """Choose the next row; return it, its cost, and the cost of continuing from `row`, NaN if its clip has ended.
 
-    The pose of the query is that of `row`, so that going on costs what its trajectory costs.
+    The pose of the query is that of `row`, so that continuing costs only what its trajectory costs.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:
@@ -184,7 +184,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
-    """The row a trial starts with: nearest to the wished trajectory whatever its pose."""
+    """Find the row that a trial starts with: nearest to the desired trajectory, whatever its pose."""
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
     weights[: query.shape[0] - 4 * playback.horizons_s.shape[0]] = 0.0
@@ -193,7 +193,7 @@ def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-un
 
 @compiled
 def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
-    """Whether the wished velocity or direction jumped between two moments."""
+    """Return whether the desired velocity or direction jumped between two moments."""
     last = wish.speeds.shape[0] - 1
     a, b = min(int(before), last), min(int(when), last)
     x = wish.speeds[b] * np.sin(wish.headings[b]) - wish.speeds[a] * np.sin(wish.headings[a])
@@ -203,9 +203,9 @@ def _jumped(wish, before, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-def]
-    """Move `root` (x, z, heading) by the step that follows `row`, and by what is left of blended velocities.
+    """Move `root` (x, z, heading) by the step that follows `row`, and by the remaining blended velocities.
 
-    offsets (2, 3): what to add to the root's velocity (left, forward, turn), and how that changes per second.
+    offsets (2, 3): the offset of the root's velocity (left, forward, turn), and its change per second.
     """
     left = playback.steps[row, 0] + offsets[0, 0] * rules.tick_s
     forward = playback.steps[row, 1] + offsets[0, 1] * rules.tick_s
@@ -221,7 +221,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 
 @compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
-    """Pull the root towards the wished one, and hold it near."""
+    """Pull the root towards the desired one, and limit its distance."""
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])

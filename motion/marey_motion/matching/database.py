@@ -81,8 +81,8 @@ class SourceClip:
 
     Parameters
     ----------
-    uid : what names the clip for good, for example "clip_01J…@3"; ties between equal costs go to the lower uid
-    name : what people call it
+    uid : permanent identifier of the clip, for example "clip_01J…@3"; ties between equal costs go to the lower uid
+    name : name for people
     content : digest of its motion document, or "" when unknown
     loop : the last frame leads into the first one
     frames : the half-open range of frames to use, all when None
@@ -124,7 +124,7 @@ class DatabaseClip:
 
 @dataclass(frozen=True)
 class DatabaseNote:
-    """Something to know about a database; `NOTES` explains every code. `clip` is the uid of the clip concerned."""
+    """Remark about a database; `NOTES` explains every code. `clip` is the uid of the clip concerned."""
 
     code: str
     message: str

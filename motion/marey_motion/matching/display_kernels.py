@@ -19,7 +19,7 @@ SMALL = 1e-4
 
 @compiled
 def _exponential(x, y, z):  # type: ignore[no-untyped-def]
-    """The rotation about (x, y, z) by its length in radians."""
+    """Compute the rotation about (x, y, z) by its length in radians."""
     square = 0.25 * (x * x + y * y + z * z)
     if square < SMALL:
         cosine = 1.0 - square * (1.0 / 2.0 - square * (1.0 / 24.0 - square / 720.0))
@@ -32,7 +32,7 @@ def _exponential(x, y, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _turn_to(pose, column, w, x, y, z):  # type: ignore[no-untyped-def]
-    """The turn of at most half a circle, as a rotation vector, that takes a rotation of `pose` to (w, x, y, z)."""
+    """Compute the rotation vector, of at most half a turn, from a rotation of `pose` to (w, x, y, z)."""
     bw, bx, by, bz = (
         np.float64(pose[column]),
         np.float64(pose[column + 1]),
@@ -83,7 +83,7 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ig
 
 @compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
-    """`_show` without offsets."""
+    """Fill like `_show`, without offsets."""
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
         shown_places[m] = place[moved[m]]
@@ -93,7 +93,7 @@ def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[
 
 @compiled
 def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # type: ignore[no-untyped-def]
-    """Fill `offsets` with what takes a row to what is shown."""
+    """Fill `offsets` with the difference between a row and the displayed pose."""
     for c in range(3):
         offsets[0, c] = shown[c] - pose[c]
         for m in range(moved.shape[0]):
@@ -106,7 +106,7 @@ def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # 
 
 @compiled
 def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
-    """One tick of all springs; whether anything is left of them."""
+    """Advance all springs by one tick; return whether any offset remains."""
     left = 0.0
     for k in range(offsets.shape[0]):
         for c in range(3):

@@ -71,7 +71,7 @@ class Normaliser:
 
         Raises
         ------
-        MotionError    where it does not
+        MotionError    if the dimensions differ
         """
         if len(self.offset) != layout.dimension_count:
             raise MotionError(

@@ -37,7 +37,7 @@ class PreparedClip:
 
     Parameters
     ----------
-    seam : how a round leads into the next one where rows look ahead through it, None where the clip ends
+    seam : transition to the next round of a loop whose rows look ahead across it; None if the clip ends
     mirrored : whether left and right are exchanged
     first_s : how much of the recording lies before the motion, seconds
     """

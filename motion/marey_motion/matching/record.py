@@ -34,7 +34,8 @@ class TrialRecord:
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
     match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN where nothing was searched
-    continuing_cost : (T,) float64    the same of going on; NaN where nothing was searched or nothing was there to go on
+    continuing_cost : (T,) float64    the same for continuing the displayed clip; NaN where nothing was searched or the
+        clip had ended
     pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, with what is left of
         earlier switches, and the row displayed next; at the last tick, the row that would follow
     """

@@ -2,12 +2,11 @@
 
 `index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Rows are database rows.
 
-How an answer in float64 comes out of screening in float32
-----------------------------------------------------------
+Proof that screening in float32 gives the answer of float64 ----------------------------------------------------------
 Let c be the cost of a row in exact arithmetic, c32 what the screening computes for it, u = 2⁻²⁴, and ‖·‖ the norm with
-the weights. Rounding row and query to float32 moves each by at most u times its norm, hence their distance √c by
-at most u (‖row‖ + ‖query‖) < reach / 2. Each of the D terms of the sum then goes through at most six roundings, and
-every addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded vectors' cost:
+the weights. Rounding row and query to float32 moves each by at most u times its norm, hence their distance √c by at
+most u (‖row‖ + ‖query‖) < reach / 2. Each of the D terms of the sum then goes through at most six roundings, and every
+addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded vectors' cost:
 
     c32 ≤ (1 + u)^(D + 8) (√c + reach)²
 
@@ -61,7 +60,7 @@ def _cost(values, query, weights):  # type: ignore[no-untyped-def]
 
 @compiled
 def cost_of(index, row, query):  # type: ignore[no-untyped-def]
-    """Squared distance of a row, selectable or not, to the query (D,): float64, summed in the order of dimensions."""
+    """Compute the squared distance of a row, selectable or not, to the query (D,), in the order of dimensions."""
     values = index.rows[row]
     cost = 0.0
     for d in range(query.shape[0]):
@@ -100,7 +99,7 @@ def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-
 
 @inlined
 def _limit(query, best):  # type: ignore[no-untyped-def]
-    """The float32 cost that no row as near as `best` can exceed."""
+    """Compute the float32 cost that no row as near as `best` can exceed."""
     distance = np.sqrt(best) + query.reach
     return np.float32(distance * distance * query.margin + query.least)
 
@@ -127,7 +126,7 @@ def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyp
 
 @inlined
 def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The best of (row, cost) and those rows of a block, given as bits, that the screening left; and its limit."""
+    """Find the best of (row, cost) and the screened rows of a block, given as bits; also return its limit."""
     while lanes:
         lane = _lane_of_least(query.sums, lanes)
         if query.sums[lane] > limit:
@@ -144,7 +143,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
 
 @inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The best of (row, cost) and the rows of a group's blocks, the nearest box first; and its limit."""
+    """Find the best of (row, cost) and the rows of a group's blocks, the nearest box first; also return its limit."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
     boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
@@ -161,9 +160,9 @@ def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-unt
 
 @compiled
 def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The group with the nearest box first, for a tight limit; then those of the others that are left, in their order.
+    """Search the group with the nearest box first, for a tight limit, then the remaining groups in their order.
 
-    Taking them all by distance would look at a few per cent fewer, and take longer.
+    Searching all groups by distance would visit a few per cent fewer, and take longer.
     """
     groups = index.boxes.shape[0]
     bounds = np.empty((index.group_boxes.shape[0], LANES), np.float32)
@@ -184,7 +183,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 @compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
-    """The best of (row, cost) and the rows of blocks [start, stop), all of them; and its limit."""
+    """Find the best of (row, cost) and all rows of the blocks [start, stop); also return its limit."""
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
         if lanes:
@@ -208,7 +207,7 @@ def _nearest(index, query, weights, warm_row, skip_start, skip_stop):  # type: i
 
 @compiled
 def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """The selectable row of least cost outside [skip_start, skip_stop) and its cost; (-1, inf) when there is none.
+    """Find the selectable row of least cost outside [skip_start, skip_stop) and its cost; (-1, inf) if there is none.
 
     The lowest row wins a tie. `warm_row` is a row likely to be near, or -1: it changes the time taken, not the answer.
     """
@@ -217,7 +216,7 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """As `nearest`, each dimension's squared difference multiplied by its weight (D,), at least 0."""
+    """Find the row like `nearest`, with squared differences multiplied by weights (D,), at least 0."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 

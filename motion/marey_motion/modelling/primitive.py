@@ -35,8 +35,8 @@ class FunctionalComponents:
     basis : of the functions
     mean : (n, D) coefficients
     directions : (k, n, D) what one unit of each score adds to the coefficients; any scaling is undone in them
-    projections : (k, n, D) what takes the scores off coefficients again: their inner products with directions are the
-        identity
+    projections : (k, n, D) functions whose inner products with coefficients give scores; with the directions they give
+        the identity
     variances : (k,) of the training examples' scores
     energy : (k,) share of the variance that the first 1, 2, ... components hold, of that of all components
     """
@@ -106,8 +106,8 @@ class MotionPrimitive:
     mixture : of latent vectors
     keyframes : canonical frame by label
     duration_range_s : within which motions last, or None; normal distributions of logarithms have long tails
-    log_slope_range : what the temporal function is cut off at, or None where the examples are not known: splines swing
-        out at their ends, where a motion would stand still
+    log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
+        swing out at their ends, and a motion would stop there
     """
 
     name: str

@@ -97,7 +97,7 @@ def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPr
 
     Raises
     ------
-    ModelError    where the joints differ, and where the numbers describe no model
+    ModelError    if the joints differ, or if the numbers describe no model
     """
     if tree.get("schema") != PRIMITIVE_SCHEMA:
         raise ModelError(f"the document has the schema {tree.get('schema')!r}, not {PRIMITIVE_SCHEMA!r}")

@@ -1,4 +1,4 @@
-"""Compiled comparison of poses by where their joints are, with the derivative by the poses."""
+"""Compiled comparison of poses by their joint positions, with its derivative by the poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marey_motion.kernels import compiled, inverse, product, put_rotation, rotat
 
 @compiled
 def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
-    """Unit local rotations (J, 4) and the lengths (J,) that the pose's quaternions had."""
+    """Fill unit local rotations (J, 4) and the lengths (J,) of the pose's quaternions."""
     for joint in range(len(rotations)):
         column = 3 + 4 * joint
         w, x, y, z = pose[column], pose[column + 1], pose[column + 2], pose[column + 3]
@@ -23,7 +23,7 @@ def _load_rotations(pose, rotations, lengths):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place_joints(pose, local, parents, offsets, world, positions):  # type: ignore[no-untyped-def]
-    """Global rotations (J, 4) and positions (J, 3)."""
+    """Fill global rotations (J, 4) and positions (J, 3)."""
     world[0] = local[0]
     positions[0] = pose[:3]
     for joint in range(1, len(parents)):
@@ -60,10 +60,10 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 
 @compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
-    """The sum of squared distances of joints from targets (F, J, 3); fill its gradient (F, D) by the poses (F, D).
+    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) by the poses.
 
     Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they stand for.
-    What pulls at the joints below one adds up to a force and a torque on it, from the leaves to the root.
+    The gradients of the joints below each joint add up to a force and a torque on it, from the leaves to the root.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

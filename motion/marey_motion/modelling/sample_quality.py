@@ -51,7 +51,7 @@ def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> F
 def standing_steps(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> NDArray[np.bool_]:
     """Find the steps in which most examples have a foot on the ground.
 
-    Such a foot is slower than the limit of contacts, height included.
+    A foot is on the ground while its speed in three dimensions is below the limit for contacts.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ LOG_SLOPE_MARGIN = 0.05
 
 @dataclass(frozen=True, eq=False)
 class TrainedPrimitive:
-    """A model and how good it is.
+    """Model with its report and warnings.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class TrainedPrimitive:
 
 @dataclass(frozen=True, eq=False)
 class FittedExamples:
-    """Examples as what is modelled: their poses with consistent signs, and the components of space and time."""
+    """Examples in modelled form: poses with consistent signs, and the components of space and time."""
 
     poses: Floats
     spatial: PrincipalExamples
@@ -86,7 +86,7 @@ def train_primitive(
 
     Raises
     ------
-    ModelError    where no model can be made of the examples
+    ModelError    if no model can be made of the examples
     """
     check_examples(aligned)
     with one_thread():
@@ -116,7 +116,7 @@ def check_examples(aligned: AlignedSet) -> None:
     ModelError    naming the example that is wrong
     """
     if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
-        raise ModelError(f"{len(aligned.clips)} examples; a model is of 1 to {MOST_EXAMPLES:,}", code="example-count")
+        raise ModelError(f"{len(aligned.clips)} examples; a model needs 1 to {MOST_EXAMPLES:,}", code="example-count")
     frames = aligned.frame_count
     if frames < LEAST_FRAMES:
         raise ModelError(f"{frames} canonical frames; at least {LEAST_FRAMES} are needed", code="too-few-frames")

@@ -71,7 +71,7 @@ class TrainingReport:
     log_likelihood : mean over the examples
     held_out_log_likelihood : mean over the examples of their density under mixtures fitted without them
     examples : in the order of the aligned set
-    time_error_frames : root mean square of what time functions are off, after their splines and kept components
+    time_error_frames : root mean square error of time functions that are rebuilt from splines and kept components
     """
 
     spatial_energy: Floats

@@ -101,9 +101,9 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
 
     Raises
     ------
-    MappingError    where the mapping lacks the joints that give left and up, or those of an arm coincide
-    UnknownJoint    where it names joints that the skeleton does not have
-    ClipError    where the motion belongs to another skeleton
+    MappingError    if the mapping lacks the joints that give left and up, or those of an arm coincide
+    UnknownJoint    if it names joints that the skeleton does not have
+    ClipError    if the motion belongs to another skeleton
 
     Examples
     --------
@@ -226,7 +226,7 @@ class _PosedBody:
 
     @cached_property
     def up(self) -> Floats:
-        """From the pelvis to the middle of the shoulders, or what comes next to that, perpendicular to the hips."""
+        """Direction from the pelvis up to the shoulders, or to the nearest known joints, perpendicular to the hips."""
         levels = [level for level in map(self._level, _LEVELS) if level is not None]
         if len(levels) < 2:
             raise MappingError(
@@ -247,7 +247,7 @@ class _PosedBody:
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:
-        """Parts that stand as a body's do, judged in the first frame."""
+        """Parts of the body whose pose is that of a standing person, judged in the first frame."""
         left, up = self.hips_left[0], self.up[0]
         legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
         if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):

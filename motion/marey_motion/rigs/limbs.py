@@ -136,7 +136,7 @@ class BoneTree:
 
         Returns
         -------
-        bool    True where they can belong to one body
+        bool    True if they can belong to one body
         """
         above_legs, above_arms = (self.path_to_root(pair.parent) for pair in (legs, arms))
         nested = any(limb.chain[0] in above_arms for limb in legs.limbs) or any(

@@ -141,7 +141,7 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 
     Raises
     ------
-    MappingError    where its confidence is below `LEAST_CONFIDENCE`
+    MappingError    if its confidence is below `LEAST_CONFIDENCE`
     """
     if mapping.confidence < LEAST_CONFIDENCE:
         found = f"its joints were recognised with a confidence of {mapping.confidence:.2f} only"

@@ -231,7 +231,7 @@ def changed(path, value):
         (changed(["sspm", "mean"], [float("1e400")] * 459), "mean"),
         (changed(["sspm", "animated_joints"], ["Hips"]), "51 channels, but 1 joints need 7"),
         (changed(["sspm", "animated_joints"], [*models.ANIMATED[:-1], "Tail"]), "joint Tail: the skeleton has no such"),
-        (changed(["tspm", "mean"], [50.0] * 8), "speed that makes sense"),
+        (changed(["tspm", "mean"], [50.0] * 8), "plausible speed"),
         (changed(["gmm", "weights"], [0.4, 0.4]), "add up to 1"),
         (changed(["gmm", "covars"], np.zeros((2, 8, 8)).tolist()), "not positive definite"),
         (changed(["gmm", "covars"], np.eye(8).tolist()), "gmm: weights, means and covars of shapes"),

@@ -1,4 +1,4 @@
-"""Foot contacts that neither noise nor the rolling of the foot makes flicker."""
+"""Detection of foot contacts, robust against noise and against the rolling of the foot."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Keyframe(NamedTuple):
 class Layer:
     """Segments in the order of time and without overlap, and keyframes in the order of time, of a clip of F frames.
 
-    Two keyframes may share a frame under different labels. What is given in another order is brought into order.
+    Two keyframes may share a frame under different labels. Segments and keyframes given in another order are sorted.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
 
     Raises
     ------
-    AnnotationError    where it is invalid or overlaps
+    AnnotationError    if the segment is invalid or overlaps another
     """
     made = Segment(label, start, end)
     first, stop = layer._among(start, end)
@@ -145,7 +145,7 @@ def remove_segment(layer: Layer, at: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    where no segment holds the frame
+    AnnotationError    if no segment holds the frame
     """
     index = layer._index_at(at)
     return layer._with(index, index + 1)
@@ -166,7 +166,7 @@ def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
 
     Raises
     ------
-    AnnotationError    where no segment can be split there
+    AnnotationError    if no segment can be split there
     """
     index = layer._index_at(at)
     segment = layer.segments[index]
@@ -193,7 +193,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
 
     Raises
     ------
-    AnnotationError    where there is no such segment or neighbour
+    AnnotationError    if there is no such segment or neighbour
     """
     index = layer._index_at(at)
     segment = layer.segments[index]
@@ -229,7 +229,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
 
     Raises
     ------
-    AnnotationError    where a segment would become empty
+    AnnotationError    if a segment would become empty
     """
     index = layer._index_at(at)
     segment = layer.segments[index]
@@ -267,7 +267,7 @@ def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
 
     Raises
     ------
-    AnnotationError    where no segment holds the frame
+    AnnotationError    if no segment holds the frame
     """
     index = layer._index_at(at)
     return layer._with(index, index + 1, layer.segments[index]._replace(label=label))
@@ -291,7 +291,7 @@ def add_keyframe(layer: Layer, label: str, frame: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    where it is invalid or exists
+    AnnotationError    if the keyframe is invalid or exists already
     """
     made = Keyframe(label, frame)
     place = layer._place_of(made)
@@ -314,7 +314,7 @@ def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    where it does not exist or cannot be there
+    AnnotationError    if the keyframe does not exist, or its new frame is invalid
     """
     return add_keyframe(remove_keyframe(layer, label, frame), label, to)
 
@@ -334,7 +334,7 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
 
     Raises
     ------
-    AnnotationError    where it does not exist
+    AnnotationError    if it does not exist
     """
     gone = Keyframe(label, frame)
     place = layer._place_of(gone)
@@ -414,7 +414,7 @@ def _moment(keyframe: Keyframe) -> tuple[int, str]:
 
 
 def _require_segments(segments: Sequence[Segment], frame_count: int) -> None:
-    """Raise `AnnotationError` for what is no segment of the clip, and for neighbours that overlap."""
+    """Raise `AnnotationError` for segments that do not fit the clip, and for neighbours that overlap."""
     for segment in segments:
         _require_label(segment.label, str(segment))
         if segment.end <= segment.start:
@@ -427,7 +427,7 @@ def _require_segments(segments: Sequence[Segment], frame_count: int) -> None:
 
 
 def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
-    """Raise `AnnotationError` for what is no keyframe of the clip, and for one that is there twice."""
+    """Raise `AnnotationError` for keyframes that do not fit the clip, and for repeated ones."""
     for keyframe in keyframes:
         _require_label(keyframe.label, str(keyframe))
         if not 0 <= keyframe.frame < frame_count:

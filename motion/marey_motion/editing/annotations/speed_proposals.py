@@ -81,7 +81,7 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
     Raises
     ------
-    MotionError    where the body has no facing direction or lacks the wrist
+    MotionError    if the body has no facing direction or lacks the wrist
     """
     options = options or WristContactProposal()
     distances = {side: _distance_from_rest(clip, body, side) for side in SIDES if options.hand in (side, "either")}

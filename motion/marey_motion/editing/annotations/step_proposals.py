@@ -61,7 +61,7 @@ def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None 
 
 
 class _Step(NamedTuple):
-    """Foot `side` swings, and touches the ground at `end`."""
+    """Step in which foot `side` swings and touches the ground at `end`."""
 
     side: int
     start: int

@@ -42,7 +42,7 @@ STAYING = 1e-9
 
 @compiled
 def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
-    """Add up Σ w·b·aᵀ (3, 3) of the vectors a that joint k turns and the b they should become; count the pairs.
+    """Add up Σ w·b·aᵀ (3, 3) of the vectors a that joint k turns and their targets b; count the pairs.
 
     Returns the number of pairs and the last one, each as unit vectors.
     """
@@ -109,7 +109,7 @@ def _form_value(form, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _largest_eigenvector(form, vectors):  # type: ignore[no-untyped-def]
-    """The unit eigenvector of the largest eigenvalue of a symmetric (4, 4), by Jacobi's rotations; destroys `form`."""
+    """Compute the unit eigenvector of the largest eigenvalue of `form` (4, 4), symmetric, by Jacobi; destroys it."""
     vectors[:] = 0.0
     for i in range(4):
         vectors[i, i] = 1.0
@@ -152,7 +152,7 @@ def _annihilate(form, vectors, p, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-untyped-def]
-    """The world rotation that brings the vectors nearest to where they should be; the smallest of those that do."""
+    """Compute the smallest world rotation that brings the vectors nearest to their targets."""
     if pairs == 1:
         return between(start, end)
     _davenport(matrix, form)
@@ -166,7 +166,7 @@ def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-unt
 
 @compiled
 def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untyped-def]
-    """The local rotation of a hinge, within its limits, that is best for the targets; a share `flexible` of the way."""
+    """Compute the local rotation of a hinge, moved by a share `flexible` towards its best angle within the limits."""
     reference, axis = (limit[0], limit[1], limit[2], limit[3]), (limit[4], limit[5], limit[6])
     now = twist_angle(product(inverse(reference), local), axis)
     hinge = rotated(product(spin, inverse(local)), rotated(reference, axis))
@@ -192,7 +192,7 @@ def _hinge_turn(limit, spin, local, flexible, matrix):  # type: ignore[no-untype
 
 @compiled
 def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignore[no-untyped-def]
-    """The new local rotation of joint k."""
+    """Compute the new local rotation of joint k."""
     limit = body.limits[k]
     flexible = 1.0 - body.stiffness[k]
     if body.limited[k] and limit[SWING_RANGE] <= 0.0 and limit[SWING_RANGE + 1] <= 0.0:

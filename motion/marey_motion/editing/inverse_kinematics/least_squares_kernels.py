@@ -48,7 +48,7 @@ LIMIT_REACHED_RAD = 1e-9
 
 @compiled
 def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
-    """Change of an angular error when what is turned turns by `turn`, and the wished direction by `drift`."""
+    """Compute the change of an angular error when the joint turns by `turn` and the target direction by `drift`."""
     if kind == ORIENTATION:
         # The inverse left Jacobian of the rotation group at `error`.
         angle = length(error)
@@ -61,7 +61,7 @@ def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-un
 
 @compiled
 def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
-    """Change of `look_error` when the gaze turns by a vector."""
+    """Compute the change of `look_error` when the gaze turns by a vector."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
     if sine < 1e-9:
@@ -74,7 +74,7 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
-    """Derivatives of target `c` by an unknown that moves its tip by `move` and turns its joint by `spin`."""
+    """Fill the derivatives of target `c` by an unknown that moves its tip by `move` and turns its joint by `spin`."""
     if targets.kinds[c] == POSITION:
         axes = targets.axes
         change = (move[0] * axes[c, 0], move[1] * axes[c, 1], move[2] * axes[c, 2])
@@ -154,7 +154,7 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _soften(work, vector, out):  # type: ignore[no-untyped-def]
-    """out = D⁻¹·vector."""
+    """Fill `out` with D⁻¹·vector."""
     for v in range(work.blocked.shape[0]):
         known, along = work.blocked[v], 0.0
         for i in range(3):
@@ -218,9 +218,9 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Take a direction out of the steps of movable joint v; whether there was something left to take out.
+    """Exclude a direction from the steps of movable joint v; return whether it was not excluded before.
 
-    `work.outward` is the one direction that is blocked, or where two are, the one that is not.
+    `work.outward` is the blocked direction, or, if two are blocked, the one that is free.
     """
     known = work.blocked[v]
     if known == 1:
@@ -273,7 +273,7 @@ def _fill_gradient(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
-    """Fill Jacobian and gradient of the pose just measured; the mean size of the Jacobian's rows."""
+    """Fill Jacobian and gradient of the pose just measured; return the mean size of the Jacobian's rows."""
     fill_jacobian(body, targets, frame, work, work.jacobian)
     for c in range(targets.kinds.shape[0]):
         for i in range(3):
@@ -299,7 +299,7 @@ def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before, after):  # type: ignore[no-untyped-def]
-    """Solve one frame in place; the number of steps tried and whether all targets are reached."""
+    """Solve one frame in place; return the number of steps tried and whether all targets are reached."""
     most_steps, tolerance_m, tolerance_rad = ends
     work.first[:] = local
     work.first_root[:] = root

@@ -1,4 +1,4 @@
-"""One pose of the joints that matter to inverse kinematics: where they are, how far targets are missed, limits."""
+"""Poses in inverse kinematics: positions of the relevant joints, errors of targets, and limits."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def place_joints(parents, offsets, root, local, spins, places):  # type: ignore[
 
 @compiled
 def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-def]
-    """Fill the points (C, 3) and world rotations (C, 4) that the targets are about."""
+    """Fill the points (C, 3) and world rotations (C, 4) to which the targets apply."""
     for c in range(targets.kinds.shape[0]):
         k = targets.joints[c]
         spin = rotation_at(spins, k)
@@ -57,7 +57,7 @@ def place_tips(targets, spins, places, tips, turns):  # type: ignore[no-untyped-
 
 @compiled
 def look_error(gaze, wished):  # type: ignore[no-untyped-def]
-    """Rotation vector (radians) from the wished unit direction to the gaze."""
+    """Compute the rotation vector (radians) from the target's unit direction to the gaze."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
     if sine > TINY:
@@ -67,7 +67,7 @@ def look_error(gaze, wished):  # type: ignore[no-untyped-def]
 
 @compiled
 def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
-    """Error of target `c`: metres along its axes, or a rotation vector in radians, both in the world."""
+    """Compute the error of target `c`: metres along its axes, or a rotation vector in radians, both in the world."""
     values = targets.values[frame]
     if targets.kinds[c] == POSITION:
         off = minus(tip, vector_at(values, c))
@@ -95,7 +95,7 @@ def weigh_errors(targets, frame, tips, turns, errors, tolerance_m, tolerance_rad
 
 @compiled
 def measure(body, targets, frame, offsets, root, local, work, tolerance_m, tolerance_rad):  # type: ignore[no-untyped-def]
-    """Place everything and fill the errors; the cost of the targets and whether all are reached."""
+    """Place joints and tips and fill the errors; return the cost of the targets and whether all are reached."""
     place_joints(body.parents, offsets, root, local, work.spins, work.places)
     place_tips(targets, work.spins, work.places, work.tips, work.turns)
     return weigh_errors(targets, frame, work.tips, work.turns, work.errors, tolerance_m, tolerance_rad)
@@ -109,7 +109,7 @@ def store_residuals(errors, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
-    """The angle (radians, on the circle) in [low, high] that is nearest to `angle`."""
+    """Find the angle (radians, on the circle) in [low, high] that is nearest to `angle`."""
     if low <= angle <= high:
         return angle
     above = (angle - high) % (2.0 * math.pi)
@@ -119,7 +119,7 @@ def nearest_in_range(angle, low, high):  # type: ignore[no-untyped-def]
 
 @compiled
 def within_limits(row, q):  # type: ignore[no-untyped-def]
-    """The local rotation `q` brought into the limits of a row of `Body.limits`."""
+    """Bring the local rotation `q` into the limits of a row of `Body.limits`."""
     reference = (row[0], row[1], row[2], row[3])
     axis, side = (row[4], row[5], row[6]), (row[7], row[8], row[9])
     turn = product(inverse(reference), q)
@@ -135,7 +135,7 @@ def within_limits(row, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
-    """The point (x, y) drawn towards the middle of an ellipse with these half axes until it is in it."""
+    """Move the point (x, y) towards the centre of an ellipse with these half axes until it is inside."""
     if width <= 0.0:
         x = 0.0
     if height <= 0.0:

@@ -62,7 +62,7 @@ class SolverResult(NamedTuple):
 
 
 class Placing(NamedTuple):
-    """Room for one pose of K joints and C targets; the last three for the best turn of one joint."""
+    """Scratch arrays for one pose of K joints and C targets; the last three are for the best turn of one joint."""
 
     spins: Floats
     places: Floats
@@ -75,7 +75,7 @@ class Placing(NamedTuple):
 
 
 class Stepping(NamedTuple):
-    """Room for one pose and for a step of least squares of n unknowns and m errors."""
+    """Scratch arrays for one pose and for a step of least squares with n unknowns and m errors."""
 
     spins: Floats
     places: Floats

@@ -57,14 +57,14 @@ def length(a):  # type: ignore[no-untyped-def]
 
 @compiled
 def direction(a):  # type: ignore[no-untyped-def]
-    """The unit vector along `a`; zero where it has no length."""
+    """Compute the unit vector along `a`; zero if it has no length."""
     size = length(a)
     return scaled(a, 1.0 / size) if size > TINY else (0.0, 0.0, 0.0)
 
 
 @compiled
 def perpendicular(a):  # type: ignore[no-untyped-def]
-    """A unit vector at a right angle to `a`, from the coordinate axis that `a` is farthest from."""
+    """Compute a unit vector at a right angle to `a`, from the coordinate axis that `a` is farthest from."""
     x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
     axis = (1.0, 0.0, 0.0)
     if y <= x and y <= z:
@@ -89,7 +89,7 @@ def rotated(q, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def exponential(v):  # type: ignore[no-untyped-def]
-    """The rotation about `v` by its length in radians."""
+    """Compute the rotation about `v` by its length in radians."""
     half = 0.5 * length(v)
     share = 0.5 * math.sin(half) / half if half > 1e-8 else 0.5
     return math.cos(half), v[0] * share, v[1] * share, v[2] * share
@@ -97,7 +97,7 @@ def exponential(v):  # type: ignore[no-untyped-def]
 
 @compiled
 def logarithm(q):  # type: ignore[no-untyped-def]
-    """Axis times angle of a rotation, of at most half a turn."""
+    """Compute axis times angle of a rotation, of at most half a turn."""
     sign = -1.0 if q[0] < 0.0 else 1.0
     v = (sign * q[1], sign * q[2], sign * q[3])
     sine = length(v)
@@ -107,7 +107,7 @@ def logarithm(q):  # type: ignore[no-untyped-def]
 
 @compiled
 def between(a, b):  # type: ignore[no-untyped-def]
-    """The shortest rotation from unit vector `a` to unit vector `b`; none where one of them is zero."""
+    """Compute the shortest rotation from unit vector `a` to unit vector `b`; the identity if one of them is zero."""
     if dot(a, a) < 0.5 or dot(b, b) < 0.5:
         return 1.0, 0.0, 0.0, 0.0
     middle = plus(a, b)
@@ -123,7 +123,7 @@ def between(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def twist_angle(q, axis):  # type: ignore[no-untyped-def]
-    """Radians that `q` turns about the unit vector `axis`, in -π to π, when split into swing · twist."""
+    """Compute the twist of `q` = swing · twist about the unit vector `axis`, in radians from -π to π."""
     angle = 2.0 * math.atan2(dot((q[1], q[2], q[3]), axis), q[0])
     if angle > math.pi:
         angle -= 2.0 * math.pi
@@ -132,6 +132,6 @@ def twist_angle(q, axis):  # type: ignore[no-untyped-def]
 
 @compiled
 def about(axis, angle):  # type: ignore[no-untyped-def]
-    """The rotation about a unit vector by an angle in radians."""
+    """Compute the rotation about a unit vector by an angle in radians."""
     sine = math.sin(0.5 * angle)
     return math.cos(0.5 * angle), axis[0] * sine, axis[1] * sine, axis[2] * sine

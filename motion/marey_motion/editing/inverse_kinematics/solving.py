@@ -1,8 +1,8 @@
 """Inverse kinematics: rotations of joints that bring points, orientations and looks to their targets.
 
 Three solvers, each for one frame or many, which are solved one by one: the same frame has the same result alone and
-among others. None returns a pose that misses its targets by more than the given one (weighted squares of metres, where
-`ANGLE_LENGTH_M` is a radian); where that pose is outside limits, than that pose within them.
+among others. No solver returns a pose with a larger error than the given pose (weighted squares of metres, where
+`ANGLE_LENGTH_M` is a radian). If the given pose violates limits, it is brought within them before the comparison.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SolvedPoses:
     Parameters
     ----------
     motion : the frames, with the joints turned
-    residual_before, residual_after : (F, C) what each target is missed by: metres, or radians
+    residual_before, residual_after : (F, C) error of each target: metres, or radians
     iterations : (F,) sweeps or steps
     reached : (F,) whether all targets are met within the tolerances
     """
@@ -129,7 +129,7 @@ def solve(
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Bring targets to their values, by the solver that fits or by the one named.
+    """Solve for targets of joints, by the solver that suits them or by a given one.
 
     Parameters
     ----------
@@ -137,9 +137,9 @@ def solve(
     motion : Motion    F frames, which stay unchanged
     targets : sequence of targets    C targets
     freedom : Freedom    joints that may turn
-    limb : TwoBoneLimb, optional    a limb that may turn. "auto" takes the two-bone solver where there is one, all
-        targets are the position (in all axes) and the orientation of its end, and there are no limits; else, and where
-        the limb is too short in any of the frames and more may turn, least squares.
+    limb : TwoBoneLimb, optional    a limb that may turn. "auto" uses the two-bone solver if a limb is given, all
+        targets are the position (in all axes) and the orientation of its end, and there are no limits. Otherwise, or if
+        the limb is too short in any of the frames and other joints may turn, it uses least squares.
     solver : str    "auto", "ccd", "two_bone" or "least_squares"
     options : SolverOptions    tolerances and iterations
 
@@ -287,7 +287,7 @@ def solve_two_bone(
 
     Raises
     ------
-    EditError    where the joints form no limb or the targets do not belong to its end
+    EditError    if the joints form no limb or the targets do not belong to its end
     """
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
@@ -389,7 +389,7 @@ def limb_targets(
 
     Returns
     -------
-    (PositionTarget, OrientationTarget or None) or None    None where there are other targets
+    (PositionTarget, OrientationTarget or None) or None    None if there are other targets
     """
     positions = [target for target in targets if isinstance(target, PositionTarget)]
     orientations = [target for target in targets if isinstance(target, OrientationTarget)]

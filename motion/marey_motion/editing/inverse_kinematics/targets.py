@@ -25,7 +25,7 @@ ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
 
 @dataclass(frozen=True, eq=False)
 class PositionTarget:
-    """A point of a joint should be somewhere.
+    """Target position of a point of a joint.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class PositionTarget:
 
 @dataclass(frozen=True, eq=False)
 class OrientationTarget:
-    """A joint should be turned in a certain way.
+    """Target orientation of a joint.
 
     Parameters
     ----------
@@ -71,13 +71,13 @@ class OrientationTarget:
 
 @dataclass(frozen=True, eq=False)
 class LookAtTarget:
-    """An axis of a joint should point at something.
+    """Target point of an axis of a joint, such as that of the eyes.
 
     Parameters
     ----------
     joint : index of the joint
     point : (3,), or (F, 3) for each frame    metres, world
-    axis : (3,) direction in the joint's frame that looks
+    axis : (3,) direction in the joint's frame that should point at the target
     offset : (3,) metres in the joint's frame, from the joint to the eye
     weight : of the squared angle, where `ANGLE_LENGTH_M` is one radian
     """
@@ -103,11 +103,11 @@ class JointLimit:
 
     Parameters
     ----------
-    axis, side : (3,) unit directions in the joint's frame at a right angle to each other: what it twists about, and the
-        first axis it swings about; the second is axis × side
+    axis, side : (3,) unit directions in the joint's frame at a right angle to each other: the axis of the twist, and
+        the first axis of the swing; the second is axis × side
     twist_rad : least and greatest twist
     swing_rad : half axes of the ellipse that the swing's rotation vector stays in, about `side` and about axis × side
-    reference : (4,) local rotation that counts as none
+    reference : (4,) local rotation from which twist and swing are measured
     """
 
     axis: ArrayLike
@@ -236,7 +236,7 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
 
     Raises
     ------
-    EditError    where `top` is not above `effector`
+    EditError    if `top` is not above `effector`
     """
     path = skeleton.path_to_root(effector)
     if top not in path:

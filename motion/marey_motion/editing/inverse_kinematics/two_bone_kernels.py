@@ -1,4 +1,4 @@
-"""Limbs of two bones: the angle between the bones follows from the distance, the rest is aiming."""
+"""Inverse kinematics of limbs with two bones: the distance of the target gives their angle, then the limb is aimed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CARRIED, HELD, GIVEN = 0, 1, 2
 
 @compiled
 def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
-    """Inner angle (radians, π when straight) between bones of these lengths whose ends are `distance` apart."""
+    """Compute the inner angle (radians, π if straight) between bones whose ends are `distance` apart."""
     near = max(distance * distance - (first - second) ** 2, 0.0)
     far = max((first + second) ** 2 - distance * distance, 0.0)
     return 2.0 * math.atan2(math.sqrt(near), math.sqrt(far))
@@ -43,7 +43,7 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
-    """The wished inner angle, less of it the nearer a stretching limb comes to straight (Kovar et al. 2002, 5.2).
+    """Reduce the change to the inner angle `wished`, the more the straighter the limb becomes (Kovar et al. 2002, 5.2).
 
     In the last `zone` radians before straight, the change from `angle` is weighed by a cubic that falls from 1 to 0.
     """
@@ -60,7 +60,7 @@ def _weighed(angle, zone):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
-    """The fore bone's vector, from the middle, at the inner angle `wished` to the way back to the limb's root."""
+    """Compute the lower bone's vector at the inner angle `wished` to the reversed upper bone."""
     back, way = direction(upper), direction(fore)
     axis = cross(back, way)
     hinge = minus(hinge, scaled(back, dot(hinge, back)))
@@ -78,15 +78,15 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 
 @compiled
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
-    """Angle about the upper bone from a limb's hinge to the axis that it bends about by `wished` radians.
+    """Compute the angle about the upper bone from a limb's hinge to the axis about which it bends by `wished` radians.
 
     A nearly straight limb bends about its hinge, even where it is a little overstretched; a bend to the side is kept,
     and the added bend is about the hinge. The pose of a bent limb defines the axis.
 
     Parameters
     ----------
-    along, across : the sine of the bend now, about the hinge and about what is across
-    cosine : of the inner angle now
+    along, across : sine of the current bend, about the hinge and about the axis across it
+    cosine : of the current inner angle
     """
     sine = math.hypot(along, across)
     if cosine > 0.0:  # folded, not straight
@@ -131,7 +131,7 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: i
 
 @compiled
 def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
-    """Turn joint k by a rotation given in the world as it was before its parents turned."""
+    """Turn joint k by a rotation that is given in the world before its parents are turned."""
     parent = body.parents[k]
     spin = product(turn, rotation_at(work.spins, k))
     if parent >= 0:
@@ -154,7 +154,7 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """Largest span (F,) of limbs that span `starts` before damping reduces their stretching."""
+    """Compute the largest span (F,) that limbs of span `starts` reach before damping reduces their stretching."""
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]

@@ -1,1 +1,1 @@
-"""Improvements of a dataset: what can go, what fills its holes, and how settings change its evaluation."""
+"""Improvements of a dataset: removable clips, clips that fill its holes, and the effect of settings."""

@@ -26,7 +26,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class NearDuplicate:
-    """Two sources of nearly the same motion; if `mirrored`, that of `second` is its mirror image.
+    """Two sources of nearly the same motion; if `mirrored`, one is nearly the mirror image of the other.
 
     Parameters
     ----------
@@ -117,8 +117,7 @@ class _Families:
         return source_of(self._clips[self._first[number]])
 
     def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
-        """Find near-duplicates of a source's clip among later sources; also count the clips aligned with it, and all
-        later clips.
+        """Find near-duplicates of a source among later ones; also count the aligned clips, and all later clips.
 
         Mirroring both clips changes no distance, so one of them is never mirrored.
         """
@@ -165,7 +164,7 @@ def spared_sources(
 ) -> tuple[tuple[str, NearDuplicate], ...]:
     """Choose sources to remove so that no pair is left.
 
-    Of a pair, the one that is displayed less goes, then the shorter, then that of the higher uid.
+    Of a pair, the source that is displayed less is removed; in a tie the shorter one, then the one with the higher uid.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ class Filling:
 
     Parameters
     ----------
-    collection : what its collection was called
+    collection : name of its collection
     seconds : of the clip
     cells : that it helps to fill, most seconds first
     filled_s : sum over the cells
@@ -127,7 +127,7 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order the additions: each the best for the data that the set and those before it lack, until none helps.
+    """Order candidates: each is the best for the data that the set and the earlier ones lack, until none helps.
 
     Candidates of another skeleton come after all others.
 

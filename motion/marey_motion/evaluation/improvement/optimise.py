@@ -24,17 +24,17 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class OptimisationStep:
-    """One step, enough to do it again.
+    """Record of one step, sufficient to repeat it.
 
     Parameters
     ----------
-    sources : taken away or added: one, or all at once that no trial needs
+    sources : removed or added: one source, or at once all sources that no trial needs
     absent : the sources that are not in the set after the step, in ascending order
     objective : after the step, metres
     metrics : headline metrics after the step
     data_s : seconds of data after the step
     evaluations : candidates tried up to here, over all steps
-    changed_trials : trials that are not what they were before the step
+    changed_trials : trials whose result the step changes
     """
 
     number: int
@@ -50,7 +50,7 @@ class OptimisationStep:
 
 @dataclass(frozen=True)
 class Optimisation:
-    """The steps made, beginning with the set as it was ("start"), and why there are no more."""
+    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason why it ended."""
 
     steps: tuple[OptimisationStep, ...]
     ended: Literal["no gain", "steps", "evaluations"]
@@ -65,7 +65,7 @@ def optimise(
     made: Callable[[OptimisationStep], None] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Optimisation:
-    """Remove and add sources until nothing gains or the budget is spent.
+    """Remove and add sources until no step lowers the objective or the budget is spent.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _require_same(simulation: Resimulation, options: OptimisationOptions, last: 
 
 
 class _Search:
-    """Tries the candidates of one step after another, within the budget."""
+    """Search over the candidates of each step, within the budget."""
 
     def __init__(self, simulation: Resimulation, options: OptimisationOptions, evaluations: int) -> None:
         self._simulation, self._options = simulation, options

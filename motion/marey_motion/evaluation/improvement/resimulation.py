@@ -43,12 +43,12 @@ class Outcome:
 
 
 class Resimulation:
-    """The trials of a suite over the clips of a database that are left when some are taken away.
+    """Trials of a suite over a database from which clips are removed.
 
     Parameters
     ----------
     trials : the suite's when None
-    records : of these trials over the whole database, where they are there already
+    records : records of these trials over the whole database, if they exist already
     threads, cancelled : as in `suite.run_suite`
 
     `simulated` counts the trials that were run, `sources` has the indices of each source's clips.
@@ -111,7 +111,7 @@ class Resimulation:
         return tuple(outcome for outcome in found if outcome is not None)
 
     def results(self, removed: Collection[str] = NONE) -> tuple[TrialResult, ...]:
-        """Measure the trials without some sources, as `outcomes`.
+        """Simulate the trials without some sources, and return their metrics.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class Resimulation:
 
         Returns
         -------
-        bool    True where one is left
+        bool    True if a row is left
         """
         return bool(np.any(self.database.selectable & ~rows_of_sources(self.database.clips, removed)))
 

@@ -108,7 +108,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
     Raises
     ------
-    MotionError    where they differ, or share a clip
+    MotionError    if skeletons or options differ, or both databases have the same clip
     """
     if first.options != second.options:
         raise MotionError("both databases must be made with the same options", where="options")
@@ -154,7 +154,7 @@ def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
 
     Returns
     -------
-    bool    True where they can
+    bool    True if clips of both can be mixed
     """
     one, other = first.body.skeleton, second.body.skeleton
     if first.body.pose_joints != second.body.pose_joints or one.joint_count != other.joint_count:
@@ -174,7 +174,7 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
 
     Raises
     ------
-    MotionError    where they cannot
+    MotionError    if they cannot be mixed
     """
     if not same_skeleton(first, second):
         raise MotionError(

@@ -40,10 +40,10 @@ class Suggestions:
 
     Parameters
     ----------
-    unused : what can go without changing a trial
-    redundant : every clip tried, ranked by what its removal does per second saved
+    unused : data that can be removed without changing a trial
+    redundant : every clip tried, ranked by the harm of its removal per second saved
     plan : several removals after one another, beginning without the unused clips
-    spared : near-duplicates to take away, each with the pair whose other clip stays
+    spared : near-duplicates to remove, each with the pair whose other clip stays
     fillings, additions : clips of other collections, one by one and after one another
     tried : how many of the needed clips were left out in turn, and how many there are
     """

@@ -43,7 +43,7 @@ class Influence:
     ----------
     spread : largest minus least objective, metres
     best_weight : with the least objective
-    gain : what that saves against the first setting, metres
+    gain : decrease of the objective against the first setting, metres
     """
 
     group: str

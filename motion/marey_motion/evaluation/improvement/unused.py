@@ -6,8 +6,8 @@ clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BE
 may not choose. Taking their rows out of the database leaves the rows that are needed, the ones that follow them and all
 their features as they are. The margins are as wide as filters and differences reach, so that they hold what the
 features of needed frames were made from, too; but a recording that is cut there is sampled and filtered again, which
-rounds differently, and its frames near the cut look ahead into nothing: that is near the same, not the same, and is not
-called safe.
+rounds differently, and its frames near the cut have no frames to look ahead to. The result is then nearly, but not
+exactly, the same, and such a cut is not called safe.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ def read_predecessor_annotation(
     frame_count : int    frames of the clip
     end_index : str    "inclusive" where sections include their frame `end_idx`, as the predecessor's editor writes and
         shows them; "exclusive" as its time warping reads them
-    labels : sequence of str, optional    read only these, as where those of a document overlap and must become several
-        layers. Sections of a list have no label and are named "section 1" and so on.
+    labels : sequence of str, optional    read only these, for example if labels of a document overlap and must become
+        several layers. Sections of a list have no label and are named "section 1" and so on.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def read_predecessor_annotation(
 
     Raises
     ------
-    FormatError    naming the label and section; also where sections overlap or exceed the clip
+    FormatError    naming the label and section that is wrong; also if sections overlap or exceed the clip
     """
     return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
 

@@ -1,6 +1,6 @@
 """The predecessor's clip documents: reading and writing, as stored in its data base.
 
-Lengths are centimetres. Stored clips are mirrored in x for a left-handed engine: a translation (x, y, z) stands as
+Lengths are centimetres. Stored clips are mirrored in x for a left-handed engine: a translation (x, y, z) is stored as
 (-x, y, z) and a rotation (w, x, y, z) as (-w, -x, y, z), so the same map reads and writes. The root's translation is
 added to the root's offset. A clip names its joints but not their hierarchy: it needs its skeleton document.
 """
@@ -56,7 +56,7 @@ def motion_of_document(
 
     Raises
     ------
-    FormatError    naming the field, and the joint where there is one
+    FormatError    naming the field, and the joint if there is one
     """
     if "poses" not in document and "frames" not in document:
         return read_skeleton_document(document, file)

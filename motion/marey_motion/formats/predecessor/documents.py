@@ -43,7 +43,7 @@ def read_predecessor(
 
     Raises
     ------
-    FormatError    naming the field, and the joint where there is one
+    FormatError    naming the field, and the joint if there is one
     """
     document = decode_document(data, file)
     subject = _subject_of(document)

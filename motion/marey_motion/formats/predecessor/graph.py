@@ -30,7 +30,7 @@ class GraphNode:
     ----------
     model_id : in the data base that the graph comes from, or goes to
     type : one of `TYPES`
-    transitions : what may follow
+    transitions : nodes that may follow
     """
 
     model_id: str
@@ -40,7 +40,7 @@ class GraphNode:
 
 @dataclass(frozen=True)
 class PredecessorGraph:
-    """A graph that was read, or shall be written."""
+    """Graph that was read or is to be written."""
 
     nodes: Mapping[Place, GraphNode]
     start: Place
@@ -55,7 +55,7 @@ def is_graph(document: Mapping[str, Any]) -> bool:
 
     Returns
     -------
-    bool    True where it is
+    bool    True for a graph
     """
     return isinstance(document.get("nodes"), Mapping) and any(name in document for name in START_FIELDS)
 

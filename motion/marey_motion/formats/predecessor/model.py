@@ -54,7 +54,7 @@ class PredecessorModel:
     primitive : in our convention
     layout : of the document
     animated_joints : joints that the document has rotations of; the others of the skeleton rest
-    time_form : how its time function was meant, None where it had none and runs at constant speed
+    time_form : form of its time function; None for a model without one, which runs at constant speed
     time_error_frames : how far the time function of `primitive` is off that of the document, at most
     """
 
@@ -74,7 +74,7 @@ def layout_of(document: Document) -> Layout | None:
 
     Returns
     -------
-    str or None    "1", "2", "3" or "static"; None where it is not a model
+    str or None    "1", "2", "3" or "static"; None if it is not a model
     """
     if isinstance(document.get("sspm"), dict) and "gmm" in document:
         return "3"
@@ -318,7 +318,7 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
         return SplineBasis.clamped(frames, count)
     knots = _numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
     if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
-        raise FormatError(f"{what}: knots must be up to {MOST_FRAMES} numbers as high at most", file=file)
+        raise FormatError(f"{what}: knots must be at most {MOST_FRAMES} numbers up to {MOST_FRAMES}", file=file)
     degree = part.get("degree", DEGREE)
     if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:
         raise FormatError(f"{what}: degree is {degree!r}, a small whole number is needed", file=file)

@@ -4,8 +4,8 @@ Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as
 g. Ours keeps ln(t(x + 1) - t(x)), linear in g. The predecessor has two forms:
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later trainer): t(x) is a spline whose coefficients are
-  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g, so what is made of it is the best
-  linear function over the scores that the model draws; how far off that is comes along.
+  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g, so it is converted to the best
+  linear function over the scores that the model draws; the largest error is returned, too.
 * `increments` (layout 2 by its first trainer): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is linear in g.
   This is our own form.
 """
@@ -34,7 +34,7 @@ WRITTEN_COEFFICIENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class PredecessorTime:
-    """A time function as a model of the predecessor has it.
+    """Time function in one of the forms of the predecessor's models.
 
     Parameters
     ----------
@@ -89,9 +89,7 @@ def as_log_slopes(
         wanted = time.time_functions(scores)
         steps = np.diff(wanted, axis=1)
     if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < ODD_LOG_SLOPE).all()):
-        raise FormatError(
-            "the time function does not run forward at a speed that makes sense", code="bad-time", file=file
-        )
+        raise FormatError("the time function does not run forward at a plausible speed", code="bad-time", file=file)
     basis = _basis_over(steps.shape[1])
     # The fit over scores comes before the one over time, which is linear as well: a few functions are left by then.
     at_mean, by_score = _linear_fit(scores, np.log(steps))

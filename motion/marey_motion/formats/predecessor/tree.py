@@ -33,7 +33,7 @@ def is_tree(document: Mapping[str, Any]) -> bool:
 
     Returns
     -------
-    bool    True where it is
+    bool    True for a cluster tree
     """
     return "data" in document and isinstance(document.get("root"), Mapping) and "indices" in document["root"]
 
@@ -83,7 +83,9 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
     indices, children = _by_levels(field_of(document, "root", dict, file), len(samples), file)
     order = _in_tree_order(indices, children)
     if len(np.unique(order)) != len(samples):
-        raise FormatError("the ends of the tree do not hold each sample once", code="tree-invalid", file=file)
+        raise FormatError(
+            "the leaves of the tree do not contain each sample exactly once", code="tree-invalid", file=file
+        )
     sizes = np.array([len(one) for one in indices], dtype=np.int32)
     try:
         tree = SampleTree(samples[order].astype(np.float32), sizes, np.array(children, dtype=np.int32))

@@ -36,9 +36,9 @@ class SearchCheck:
 
     Parameters
     ----------
-    examples, joints : (n,) uid and standard name: whose joint was where the target is
+    examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
     frames : (n,) canonical frame: where the places of that joint differ most between examples
-    searched_cm, refined_cm : (n,) what the best sample of the tree misses, and what is left after refining it
+    searched_cm, refined_cm : (n,) error of the best sample of the tree, and after refining it
     """
 
     examples: tuple[str, ...]

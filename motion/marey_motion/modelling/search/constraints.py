@@ -32,7 +32,7 @@ class InvalidConstraint(MotionError):
 
 @dataclass(frozen=True)
 class JointPosition:
-    """A joint is at a place.
+    """Position of a joint.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class JointPosition:
 
 @dataclass(frozen=True)
 class JointOrientation:
-    """A joint has the given rotation; the error is the angle between that and its rotation, about any axis.
+    """Orientation of a joint; the error is the angle between the target and the joint's rotation, about any axis.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class JointOrientation:
 
 @dataclass(frozen=True)
 class LookDirection:
-    """An axis of a joint points in a direction, or at a point; the error is the angle between them.
+    """Direction, or point, that an axis of a joint points at; the error is the angle between them.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class LookDirection:
 
 @dataclass(frozen=True)
 class RootPosition:
-    """The pelvis is over a place on the ground.
+    """Position of the pelvis over the ground.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class RootPosition:
 
 @dataclass(frozen=True)
 class RootHeading:
-    """The body faces a heading on the ground, by its hips and shoulders.
+    """Heading of the body on the ground, given by its hips and shoulders.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class RootHeading:
 
 @dataclass(frozen=True)
 class KeyframeTime:
-    """A moment comes so long after the motion's beginning.
+    """Time from the motion's beginning to a moment.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def joint_index(primitive: MotionPrimitive, name: str, standard_joints: Mapping[
 
     Raises
     ------
-    UnknownJoint    where neither name exists
+    UnknownJoint    if neither name exists
     """
     if name not in primitive.skeleton and name in standard_joints:
         return standard_joints[name]

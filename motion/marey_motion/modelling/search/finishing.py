@@ -33,7 +33,7 @@ class Finished:
 
     Parameters
     ----------
-    errors : what is left, metres or radians, by step and place of the constraint; those that a solver can meet
+    errors : remaining errors, metres or radians, by step and place of the constraint, of those that a solver can meet
     """
 
     found: FoundMotion
@@ -100,7 +100,7 @@ def _constrained(
 
 
 def _chain(found: FoundMotion, joint: int, pelvis: int) -> tuple[int, ...]:
-    """List the joints from one up to below the pelvis, which moves the whole body."""
+    """List the joints from one up to the last below the pelvis; turning the pelvis would move the whole body."""
     path = found.skeleton.path_to_root(joint)
     return path[: path.index(pelvis)] if pelvis in path else path[:-1]
 

@@ -74,7 +74,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
 
     Raises
     ------
-    InvalidConstraint    where steps have different skeletons or frame rates
+    InvalidConstraint    if steps have different skeletons or frame rates
     """
     first = steps[0].primitive
     for number, step in enumerate(steps):

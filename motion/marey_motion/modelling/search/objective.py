@@ -60,12 +60,13 @@ class Rows(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Constraints about one latent vector, W numbers in all where it is one of several steps.
+    """Constraints linearised at one latent vector; W counts the numbers of the latent vectors of all steps.
 
     Parameters
     ----------
     points, point_slopes : (n, 3), (n, 3, W) what is tracked, in the world, and its derivatives
-    residuals, slopes : (3 m,), (3 m, W) errors of the constraints, in tolerances and by the roots of their weights
+    residuals, slopes : (3 m,), (3 m, W) errors of the constraints in tolerances, multiplied by the roots of their
+        weights
     """
 
     points: Floats
@@ -122,7 +123,7 @@ class Objective:
         return out
 
     def linearise(self, stacked: Floats, first: int, placement: Floats, moved: Floats) -> Linearised:
-        """Compute errors and their derivatives by all numbers of a stack of steps.
+        """Compute errors and their derivatives with respect to the latent vectors of all steps.
 
         Parameters
         ----------

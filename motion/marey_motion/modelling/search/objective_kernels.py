@@ -1,7 +1,7 @@
 """Compiled evaluation of constraints, kept apart so that importing the rest of the package does not load numba.
 
-`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so what comes out
-does not depend on how many are asked for at once, nor on threads. A placement is (heading, x, z).
+`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so that results
+depend neither on how many are evaluated at once nor on threads. A placement is (heading, x, z).
 
 Derivatives of rotations are angular velocities in the world: turning by a small w takes q to (1, w / 2) q.
 """
@@ -66,9 +66,9 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 
 @compiled
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
-    """Seconds since the beginning at each clock; the steps that they add up stay in `log_steps`.
+    """Fill the seconds since the beginning at each clock, and `log_steps` with the steps that they add up.
 
-    Returns what the times were multiplied by to keep the whole motion within its range, and its seconds without that.
+    Returns the factor of the times that keeps the whole motion within its range, and its seconds without that factor.
     """
     log_steps[:] = clocks.mean
     for component in range(clocks.directions.shape[0]):
@@ -91,7 +91,7 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
 
 @compiled
 def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
-    """Angle over its sine, and the derivative of that by the cosine."""
+    """Compute the angle over its sine, and the derivative of that by the cosine."""
     angle = math.atan2(sine, cosine)
     if angle < _SMALL:
         return 1.0 + angle * angle / 6.0, -1.0 / 3.0
@@ -101,7 +101,7 @@ def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
 
 @compiled
 def _rotation_error(turn, target, out):  # type: ignore[no-untyped-def]
-    """The rotation vector that takes the target to where the joint is turned; its length is the geodesic distance."""
+    """Fill `out` with the rotation vector from the target to the rotation; its length is the geodesic distance."""
     w, x, y, z = product(turn, inverse(target))
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
@@ -169,7 +169,7 @@ def _residual(row, rows, points, turns, times, room, out):  # type: ignore[no-un
 
 @compiled
 def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, rows) with how far latent vectors (n, L) miss each constraint: metres, radians or seconds."""
+    """Fill `out` (n, rows) with the errors of latent vectors (n, L) in each constraint: metres, radians or seconds."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations = np.empty((nodes, 3)), np.empty((nodes, 4))
@@ -201,7 +201,7 @@ def costs(prices, errors, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def track(chains, placement, latents, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n, items, 3) with what is tracked of the motions of latent vectors (n, L), in the world."""
+    """Fill `out` (n, items, 3) with the tracked points of the motions of latent vectors (n, L), in the world."""
     nodes, items = chains.parents.shape[0], chains.turned.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations, turns = np.empty((nodes, 3)), np.empty((nodes, 4)), np.empty((items, 4))

@@ -35,8 +35,8 @@ class Refined:
     Parameters
     ----------
     latents : (W,)
-    cost : what was minimised, there
-    start_cost : and where it began
+    cost : the minimised cost at `latents`
+    start_cost : the cost at the start
     iterations, evaluations : steps that were tried; motions that were evaluated, slopes included
     """
 
@@ -83,7 +83,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
     Raises
     ------
-    MotionError    where the start has no finite cost
+    MotionError    if the start has no finite cost
     """
     prior = _Prior(problem.priors, options.likelihood_weight)
     here = np.array(start, dtype=np.float64)
@@ -91,7 +91,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
     cost = start_cost = _cost(residuals, prior, here)
     if not np.isfinite(cost):
         raise MotionError(
-            "errors in their tolerances are too large to compute with; take wider tolerances or smaller weights",
+            "the constraints' errors are too large to compute with; use wider tolerances or smaller weights",
             code="refining-not-finite",
         )
     damping, evaluations, iterations = FIRST_DAMPING, 1, 0

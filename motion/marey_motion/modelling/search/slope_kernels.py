@@ -1,4 +1,4 @@
-"""Compiled derivatives of what constraints look at, by the latent vectors of one or several steps.
+"""Compiled derivatives of the tracked points and times of constraints by the latent vectors of one or several steps.
 
 A step's own latent vector moves its joints through spline, quaternion normalisation and forward kinematics; those of
 the steps before it move the placement of its canonical frame. `moved` (3, W) is the derivative of that placement
@@ -34,7 +34,7 @@ _SMALL_ANGLE = 1e-3
 
 @compiled
 def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
-    """Velocities (V, 3, k) of joints and angular velocities (V, 3, k), in the canonical frame, by each score."""
+    """Fill velocities and angular velocities (V, 3, k) of joints by each score, in the canonical frame."""
     for node in range(chains.parents.shape[0]):
         first, parent = chains.columns[node], chains.parents[node]
         w, x, y, z, length = local[node]
@@ -65,7 +65,7 @@ def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-u
 
 @compiled
 def track(chains, placement, moved, latent, first, points, turns, point_slopes, turn_slopes):  # type: ignore[no-untyped-def]
-    """Fill what is tracked, points (n, 3) and turns (n, 4), and its derivatives (n, 3, W), in the world."""
+    """Fill the tracked points (n, 3) and rotations (n, 4), and their derivatives (n, 3, W), in the world."""
     nodes, scores = chains.parents.shape[0], chains.directions.shape[0]
     channels, local = np.empty(chains.mean.shape[0]), np.empty((nodes, 5))
     positions, rotations = np.empty((nodes, 3)), np.empty((nodes, 4))
@@ -126,7 +126,7 @@ def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-
 
 @compiled
 def _hat(v, out):  # type: ignore[no-untyped-def]
-    """The matrix that takes a vector to v times it."""
+    """Fill `out` with the matrix whose product with a vector is the cross product of v with it."""
     out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
     out[1, 0], out[1, 1], out[1, 2] = v[2], 0.0, -v[0]
     out[2, 0], out[2, 1], out[2, 2] = -v[1], v[0], 0.0
@@ -159,7 +159,7 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Derivatives of angle / sin(angle) · (pointing × wanted); `distance` is 0 where the point may not move it."""
+    """Fill the derivatives of angle / sin(angle) · (pointing × wanted); `distance` is 0 if no point is involved."""
     across = np.empty(3)
     sine = _crossed(pointing, wanted, across)
     cosine = pointing[0] * wanted[0] + pointing[1] * wanted[1] + pointing[2] * wanted[2]
@@ -182,7 +182,7 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
 
 @compiled
 def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives (3, 3) of a constraint's error by the point and by the turn it looks at."""
+    """Fill the derivatives (3, 3) of a constraint's error by its tracked point and its tracked rotation."""
     kind, item = rows.kinds[row], rows.items[row]
     by_point[:], by_turn[:] = 0.0, 0.0
     if kind == POSITION:

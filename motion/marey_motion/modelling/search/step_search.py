@@ -32,11 +32,11 @@ class Sequel:
     Parameters
     ----------
     latents : one vector (L,) a step
-    measured : where they take place, and what they miss
+    measured : their placements and errors
     joints : standard names of the transition joints, whose jumps were measured after that of the pelvis
-    searched : what the search of each tree came upon
-    sampled : what comes of the searches alone
-    refined : how refining them ended, None where it was not asked for
+    searched : result of the search in each tree
+    sampled : placements and errors before refining
+    refined : result of refining, None if it was not requested
     """
 
     latents: tuple[Floats, ...]
@@ -75,7 +75,7 @@ def search_steps(
     Raises
     ------
     InvalidConstraint    naming step and constraint
-    MotionError    where numbers become too large to compute with
+    MotionError    if numbers become too large to compute with
     """
     problem = SeveralSteps.of(steps, start, transitions)
     searched: list[FoundSamples] = []

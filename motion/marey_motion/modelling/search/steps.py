@@ -30,7 +30,7 @@ MOST_SEARCH_STEPS = 32
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One motion of a sequence, and what it shall do.
+    """One motion of a sequence, with its constraints.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class _Walked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SeveralSteps:
-    """The constraints on several motions and on how they hang together.
+    """Constraints on several motions and on the continuity between them.
 
     Parameters
     ----------

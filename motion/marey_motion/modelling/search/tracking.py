@@ -110,7 +110,7 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
 
     Raises
     ------
-    MappingError    where hips or shoulders are not known
+    MappingError    if hips or shoulders are not known
     """
     missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]
     if missing:

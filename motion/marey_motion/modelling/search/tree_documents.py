@@ -56,6 +56,6 @@ def sample_tree_from_tree(tree: Mapping[str, Any]) -> SampleTree:
 
     Raises
     ------
-    MotionError    where its nodes do not form a tree
+    MotionError    if its nodes do not form a tree
     """
     return SampleTree(*(np.asarray(tree[name]) for name in ("samples", "sizes", "children")))

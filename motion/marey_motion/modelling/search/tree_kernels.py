@@ -24,7 +24,7 @@ def _square_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _place_centres(features, members, randoms, nearest, centres):  # type: ignore[no-untyped-def]
-    """Choose members as centres, far ones more likely, as k-means++ (Arthur and Vassilvitskii 2007); how many."""
+    """Choose centres among members by k-means++ (Arthur and Vassilvitskii 2007); return their number."""
     count = members.shape[0]
     centres[0] = features[members[min(int(randoms[0] * count), count - 1)]]
     for m in range(count):
@@ -49,7 +49,7 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
 
 @compiled
 def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
-    """Give each member to its nearest centre, the first of equals; how many changed."""
+    """Assign each member to its nearest centre, the first of equals; return the number of changes."""
     changed = 0
     for m in range(members.shape[0]):
         best, label = np.inf, 0
@@ -64,7 +64,7 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
 
 @compiled
 def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
-    """Move each centre to the mean of what it was given; one that was given nothing stays."""
+    """Move each centre to the mean of its members; a centre without members stays."""
     sums = np.zeros(centres.shape)
     sizes[:] = 0
     for m in range(members.shape[0]):
@@ -78,7 +78,7 @@ def _average(features, members, labels, centres, sizes):  # type: ignore[no-unty
 
 @compiled
 def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-def]
-    """Order members by cluster, changed in place, and fill the clusters' sizes; how many clusters there are."""
+    """Sort members by cluster in place, and fill the sizes of the clusters; return their number."""
     nearest, labels, ordered = room
     count = members.shape[0]
     centres = np.empty((sizes.shape[0], features.shape[1]))
@@ -108,9 +108,9 @@ def _split(features, members, randoms, sizes, room):  # type: ignore[no-untyped-
 
 @compiled
 def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, children):  # type: ignore[no-untyped-def]
-    """Split samples (n, D) again and again, level by level; how many nodes there are.
+    """Split samples (n, D) recursively, level by level; return the number of nodes.
 
-    `order` (n,) is permuted so that each node's members stand together; `starts`, `sizes` and `children` (nodes,) are
+    `order` (n,) is permuted so that each node's members are contiguous; `starts`, `sizes` and `children` (nodes,) are
     filled per node: first member, number of members, number of child nodes. Children of a node follow one another, and
     nodes of a level come in the order of their parents.
     """
