@@ -43,7 +43,7 @@ ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?
 
 
 class UserCreate(Request):
-    """A new user. Without a password the user can sign in with tokens only."""
+    """Request to create a user. Without a password the user can sign in with tokens only."""
 
     name: UserName
     display_name: DisplayName | None = None
@@ -84,7 +84,7 @@ class Me(Answer):
 
 
 class TokenCreate(Request):
-    """A new token for the caller."""
+    """Request to create a token for the caller."""
 
     name: DisplayName
     scopes: tuple[ScopeText, ...] = Field(("read", "write", "jobs"), min_length=1, max_length=32)
@@ -120,7 +120,7 @@ class Login(Request):
 
 
 class ProjectCreate(Request):
-    """A new project; the caller becomes its owner."""
+    """Request to create a project; the caller becomes its owner."""
 
     name: ProjectName
     title: DisplayName | None = None
@@ -152,7 +152,7 @@ class Project(Answer):
 
 
 class MemberChange(Request):
-    """The role a user gets in a project."""
+    """Request to give a user a role in a project."""
 
     role: Role
 

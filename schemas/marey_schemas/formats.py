@@ -36,10 +36,10 @@ class FileFormat:
 
     Parameters
     ----------
-    name : what choices, options and the modules of readers and writers call it
+    name : name in choices and options, and of the modules of its reader and writer
     endings : endings of file names, lower case; folders are searched for them, and the first is the one written
     media_type : of written files
-    reads, writes : what its reader understands and its writer can write
+    reads, writes : contents that its reader understands and its writer can write
     units : units of length that it is written in; more than one: the caller chooses
     begins : pattern that only the beginning of such a file matches; None where the name alone identifies it
     other_endings : endings that identify a named file, but that folders are not searched for

@@ -78,7 +78,7 @@ class PartsRequest(Request):
 
 
 class Item(Answer):
-    """A named thing of one kind, at its newest revision."""
+    """Named object of one kind in a project, at its newest revision."""
 
     id: str
     kind: Kind
@@ -143,7 +143,7 @@ class Lineage(Answer):
 
 
 class Staleness(Answer):
-    """Whether something an item was made from has a newer revision."""
+    """State of an item's inputs: whether any of them has a newer revision."""
 
     item: str
     revision: int
@@ -162,7 +162,7 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Which of these does the server lack, as far as the caller may know?"""
+    """Question which of the given blobs the server lacks; blobs hidden from the caller count as lacking."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 
@@ -174,7 +174,7 @@ class BlobsMissing(Answer):
 
 
 class UploadCreate(Request):
-    """Announce bytes that come in pieces."""
+    """Request to begin an upload of bytes in pieces."""
 
     length: int = Field(ge=1, le=16 * 2**30, description="Number of bytes of the whole upload.")
     digest: Digest | None = Field(None, description="Digest that the complete upload must have.")
@@ -190,7 +190,7 @@ class Upload(Answer):
 
 
 class Event(Answer):
-    """One thing that happened, in the order it became visible."""
+    """Event in a project; events are ordered by when they became visible."""
 
     seq: int
     at: datetime

@@ -32,22 +32,23 @@ class KindDeclaration:
 
     A job is spread over tasks in one of two ways. With `fan_out`, each task gets `batch_size` items of that input, and
     the whole is the sum of its tasks. With `task_count`, the checked parameters say how many tasks there are; each gets
-    all inputs and learns from `context.task` which it is. When all have succeeded, a worker runs `gathering`, a
-    function `gather(context, params, results)`, over what they returned, in their order. Where `task_count` says one,
-    a single job runs both functions.
+    all inputs, and `context.task` is its number. When all have succeeded, a worker runs `gathering`, a function
+    `gather(context, params, results)`, on their results in order. If `task_count` is one, a single job runs both
+    functions.
 
     Results are published again for identical jobs: for those of the same parameters, seed, and inputs, each with its
-    name, place and content. What else decides them is declared, and makes other jobs of them:
+    name, place and content. Further facts that determine the results are declared, and distinguish jobs:
 
     * `place_counts`: the collection they go to.
     * `newest_of`: parameters that each name an item, or none, whose newest revision is read.
-    * `never_cached_for`: says of parameters whether a job with them goes by names as they are while it runs.
-    * `in_place`: a parameter with which results replace what they are made of, if that is still the newest.
-      `never_cached_without`: inputs without which a job goes by names as they are while it runs. The results of such
-      jobs answer no other.
+    * `never_cached_for`: returns whether a job with the given parameters looks up names while it runs.
+    * `in_place`: a parameter with which results replace their sources, if these are still the newest revisions.
+      `never_cached_without`: inputs without which a job looks up names while it runs. Results of jobs that look up
+      names are not used again.
 
     `named_after` is the input whose items lend their places and names to the results; the parameter `suffix` is
-    appended. `unclear_place` says of checked parameters and a collection why it is open where results would go.
+    appended. `unclear_place` returns the reason why parameters and a collection do not determine the place of the
+    results.
     """
 
     name: str

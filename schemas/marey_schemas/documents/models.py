@@ -56,7 +56,7 @@ class FunctionalComponentsDocument(Request):
         if not (frames <= MOST_CANONICAL_FRAMES and frames * n <= MOST_BASIS_NUMBERS):
             raise ValueError(
                 f"knots: {frames:g} canonical frames with {n} coefficients; at most {MOST_CANONICAL_FRAMES} frames are "
-                f"taken, and {MOST_BASIS_NUMBERS:,} as the product of both"
+                f"accepted, and {MOST_BASIS_NUMBERS:,} as the product of the two"
             )
         return self
 

@@ -104,7 +104,7 @@ class Concatenate(NamedCommand):
 
 
 class Resample(NamedCommand):
-    """The same motion at another frame rate."""
+    """Sample the motion at another frame rate."""
 
     command: Literal["resample"] = "resample"
     frame_rate_hz: float = Field(
@@ -113,7 +113,7 @@ class Resample(NamedCommand):
 
 
 class Retime(NamedCommand):
-    """Faster or slower at the same frame rate."""
+    """Play the motion faster or slower, at the same frame rate."""
 
     command: Literal["retime"] = "retime"
     speed: float = Field(
@@ -160,7 +160,7 @@ class Rotate(NamedCommand):
 
 
 class Face(NamedCommand):
-    """Turn the whole motion about the vertical so that a frame faces a given way."""
+    """Turn the whole motion about the vertical so that the body has a given heading in a frame."""
 
     command: Literal["face"] = "face"
     heading_deg: Degrees = Field(0.0, description="Heading in degrees; 0 faces +z, and positive is to the left.")
@@ -177,7 +177,7 @@ class MoveToOrigin(NamedCommand):
 
 
 class Scale(NamedCommand):
-    """Scale where the body goes, heights too. The skeleton is an item of its own and keeps its size."""
+    """Scale the path of the body, including its heights. The skeleton is an item of its own and keeps its size."""
 
     command: Literal["scale"] = "scale"
     factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="Scale factor, about the origin.")
@@ -188,7 +188,7 @@ SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
 class FlipAxes(NamedCommand):
-    """Turn a world whose axes stand otherwise, such as Blender's with Z up, to Y up."""
+    """Turn a world with other axes, such as Blender's with Z up, to Y up."""
 
     command: Literal["flip_axes"] = "flip_axes"
     up: SignedAxis = Field("+z", description="The axis of the clip that points up now.")
@@ -229,13 +229,13 @@ class MoveToGround(NamedCommand):
 
 
 class FindGround(NamedCommand):
-    """Estimate the height of the ground from the feet while they stand; changes nothing."""
+    """Estimate the height of the ground from feet in contact with it; changes nothing."""
 
     command: Literal["find_ground"] = "find_ground"
 
 
 class FindContacts(NamedCommand, ContactOptions):
-    """Find when the feet stand; changes nothing."""
+    """Find the frames in which feet are in contact with the ground; changes nothing."""
 
     command: Literal["find_contacts"] = "find_contacts"
     height_limit_m: float | None = Field(

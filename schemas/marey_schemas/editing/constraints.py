@@ -70,7 +70,7 @@ class _Constraint(Tagged):
 
 
 class PositionConstraint(_Constraint):
-    """A joint, or a point that it carries, is somewhere. Without a place or a shift it stays where it first is."""
+    """Position of a joint or of a point that it carries; by default its initial position is kept."""
 
     kind: Literal["position"] = "position"
     point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
@@ -92,7 +92,7 @@ class PositionConstraint(_Constraint):
 
 
 class OrientationConstraint(_Constraint):
-    """A joint is turned in a certain way. Without a rotation it stays as it first is."""
+    """Orientation of a joint in the world. Without a rotation, the initial orientation is kept."""
 
     kind: Literal["orientation"] = "orientation"
     rotation: Rotation | None = Field(
@@ -101,7 +101,7 @@ class OrientationConstraint(_Constraint):
 
 
 class LookAtConstraint(_Constraint):
-    """A joint looks, or points, at something."""
+    """Point at which a joint looks or points."""
 
     kind: Literal["look_at"] = "look_at"
     point_m: Shift
@@ -121,7 +121,7 @@ class _Limit(Tagged):
 
 
 class HingeLimit(_Limit):
-    """A joint turns about its swing axis alone, as knees and elbows do."""
+    """Limit of a joint that turns about its swing axis alone, as knees and elbows do."""
 
     kind: Literal["hinge"] = "hinge"
     joint: JointName
@@ -129,7 +129,7 @@ class HingeLimit(_Limit):
 
 
 class ConeLimit(_Limit):
-    """A joint's bone stays in an elliptical cone about where it is in the rest pose."""
+    """Limit of a bone to an elliptical cone about its direction in the rest pose."""
 
     kind: Literal["cone"] = "cone"
     joint: JointName
@@ -163,7 +163,7 @@ class Constrain(NamedCommand):
 
 
 class FootContact(Request):
-    """A range of frames in which a foot stands."""
+    """Range of frames in which a foot is in contact with the ground."""
 
     foot: Literal["left", "right"]
     frames: Frames
@@ -194,7 +194,7 @@ class PlantOptions(Options):
 
 
 class PlantFeet(NamedCommand, PlantOptions):
-    """Keep feet where they stand."""
+    """Keep feet in place while they are in contact with the ground."""
 
     command: Literal["plant_feet"] = "plant_feet"
     contacts: tuple[FootContact, ...] | None = Field(

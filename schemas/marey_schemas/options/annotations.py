@@ -103,7 +103,7 @@ class VelocityMinimaProposal(_Proposal):
 
 
 class WristContactProposal(_Proposal):
-    """Reaches of a hand out of its rest and back, with a keyframe `contact` where it arrives at its far place."""
+    """Movements of a hand away from its rest position and back, with a keyframe `contact` on its arrival."""
 
     method: Literal["wrist_contact"] = Field(
         "wrist_contact", description="Name of the method that proposes segments and keyframes."

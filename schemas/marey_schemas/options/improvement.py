@@ -93,7 +93,7 @@ class OptimisationOptions(ObjectiveChoice):
 
 
 class SweepOptions(ObjectiveChoice):
-    """Settings of the weights that a sweep tries."""
+    """Options of a sweep: the weights of feature groups to try."""
 
     factors: tuple[_Factor, ...] = Field(
         (0.5, 2.0),
