@@ -57,13 +57,13 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     """Draw a PNG with one row per take: at each moment the figure of the source and, on a tinted ground, of the result.
 
     The figures of a take are drawn at one scale and seen from one side, to the left of where the source faces at first.
-    Each stands over its own spot of the floor y = 0, with an arrow where it faces.
+    Each figure is drawn over its own patch of the floor y = 0, with an arrow in its facing direction.
 
     Parameters
     ----------
-    takes : what to draw, at most `MAX_TAKES`
+    takes : takes to draw, at most `MAX_TAKES`
     heading : title of the page
-    moments : how many evenly spaced moments of each take to show, at most `MAX_MOMENTS` and one per frame
+    moments : number of evenly spaced moments of each take, at most `MAX_MOMENTS` and one per frame
 
     Raises
     ------
@@ -93,7 +93,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
 
 @dataclass(frozen=True)
 class _SheetRow:
-    """A take made ready for the page: bodies and stances of source and result, and from where they are seen."""
+    """Take prepared for the page: bodies and stances of source and result, and the camera."""
 
     take: TakePair
     times_s: AnyFloats
@@ -129,7 +129,7 @@ class _SheetCell:
     Parameters
     ----------
     left, bottom, width : of its ground, inches
-    centre : where the floor under the pelvis is, inches
+    centre : position of the floor under the pelvis, inches
     scale : inches per metre
     ground : colour behind it
     """

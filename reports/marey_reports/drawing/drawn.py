@@ -1,4 +1,4 @@
-"""A figure as it is handed out: two pictures, and the numbers that were drawn."""
+"""Figures ready for use: two pictures each, and the numbers that were drawn."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class DrawnFigure:
 
     Parameters
     ----------
-    name : what it is asked for by
-    number : the paper's number, or "" for those it has not
-    caption : what is to be seen, for people who read it and for those who cannot see it
+    name : name by which it is requested
+    number : number in the paper, or "" for figures that the paper does not have
+    caption : description of the figure, also for people who cannot see it
     tables : what was drawn, see `Tables`
     """
 

@@ -1,4 +1,4 @@
-"""The page that every report stands on: one file, its style and its script inside, nothing to fetch."""
+"""Page of every report: one file that contains its style and script and loads nothing else."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ID = re.compile(r" id=\"([^\"]*)\"")
 
 
 class Section(NamedTuple):
-    """A chapter of a report: its anchor, its heading and what it says."""
+    """Chapter of a report: its anchor, heading and content."""
 
     anchor: str
     heading: str

@@ -156,8 +156,8 @@ def told_apart(names: Sequence[str]) -> list[str]:
 def labels_of(names: Sequence[str], longest: int = LONGEST_NAME) -> list[str]:
     """Shorten names of clips to `longest` characters so that different names stay different.
 
-    Folders are left out where the takes in them have names of their own, and what all names begin with where one is
-    too long. Where cutting the middle would make several alike, the beginning that they share is cut instead.
+    Folders are left out if the names without them are still unique; the beginning that all names share is left out if
+    one name is too long. If cutting the middle would make several names equal, their shared beginning is cut instead.
     """
     takes = [name.rpartition("/")[2] for name in names]
     apart = takes if len(set(takes)) == len(set(names)) else without_shared_folder(names)

@@ -1,4 +1,4 @@
-"""Bodies as lines: which bones to draw, seen from where, and which is in front."""
+"""Bodies drawn as lines: the bones to draw, the camera, and the order of depth."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def runs_of(bones: Indices) -> list[Indices]:
 
 
 def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
-    """Compute the body in these frames (K,) alone, however long the clip is."""
+    """Compute the poses of the body in the given frames (K,) only."""
     points = kinematics.forward_kinematics(
         clip.skeleton,
         clip.poses[frames].astype(np.float64),

@@ -1,7 +1,7 @@
 """Strips of small figures: motions at the same moments, one motion or one set of motions per row.
 
-All cells of a column look at the same spot of the floor, so that what differs between rows is seen where it happens.
-The lines of a body are joined to one shape per side, which keeps a drawing of a hundred bodies light.
+All cells of a column show the same patch of the floor, so that differences between rows are visible in place. The lines
+of a body are joined to one shape per side, which keeps a drawing of a hundred bodies light.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class StripRow:
     ----------
     label, note : to its left, the note in small letters below
     bodies : (m, T, P, 3) points of m motions at T moments, metres, drawn on top of each other
-    ways : (m, N, 3) where the root goes, drawn on the floor; N may be 0
+    ways : (m, N, 3) paths of the root, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion to compare with, drawn in grey behind
     """
 
@@ -76,7 +76,7 @@ def draw_strips(
     Parameters
     ----------
     cell_in : width and height of a cell, inches
-    legend : names and colours of what is drawn besides the two sides
+    legend : names and colours of further elements besides the two sides
     """
     width, height = cell_in
     columns = len(moments.names)
@@ -153,7 +153,7 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 class _Look(NamedTuple):
-    """Style of a body; without a colour in those of its sides, with a rim set off from the background."""
+    """Style of a body: without a colour, its sides have their own; a rim separates it from the background."""
 
     width: float
     alpha: float = 1.0

@@ -1,4 +1,4 @@
-"""Tables of a report, and numbers as they are written in them."""
+"""Tables of a report, and the format of their numbers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_NAMES = 40
 
 
 class Number(NamedTuple):
-    """A number in a table: its value, which rows are sorted by, and how it is written."""
+    """Number in a table: its value, by which rows are sorted, and its text."""
 
     value: float | None
     written: str
@@ -43,7 +43,7 @@ def table(
 
     Parameters
     ----------
-    numbers : columns that hold numbers, which stand to the right
+    numbers : columns of numbers, which are aligned to the right
     sortable : by a click on a column's head
     """
     look = dict.fromkeys(numbers, "number")

@@ -1,4 +1,4 @@
-"""The report of two evaluations of the same trials: what changed, and whether it helped."""
+"""Report that compares two evaluations of the same trials."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
 
 
 def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
-    """Pair the trials that both have, in the order of the first."""
+    """Pair the trials that both evaluations have, in the order of the first."""
     known = {each.trial.name: each for each in after.trials}
     return [(each, known[each.trial.name]) for each in before.trials if each.trial.name in known]
 

@@ -9,7 +9,7 @@ from marey_reports.drawing.tables import table
 
 
 class Metric(NamedTuple):
-    """A metric of the suite as a report shows it: name, unit, decimals, and what it means."""
+    """Metric of the suite in a report: name, unit, decimals and meaning."""
 
     label: str
     unit: str

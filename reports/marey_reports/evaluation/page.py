@@ -47,7 +47,7 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
     Parameters
     ----------
     title : heading of the page, for example the name of the dataset
-    figures : by name, as `draw_figures` gives them; drawn when None. Those that are missing leave no gap
+    figures : by name, as `draw_figures` gives them; drawn when None. Missing ones are left out
     """
     drawn = draw_figures(result) if figures is None else figures
     sections = [
@@ -78,8 +78,8 @@ def render_comparison(
 
     Parameters
     ----------
-    comparison : of the two; it adds intervals of confidence, and says which trials differ in any tick
-    labels : what figures and tables call the two
+    comparison : comparison of both; adds confidence intervals, and marks the trials that differ in any tick
+    labels : names of both in figures and tables
     figures : by name, as `draw_figures` gives them for two results; drawn when None
     """
     drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
@@ -114,7 +114,7 @@ def verdict(result: EvaluationResult) -> str:
 
 
 def _failing(outcome: TrialResult) -> str:
-    """Describe the limit that a trial breaks most, and by how much."""
+    """Describe the limit that a trial exceeds most, and the excess."""
     kind = max(zip(strain(outcome), ("offset_mean", "se_v", "se_omega_deg"), strict=True))
     value = outcome.metrics.get(kind[1])
     if value is None or math.isinf(kind[0]):

@@ -14,12 +14,12 @@ from marey_reports.drawing.words import span
 
 
 class CoverageGap(NamedTuple):
-    """Neighbouring cells of one speed that lack data: what to record there, and how much.
+    """Rectangle of neighbouring cells that lack data, and the seconds to record there.
 
     Parameters
     ----------
     turn_rates_deg_s, speeds_m_s : (low, high)
-    missing_s : seconds of data that lack in all
+    missing_s : seconds of data missing in total
     """
 
     turn_rates_deg_s: tuple[float, float]
@@ -36,7 +36,7 @@ def find_holes(coverage: Coverage) -> list[CoverageGap]:
     """Combine the missing cells to few rectangles, the largest deficit first.
 
     Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
-    speed. A rectangle is named by the centres of its outermost cells: they are the trials that it stands for.
+    speed. A rectangle is described by the centres of its outermost cells, which are trials.
     """
     lacking = coverage.deficit_s > 0.0
     speeds, turns = (_centres(edges) for edges in (coverage.speed_edges_m_s, coverage.turn_rate_edges_deg_s))

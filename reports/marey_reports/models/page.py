@@ -41,10 +41,9 @@ def render_model_report(
     Parameters
     ----------
     subject : the same model with its examples
-    figures : by name, as `draw_alignment_figures` and `draw_model_figures` give them. Those that are missing leave no
-        gap
+    figures : by name, as `draw_alignment_figures` and `draw_model_figures` give them. Missing ones are left out
     title : heading of the page, for example the name of the model
-    origin : where the examples come from, as the part `model` says it
+    origin : origin of the examples, from the part `model`
     """
     sections = [
         warning_chapter(trained),

@@ -44,7 +44,7 @@ class FigureKind(NamedTuple):
     Parameters
     ----------
     number : in the paper, or ""
-    trials : "one" when it shows one trial, "any" when it shows the suite or one trial, "none" when always the suite
+    trials : "one" if it shows one trial, "any" if it shows the suite or one trial, "none" if it always shows the suite
     families : those whose trials it can show
     draw : makes the page of one or two subjects
     """
@@ -96,11 +96,11 @@ def draw_figure(
     trial : name of the trial to show, such as "switching v=1.5 w=-50". Without it, figures of one trial show the one
         that was followed worst, and the others the whole suite
     other : the result to compare with, drawn second
-    labels : what the two are called in a comparison
+    labels : names of the two results in a comparison
 
     Raises
     ------
-    MotionError    for a figure or a trial that there is not, or a trial without its record
+    MotionError    for an unknown figure or trial, or a trial without its record
     """
     kind = FIGURES.get(name)
     if kind is None:
@@ -120,7 +120,7 @@ def draw_figures(
 ) -> dict[str, DrawnFigure]:
     """Draw every possible figure of a result, or of two, by name.
 
-    Left out are those of trials that there are not, and those that need records where these were not kept.
+    Figures of missing trials are left out, and so are figures that need records that were not stored.
     """
     results = [result] if other is None else [result, other]
     names = set.intersection(*({each.trial.name for each in one.trials} for one in results))

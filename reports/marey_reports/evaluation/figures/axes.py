@@ -17,7 +17,7 @@ TURN_RATE = "turn rate (deg/s, left positive)"
 
 
 def mark_sides(axes: Axes) -> None:
-    """Say which half of an axis of turn rates is which, in the corners above the panel's ground."""
+    """Label the left and right halves of an axis of turn rates, in the corners above the panel."""
     look = {"transform": axes.transAxes, "color": QUIET, "fontsize": SMALL, "va": "bottom"}
     write(axes, (0.0, 1.005), "← right turns", ha="left", **look)
     write(axes, (1.0, 1.005), "left turns →", ha="right", **look)

@@ -1,4 +1,4 @@
-"""Figure 9: how often each clip was used, and how often the character switched."""
+"""Figure 9: use of each clip, and number of transitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figure 6: where the data is dense, as seconds of data; and the same over forward and sideways speed."""
+"""Figure 6: density of the data in seconds, over turn rate and speed, and over sideways and forward speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Two quantities of the windows, what they are called, and the size of the cell that seconds are counted in."""
+    """Two quantities of the windows, their names, and the size of the cell in which seconds are counted."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]
@@ -138,7 +138,7 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 
 def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Choose the range that is shown even without data, along both axes."""
+    """Choose the range that is always shown, along both axes."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)

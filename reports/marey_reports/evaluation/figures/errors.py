@@ -1,4 +1,4 @@
-"""Figure 8: how often which error of speed and turn rate, with one and two normal distributions fitted."""
+"""Figure 8: histograms of the errors of speed and turn rate, with one and two fitted normal distributions."""
 
 from __future__ import annotations
 

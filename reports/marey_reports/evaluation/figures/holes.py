@@ -1,4 +1,4 @@
-"""The map of what is missing: seconds of data that each cell of speed and turn rate lacks."""
+"""Map of missing data: the seconds that each cell of speed and turn rate lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figure 5: how far from the wished path the character was, over the grid of speeds and turn rates."""
+"""Figure 5: distance of the character from the desired path, over the grid of speeds and turn rates."""
 
 from __future__ import annotations
 

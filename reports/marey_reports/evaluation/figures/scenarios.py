@@ -1,4 +1,4 @@
-"""Figures 4a and 4b: a trial seen from above, its sections numbered, and where the character went."""
+"""Figures 4a and 4b: a trial seen from above with numbered sections, and the path of the character."""
 
 from __future__ import annotations
 

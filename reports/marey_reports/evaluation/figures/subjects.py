@@ -25,7 +25,7 @@ class FigureOptions:
     Parameters
     ----------
     negate_errors : draw reference minus recorded, as the paper's figure 8, instead of recorded minus reference
-    logarithmic : popularity of frames, and lengths of bars of usage, on a logarithmic scale
+    logarithmic : whether popularity of frames and lengths of bars of usage have a logarithmic scale
     most_clips : clips that are drawn one by one; the rest is summed up
     """
 
@@ -36,7 +36,7 @@ class FigureOptions:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A result under the name that figures give it; the name is "" when it is the only one."""
+    """Result and its name in figures; the name is "" if it is the only result."""
 
     label: str
     result: EvaluationResult
@@ -66,7 +66,7 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class TrialView:
-    """One trial of a subject: what it asked for and every step of what happened."""
+    """One trial of a subject: its desired motion, and every step of its record."""
 
     subject: Subject
     trial: Trial

@@ -1,4 +1,4 @@
-"""Figure 7: what transitions cost over a trial, beside the speed that was wished."""
+"""Figure 7: costs of transitions during a trial, below the speeds."""
 
 from __future__ import annotations
 

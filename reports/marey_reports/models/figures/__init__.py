@@ -1,4 +1,4 @@
-"""The figures of a model: how its examples were aligned, what it keeps of them, what it does, and how well.
+"""Figures of a model: alignment and reconstruction of its examples, its samples, and its quality.
 
 matplotlib is loaded when the first figure is drawn. The same model and examples give the same bytes.
 """

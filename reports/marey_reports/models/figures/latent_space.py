@@ -1,4 +1,4 @@
-"""The examples as the model sees them: where they lie in its latent space, and how likely each of them is."""
+"""Figures of the examples of a model: their positions in latent space, and their likelihoods."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = 
     Parameters
     ----------
     searched_cm, refined_cm : (n,) distance of the joint from its target, centimetres
-    about : what the targets are, for the caption; a clause that ends without a full stop
+    about : description of the targets for the caption, without a full stop
     """
     ceiling = 1.02 * max(float(np.max(searched_cm, initial=0.0)), float(np.max(refined_cm, initial=0.0)), 0.1)
     edges = np.linspace(0.0, ceiling, BINS + 1)

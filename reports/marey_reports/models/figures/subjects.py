@@ -39,8 +39,8 @@ class ModelSubject:
     ----------
     primitive : the model
     examples : that it was trained on
-    report : how good it is
-    check : how near searches come, if that was measured
+    report : its quality
+    check : accuracy of searches, if it was measured
     seed : of the samples that are drawn
     """
 
