@@ -27,7 +27,9 @@ def main() -> int:
         if module.name.startswith("bench_")
     )
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(names)}; all when absent")
+    parser.add_argument(
+        "names", nargs="*", metavar="name", help=f"benchmarks to run, of {', '.join(names)}; default: all"
+    )
     parser.add_argument("--json", metavar="FILE", help="write the rows as JSON too")
     parser.add_argument("--strict", action="store_true", help="fail when a goal is missed")
     arguments = parser.parse_args()

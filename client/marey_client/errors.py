@@ -8,7 +8,7 @@ from marey_schemas.problems import FieldError, Problem
 
 
 class MareyError(Exception):
-    """Something Marey's client could not do; the text is written for people."""
+    """Base of all errors of Marey's client; the text is written for people."""
 
 
 # Nobody answered, or somebody else did
@@ -19,7 +19,7 @@ class Unreachable(MareyError):
 
 
 class UnexpectedAnswer(MareyError):
-    """The answer is not one a Marey server gives."""
+    """The answer does not come from a Marey server."""
 
 
 # What happened on this machine
@@ -38,11 +38,11 @@ class BadToken(MareyError):
 
 
 class BadAddress(MareyError):
-    """The address of a server is none."""
+    """The address of a server is not valid."""
 
 
 class DigestMismatch(MareyError):
-    """The bytes that arrived are not those that were asked for."""
+    """The received bytes do not have the requested digest."""
 
 
 class FileChanged(MareyError):
@@ -107,7 +107,7 @@ class RequestFailed(MareyError):
 
     @property
     def code(self) -> str:
-        """The stable slug of what went wrong."""
+        """The stable slug of the error."""
         return self.problem.code
 
     @property
@@ -144,13 +144,13 @@ class Unauthenticated(RequestFailed):
 
 
 class Forbidden(RequestFailed):
-    """The token allows to see this, not to do that."""
+    """The token allows reading this, but not the requested change."""
 
     status = 403
 
 
 class NotFound(RequestFailed):
-    """There is nothing here that the token allows to see."""
+    """The resource does not exist, or the token does not allow reading it."""
 
     status = 404
 
@@ -202,7 +202,7 @@ class Unavailable(ServerFailed):
 
 
 class StorageFull(ServerFailed):
-    """The server has no room left."""
+    """The server has no storage space left."""
 
     status = 507
 

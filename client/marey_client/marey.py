@@ -28,7 +28,7 @@ class Marey:
     url : address of the server, such as `https://marey.example.org`; without one, server and token are those that
         the environment or `marey login` name, as for the command line
     token : a personal token; None with a url reads public projects only
-    retries : how often and how long requests that cannot harm are sent again
+    retries : number and duration of repetitions of requests that are safe to repeat
     timeout_s : how long the server may stay silent
     http : replaces the network in tests
     """

@@ -103,7 +103,8 @@ class ProjectHandle(ProjectItems):
 
         `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are those of
         `model_building.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
-        `cut={"labels": ["left"]}`. Of takes of which some have changed, only what depends on those is computed again.
+        `cut={"labels": ["left"]}`. If some of the takes have changed, only results that depend on those are computed
+        again.
         """
         plan = plan_model(self, takes, name=name, **choices)
         return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache))
@@ -166,7 +167,7 @@ class ProjectHandle(ProjectItems):
     ) -> Job:
         """Submit the alignment of clips of one skeleton, all of which show the same action.
 
-        `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. Where a layer or labels are
+        `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If a layer or labels are
         named and no annotations are given, the annotations of the clips are used.
         """
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
@@ -203,7 +204,7 @@ class ProjectHandle(ProjectItems):
         """Submit the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
-        `normaliser` is an evaluation, or its id, that the result shall be comparable with.
+        `normaliser` is an evaluation, or its id, with which the result will be comparable.
         """
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))

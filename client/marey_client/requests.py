@@ -111,7 +111,7 @@ def edit_request(project: ProjectItems, clips: Clips, commands: Commands, option
 def evaluate_request(
     project: ProjectItems, clips: Clips, params: EvaluateParams, normaliser: EvaluationHandle | str | None
 ) -> JobCreate:
-    """Ask for an evaluation of clips; those with the tag `loop` are loops."""
+    """Return the job request to evaluate clips; those with the tag `loop` are loops."""
     found = list(items_at(project.clips, clips))
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if normaliser is not None:
@@ -124,7 +124,7 @@ def evaluate_request(
 
 
 def model_request(aligned: AlignedClips, params: ModelParams) -> JobCreate:
-    """Ask for a model that is trained on aligned clips."""
+    """Return the job request to train a model on aligned clips."""
     return job_request("model", {"aligned": as_inputs(aligned)}, params)
 
 
@@ -137,11 +137,11 @@ def plan_model(
     notice: Notice | None = None,
     **choices: Any,
 ) -> ModelPlan:
-    """Plan the jobs that make a model of these takes. Files are sent now, to be imported with these `options`.
+    """Plan the jobs that make a model of takes. Files are sent at once; the jobs import them with the given `options`.
 
     With a `layer`, clips are cut along their annotations of that layer, or aligned by them. The `choices` are fields of
     `ModelPlan`; results go to a folder of the model's name unless one is named.
-    Raises `NoAnnotations` where no annotation of the layer is over the clips.
+    Raises `NoAnnotations` if the clips have no annotation of the layer.
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]

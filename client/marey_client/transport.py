@@ -60,7 +60,7 @@ def trusted_authorities() -> ssl.SSLContext:
 
 
 class Transport:
-    """One server as HTTP sees it. May be used by several threads."""
+    """HTTP connections to one server. May be used by several threads."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Transport:
         return other
 
     def with_retries(self, retries: Retries) -> Transport:
-        """Return the same connections and token with other patience."""
+        """Return the same connections and token with another policy of retries."""
         other = copy(self)
         other.retries = retries
         return other
@@ -132,8 +132,8 @@ class Transport:
     ) -> httpx.Response:
         """Send a request until it is answered, and return the answer, read whole.
 
-        A POST carries an idempotency key unless `repeatable` is given. Where it is False, or the method changes things,
-        a request whose connection broke is not sent twice. A streamed `content` is a function that starts it afresh.
+        A POST carries an idempotency key unless `repeatable` is given. If it is False, or the method changes things, a
+        request whose connection broke is not sent twice. A streamed `content` is a function that returns a new stream.
 
         Raises `RequestFailed` for a problem document, `Unreachable` without an answer.
         """
@@ -255,7 +255,7 @@ def read_tree(response: httpx.Response) -> Any:
 
 
 def raise_for_problem(response: httpx.Response) -> None:
-    """Raise the error of an answer, if it is one."""
+    """Raise the error that an answer describes, if it describes one."""
     if response.status_code < 400:
         return
     circumstances: dict[str, Any] = {

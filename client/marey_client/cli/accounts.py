@@ -244,7 +244,7 @@ def change_user(
     administrator: Annotated[bool | None, typer.Option(help="Grant or revoke the rights of an administrator.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change what a user is called, and whether they are an administrator."""
+    """Change the displayed name of a user, and whether they are an administrator."""
     from marey_schemas.access import UserChange
 
     given = {"display_name": display_name, "administrator": administrator}

@@ -153,7 +153,7 @@ def list_commands(
     name: Annotated[str | None, typer.Argument(help="Name of a command; default: all commands.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what an edit can do, or the parameters of one command."""
+    """Show the commands of edits, or the parameters of one command."""
     from marey_schemas.editing.edits import COMMAND_MODELS
 
     if name is not None and name not in COMMAND_MODELS:

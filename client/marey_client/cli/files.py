@@ -46,7 +46,7 @@ def upload(
     left_handed: Annotated[bool, typer.Option("--left-handed", help="Short form of --handedness left.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Import motion files. Each goes in or is refused with a reason; the same file again makes nothing new."""
+    """Import motion files. A file may be refused with a reason; one that was imported before changes nothing."""
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions
 
@@ -202,7 +202,7 @@ def show(
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show an item: its parts, its place, what was found when it was imported."""
+    """Show an item: its parts, its place, and the findings of its import."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
@@ -270,9 +270,9 @@ def download(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files. A folder comes with the folders below it; one without clips with its aligned clips.
+    """Write clips to files, those of a folder with those below it; a folder without clips gives its aligned clips.
 
-    A file that is there already is replaced; of clips that would have one file name, the later ones get a number.
+    An existing file is replaced; if several clips would have the same file name, the later ones get a number.
     """
     if format not in EXPORT_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")

@@ -45,7 +45,7 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
 def follow(
     marey: Marey, submitted: Job, *, wait: bool = True, as_json: bool = False, count: int | None = None, unit: str = ""
 ) -> Job | None:
-    """Wait until a job has ended, with a progress bar; `count` is the number of units of a gathering job.
+    """Wait until a job has ended, with a progress bar; `count` is the number of units of a job with tasks.
 
     Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
     """
@@ -69,7 +69,7 @@ def follow(
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show the progress of a job; that of a gathering job is counted in tasks, or in `count` units."""
+    """Show the progress of a job; a job that is split into tasks is counted in tasks, or in `count` units."""
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)

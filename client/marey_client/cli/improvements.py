@@ -103,7 +103,7 @@ def suggest(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Find clips of an evaluated set that can go, and others that would fill its holes."""
+    """Find clips of an evaluated set that can be removed, and others that would fill its holes."""
     if remove_out is not None and not wait:
         raise WrongUsage("--remove-out needs the result; remove --no-wait")
     with connect(context) as marey:

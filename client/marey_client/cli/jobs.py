@@ -35,7 +35,7 @@ def list_kinds(
     name: Annotated[str | None, typer.Argument(help="Kind of job; default: all kinds.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show what can be asked for, or what one kind takes."""
+    """Show the kinds of jobs, or the inputs and parameters of one kind."""
     with connect(context) as marey:
         kinds = list(marey.jobs.kinds()) if name is None else [_kind_of_job(marey, name)]
     if as_json:

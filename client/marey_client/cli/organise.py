@@ -91,7 +91,7 @@ def rm(
 
 
 def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json: AsJson = False) -> None:
-    """Bring back what was removed, a folder with all that went with it; `marey ls --deleted` shows what can be."""
+    """Restore removed items, and folders with the contents removed along with them; `marey ls --deleted` lists them."""
     from marey_client.errors import Conflict
 
     with connect(context) as marey:
@@ -118,7 +118,7 @@ def tag(
     kind: KindOf = None,
     as_json: AsJson = False,
 ) -> None:
-    """Add tags to items, and take others away; `marey ls --tag` finds by them."""
+    """Add tags to items, and remove others; `marey ls --tag` lists items by tag."""
     from marey_schemas.items import ItemChange
 
     added, removed = tuple(add or ()), frozenset(remove or ())

@@ -90,7 +90,7 @@ def build_model(
 ) -> None:
     """Make a model from takes: import, retarget, annotate, cut, align, train, make a tree.
 
-    What was computed before is not computed again: after a take has changed, only what depends on it is.
+    Existing results are used again: if a take has changed, only the results that depend on it are computed.
     """
     plan: dict[str, Any] = _chosen(choices or ())
     if propose:
@@ -146,7 +146,7 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
         if len({address.project for address in addresses}) > 1:
             raise WrongUsage("the takes must be in one project")
         if options:
-            raise WrongUsage("import.… is for local files; give their project with --project")
+            raise WrongUsage("parameters of import apply to local files; name the project for them with --project")
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions

@@ -106,7 +106,7 @@ def demo(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """From takes to an evaluated dataset on this machine: import, retarget, evaluate; a table, a picture, a report."""
+    """Demonstrate Marey on this machine: import, retarget and evaluate takes; make a table, a picture and a report."""
     from marey_client.cli.demo.story import demonstrate
 
     demonstrate(motion, data=data, keep_serving=serve_on, as_json=as_json)
@@ -137,7 +137,7 @@ def restore_database(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Put a backup in the place of a database that is not there yet."""
+    """Restore a backup as a new database, which must not exist yet."""
     _database("restore", data, database_url, source=source)
 
 
@@ -155,7 +155,7 @@ def make_admin_token(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Write a new administrator's token to admin.token in the data folder, when it is lost."""
+    """Write a new administrator's token to admin.token in the data folder, in place of a lost one."""
     _database("admin_token", data, database_url, user=user)
 
 

@@ -44,7 +44,7 @@ def create_project(
 
 @project.command("ls")
 def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
-    """Show every project you may see."""
+    """Show every project that you may read."""
     with connect(context) as marey:
         projects = list(marey.projects())
     if as_json:
@@ -72,7 +72,7 @@ def change_project(
     visibility: Annotated[str | None, typer.Option(help="Visibility: private or public.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change what a project is called and who may read it."""
+    """Change the title of a project, and who may read it."""
     from marey_schemas.access import ProjectChange
 
     given = {"title": title, "description": description, "visibility": visibility}

@@ -34,7 +34,7 @@ def map_joints(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show which joint plays which standard joint, or change it; a change is a new revision."""
+    """Show the mapping of standard joints to joints, or change it; a change is a new revision."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:

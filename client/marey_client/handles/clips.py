@@ -74,7 +74,7 @@ class ClipHandle(ItemHandle):
     def annotate(self, layer: str, *, name: str | None = None, **said: Any) -> AnnotationHandle:
         """Create an annotation of this revision of the clip, in the clip's folder.
 
-        `said` are `segments` and `keyframes` as in `Annotation`; without them the annotation is empty.
+        `said` are the fields `segments` and `keyframes` of `Annotation`; without them the annotation is empty.
         """
         document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **said})
         return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(
@@ -86,8 +86,8 @@ class ClipHandle(ItemHandle):
     def preview(self, commands: Commands, *, frames: slice | None = None, **options: Any) -> EditPreview:
         """Return frames of the result of commands on the clip, without storing it.
 
-        `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. `RequestFailed`
-        where the commands cannot be applied, or would take too long for a preview.
+        `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. Raises
+        `RequestFailed` if the commands cannot be applied, or would take too long for a preview.
         """
         frames_text(frames)
         bounds = (0, None) if frames is None else (frames.start or 0, frames.stop)

@@ -86,7 +86,7 @@ class CoverageStreamHandle:
 
         `translations` (n, k, 3) go with poses whose joints move in their parents, too. At most 4096 frames at a time; a
         tenth of a second to a second is usual. Frames whose answer was lost on the way are sent again and count once.
-        Raises `Conflict` where somebody else sends to the stream, too.
+        Raises `Conflict` if another sender uses the stream, too.
         """
         said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:

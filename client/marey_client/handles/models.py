@@ -27,8 +27,8 @@ class Samples:
 
     Parameters
     ----------
-    latents : (n, L) what they are in the model
-    log_densities : (n,) natural logarithm of how likely each is
+    latents : (n, L) latent vectors of the motions
+    log_densities : (n,) natural logarithm of the density of each
     motions : n of them, in the canonical frame: the body begins at x = z = 0 and faces +z
     """
 

@@ -44,7 +44,7 @@ class DemoReport:
 
     @property
     def refused(self) -> list[tuple[str, str]]:
-        """(step, name and reason) of everything that was refused."""
+        """Refusals, as step, name and reason."""
         imports = [("import", refusal_text(entry)) for entry in self.entries if entry.error is not None]
         result = (self.job.result if self.job else None) or {}
         retargets = [
