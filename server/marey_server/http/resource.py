@@ -1,4 +1,4 @@
-"""The base of every handler: checks what the declaration says, runs the method, sends what it answers.
+"""Base of every handler: checks requests against the declaration, runs the method, and sends its answer.
 
 A resource names its `path` and declares its methods:
 
@@ -100,9 +100,7 @@ class Resource(Exchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """Run `function(tx, ...)` and return the rendered answer: its result as a model, the ETag and the declared
-        status.
-        """
+        """Run `function(tx, ...)` and return its result as rendered answer, with the ETag and the declared status."""
         return await self.answer_with(self._declared_reply, function, *args, **kwargs)
 
     async def answer_with(
@@ -112,9 +110,7 @@ class Resource(Exchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """Run `function(tx, ...)`, pass its result to `to_reply` in the same transaction, and return the rendered
-        answer.
-        """
+        """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
         key = self._idempotency_key()
         fingerprint = self._fingerprint() if key else ""
         answers = self.services.answers

@@ -82,7 +82,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
     except ValidationError as error:
         faults = field_errors(error, tree)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
-        raise InvalidProblem(f"The body does not fit: {first}", code="invalid-body", errors=faults) from None
+        raise InvalidProblem(f"The body is not valid: {first}", code="invalid-body", errors=faults) from None
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:

@@ -99,7 +99,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller with at most the scopes of the current credential; its secret is shown once."""
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
-        raise ForbiddenProblem(f"Your own credential does not reach {beyond[0]!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(f"Your own credential lacks the scope {beyond[0]!r}.", code="insufficient-scope")
     issued = issue_user_token()
     lifetime_s = request.expires_in_s
     row = {
@@ -158,7 +158,7 @@ def _require_user(principal: Principal, scope: str) -> str:
     if principal.kind != "user" or principal.user_id is None:
         raise ForbiddenProblem("Only users have tokens.", code="users-only")
     if not scopes.allows(principal.scopes, scope):
-        raise ForbiddenProblem(f"This token does not reach {scope!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(f"This token lacks the scope {scope!r}.", code="insufficient-scope")
     return principal.user_id
 
 

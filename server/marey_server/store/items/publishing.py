@@ -271,7 +271,7 @@ class _Publication:
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def _create(self, new: Sequence[_Ready], kind: Kind) -> None:
-        """Make items; leave out those whose place was taken meanwhile. Raises where a draft asks for a new one."""
+        """Create items whose places are still free. Raises `ConflictProblem` if another draft requires a new item."""
         if not new:
             return
         for one in new:
@@ -304,7 +304,7 @@ class _Publication:
         }  # fmt: skip
 
     def _reuse(self, one: _Ready, head: _Head) -> None:
-        """Take an item as it is where it has the content of the draft, and add a revision where it has other."""
+        """Use items that already have the content of their drafts; add a revision to the others."""
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
             self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
             return

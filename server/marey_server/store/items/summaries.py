@@ -41,7 +41,7 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
 
 
 def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:
-    """Of a motion, and what else is known of it."""
+    """Return the summary of a motion, extended by known facts."""
     frames = motion["poses"]["shape"][0]
     shown = {
         "frames": frames,

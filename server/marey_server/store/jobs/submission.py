@@ -61,8 +61,8 @@ def submit_at(
 ) -> list[Job]:
     """Submit the jobs of a request, as `submit` does.
 
-    `ids` holds ids that are reserved for jobs of the request, by their position, because other jobs of it depend on
-    them.
+    `ids` maps positions in the request to ids that are reserved for these jobs, because later jobs of the request
+    depend on them.
     """
     known = find_items(tx, project, requests.values())
     made = {ids[at]: Upstream(one.kind, JobState.WAITING) for at, one in requests.items() if at in ids}
