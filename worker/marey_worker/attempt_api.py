@@ -61,7 +61,7 @@ class AttemptApi:
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
     def append_log(self, offset: int, piece: bytes) -> LogAnswer:
-        """Append to the attempt's log at `offset`; return the length of the log, also if it does not end there."""
+        """Append to the attempt's log if its length is `offset`; in any case return the length of the log."""
         headers = {"Upload-Offset": str(offset)}
         try:
             return read_model(LogAnswer, self._post("log", piece, media_type=PLAIN_TEXT, headers=headers))

@@ -65,7 +65,7 @@ def main() -> None:
     """Run `python -m marey_worker`, which `marey serve` starts."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server")
-    parser.add_argument("--slots", type=int, default=1, help="jobs at the same time")
+    parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time")
     parser.add_argument("--name", help="name shown to people")
     parser.add_argument("--cache", type=Path, help="folder that keeps downloaded inputs")
     parser.add_argument("--token-file", type=Path, help="file that holds a token with the scope `work`")
@@ -86,14 +86,14 @@ def _form_named(name: str | None) -> LogForm:
     if name is None:
         return usual_form()
     if name not in get_args(LogForm):
-        raise MareyError(f"MAREY_LOG_FORM is {name!r}; there are {' and '.join(get_args(LogForm))}")
+        raise MareyError(f"MAREY_LOG_FORM is {name!r}; it must be {' or '.join(get_args(LogForm))}")
     return cast(LogForm, name)
 
 
 def _level_of(environment: Mapping[str, str]) -> str:
     level = environment.get("MAREY_LOG_LEVEL", "info")
     if level.upper() not in logging.getLevelNamesMapping():
-        raise MareyError(f"MAREY_LOG_LEVEL is {level!r}; there are debug, info, warning and error")
+        raise MareyError(f"MAREY_LOG_LEVEL is {level!r}; it must be debug, info, warning or error")
     return level
 
 

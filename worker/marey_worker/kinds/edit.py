@@ -172,8 +172,7 @@ class _Editing:
         now = self._context.item(Kind.CLIP, pin.item)
         if now.revision != pin.revision:
             raise EditError(
-                f"the edit is of revision {pin.revision} and would take the place of revision {now.revision}; "
-                "edit that one",
+                f"the edit is of revision {pin.revision} and would replace revision {now.revision}; edit that one",
                 code="clip-changed",
             )
         if (now.collection, now.name) != (pin.collection, pin.name):

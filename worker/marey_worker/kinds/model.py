@@ -130,7 +130,7 @@ def write_model_report(
 
     Parameters
     ----------
-    origin : where the examples come from, as the part `model` says it
+    origin : origin of the examples, from the part `model`
     """
     title = trained.primitive.name
     check = _checked(context, trained, aligned) if params.search_check else None
