@@ -1,4 +1,4 @@
-"""Clips whose alignment is known: one walk, turned, moved, mirrored, and played faster here and slower there."""
+"""Clips of known alignment: one walk, turned, moved, mirrored, and played at varying speed."""
 
 from functools import cache
 
@@ -23,7 +23,7 @@ def body_of(clip):
 
 
 def played(clip, times):
-    """The clip at fractional frames, by another library than the one under test."""
+    """Sample the clip at fractional frames by another library than the one under test."""
     frames = np.arange(clip.frame_count)
     root = np.stack([np.interp(times, frames, axis) for axis in clip.root_translations.T.astype(float)], axis=1)
     joints = []
@@ -35,7 +35,7 @@ def played(clip, times):
 
 
 def moved(clip, heading_rad, x, z):
-    """The clip turned to the left about the origin, then moved on the ground."""
+    """Rotate the clip to the left about the origin, then shift it on the ground."""
     turn = Rotation.from_euler("y", heading_rad)
     poses = clip.poses.astype(float).copy()
     poses[:, :3] = turn.apply(poses[:, :3]) + np.array((x, 0.0, z))

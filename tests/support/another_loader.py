@@ -11,7 +11,7 @@ from pymotion.rotations import quat_np
 
 
 def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
-    """(F, J, 3) in the file's unit and axes."""
+    """Compute joint positions (F, J, 3) in the file's unit and axes."""
     loader = BVH()
     loader.load(str(path))
     rotations, positions, parents, *_ = loader.get_data()

@@ -28,7 +28,7 @@ which are not measured.
 
 
 def branch_coverage() -> dict[str, float]:
-    """Percent of branches that were taken, by package; 0 for a package that no test has imported."""
+    """Return the percentage of branches that were taken, by package; 0 for a package that no test has imported."""
     measured = coverage.Coverage()
     measured.load()
     with tempfile.TemporaryDirectory() as folder:
@@ -45,7 +45,7 @@ def branch_coverage() -> dict[str, float]:
 
 
 def main() -> int:
-    """Print a line for each package; 1 if any is below its floor."""
+    """Print a line for each package; return 1 if any is below its floor."""
     found = branch_coverage()
     for package, percent in found.items():
         floor = FLOORS[package]

@@ -17,7 +17,7 @@ ANYWHERE = Freedom()
 def constraint_jacobian(
     skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom = ANYWHERE
 ) -> tuple[Floats, Floats, tuple[int, ...]]:
-    """Scaled errors (3·C,) of the first frame, their derivatives (3·C, 3·V + 3) and the V joints these are by.
+    """Return scaled errors (3·C,) of the first frame, their derivatives (3·C, 3·V + 3), and the V joints that vary.
 
     Columns are displacements of local rotations, q·exp(d), joint by joint in the order returned, then the root's
     translation, which is left out (zeros) where the root does not move.

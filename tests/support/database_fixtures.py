@@ -37,7 +37,7 @@ WHERE schemaname = 'public' AND last_value IS NOT NULL
 
 
 class AdjustableClock:
-    """A clock that runs, and that a test can set forward."""
+    """Running clock that a test can set forward."""
 
     def __init__(self) -> None:
         self._ahead_us = 0
@@ -46,7 +46,7 @@ class AdjustableClock:
         return time.time_ns() // 1000 + self._ahead_us
 
     def advance(self, seconds: float) -> None:
-        """Let so much time pass at once."""
+        """Advance the clock at once."""
         self._ahead_us += round(seconds * 1_000_000)
 
 
@@ -138,7 +138,7 @@ def sqlite_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copied_sqlite(template: Path, folder: Path) -> str:
-    """Copy the migrated SQLite file into a folder; its address."""
+    """Copy the migrated SQLite file into a folder; return its address."""
     path = folder / "marey.db"
     shutil.copyfile(template, path)
     return f"sqlite:///{path}"

@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 
 def is_sound(figure):
-    """Both pictures can be read, all columns of a table are of one length, and there is something to say."""
+    """Check that both pictures are readable, the columns of each table equally long, and the caption not empty."""
     assert imread(io.BytesIO(figure.png)).shape[0] > 100
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
     assert figure.caption.endswith(".")
@@ -27,7 +27,7 @@ def rows_of(figure, table):
 
 
 def cut_off(figure):
-    """The texts of a page of matplotlib that reach over its borders."""
+    """List the texts of a matplotlib page that extend beyond its borders."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     page = figure.bbox.padded(1.0)
@@ -38,7 +38,7 @@ def cut_off(figure):
 
 
 def _labels_beyond(axes):
-    """Those of ticks outside the limits of their axis, which are not drawn."""
+    """List the labels of ticks outside the limits of their axis, which are not drawn."""
     for axis in (axes.xaxis, axes.yaxis):
         low, high = sorted(axis.get_view_interval())
         for tick in axis.get_major_ticks():

@@ -1,4 +1,4 @@
-"""Walks to edit, and what holds of every clip that an edit makes."""
+"""Walks to edit, and checks for every clip that an edit creates."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def make_breathing_walk(**given: float) -> Clip:
 
 
 def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
-    """The clip on a skeleton whose root stands still on the floor and whose hips are `away` from it and translated."""
+    """Return the clip on a skeleton with a static root on the floor and translated hips that are `away` from it."""
     own = clip.skeleton
     skeleton = Skeleton(
         ("reference", *own.joint_names),
@@ -59,13 +59,13 @@ def are_exactly(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
 
 
 def require_sound(clip: Clip) -> None:
-    """Unit quaternions of continuous sign, in every frame."""
+    """Check that every frame has unit quaternions of continuous sign."""
     rotations = clip.rotations.astype(np.float64)
     assert np.abs(np.linalg.norm(rotations, axis=-1) - 1.0).max() < 1e-6
     assert np.einsum("fjc,fjc->fj", rotations[1:], rotations[:-1]).min(initial=1.0) >= -1e-6
 
 
 def largest_step(clip: Clip) -> float:
-    """How far any joint gets from one frame to the next at most, metres."""
+    """Compute the largest distance that a joint moves between consecutive frames, metres."""
     steps = np.linalg.norm(np.diff(global_positions(clip).astype(np.float64), axis=0), axis=-1)
     return float(steps.max())

@@ -1,4 +1,4 @@
-"""Trials, records and databases made by hand, for tests of what is measured on them."""
+"""Small trials, records and databases with known contents, for tests of measures."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -72,7 +72,7 @@ def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -
 
 
 def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]:
-    """Clips a, b, c… one after the other."""
+    """Return clips a, b, c… with consecutive rows."""
     stops = np.cumsum(frame_counts).tolist()
     return tuple(
         DatabaseClip(chr(97 + index), f"clip {index}", "", stop - frames, stop, loop)
@@ -81,14 +81,14 @@ def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]
 
 
 def arc(speed_m_s: float, turn_rate_deg_s: float, duration_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (F, 2) and headings (F,) of a circle from the origin, its end included."""
+    """Return positions (F, 2) and headings (F,) of a circle from the origin, including its end."""
     trial = Trial("circle", speed_m_s, np.radians(turn_rate_deg_s), approach_s=0.0, duration_s=duration_s)
     asked = closed_reference(trial)
     return asked.positions[: asked.tick_count], asked.headings[: asked.tick_count]
 
 
 def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]]) -> MatchingDatabase:
-    """A database whose rows match by where their roots go, every body alike; futures clamp to the clip's last frame."""
+    """Return a database whose rows differ only in the paths of roots; futures end at the clip's last frame."""
     database = root_database(*roots)
     ahead = np.round(np.array(database.options.horizons_s) * RATE_HZ).astype(np.int64)
     features = [np.concatenate([_futures(*root, ahead) for root in roots])]
@@ -107,7 +107,7 @@ def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]])
 def _futures(
     positions: NDArray[np.float64], headings: NDArray[np.float64], ahead: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """(F, 12) positions, then directions, at each horizon in the frame of each row."""
+    """Compute positions, then directions, (F, 12) at each horizon in the frame of each row."""
     frames = len(headings)
     later = np.minimum(np.arange(frames)[:, None] + ahead, frames - 1)
     step = positions[later] - positions[:, None]

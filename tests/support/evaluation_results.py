@@ -21,12 +21,12 @@ SMALL = EvaluationOptions(
 
 @dataclass(frozen=True)
 class Making:
-    """How an evaluation is made up.
+    """Parameters of a synthetic evaluation.
 
     Parameters
     ----------
     clips, frames : how many clips, of about how many frames each
-    sway_m : how far the character is off its path when it runs and turns much
+    sway_m : distance of the character from its path at high speed and turn rate
     turns_deg_s : the clips turn at rates within this range
     unused : so many of the last clips are never displayed
     names : of the first clips
@@ -42,7 +42,7 @@ class Making:
 
 
 def synthetic_result(options=SMALL, **making):
-    """A plausible evaluation, the same for the same arguments."""
+    """Return a plausible evaluation, the same for the same arguments."""
     how = Making(**making)
     random = np.random.default_rng(how.seed)
     clips = some_clips(how, random)
@@ -53,7 +53,7 @@ def synthetic_result(options=SMALL, **making):
 
 
 def evaluated(options, clips, trials, records, coverage):
-    """Records measured and put together."""
+    """Measure records and assemble an evaluation."""
     outcomes = tuple(
         measure_trial(trial, reference(trial, RATE_HZ), record, options)
         for trial, record in zip(trials, records, strict=True)
@@ -89,7 +89,7 @@ def some_clips(how, random):
 
 
 def wandering(trial, clips, sway_m, random):
-    """A character that sways about its path while it plays stretches of clips, the first ones most often."""
+    """Return the record of a character that sways about its path and plays ranges of clips, the first most often."""
     guide = reference(trial, RATE_HZ)
     ticks = guide.tick_count
     times = np.arange(ticks) / RATE_HZ
@@ -106,7 +106,7 @@ def wandering(trial, clips, sway_m, random):
 
 
 def _stretches(ticks, clips, random):
-    """Rows of each tick, and the ticks that begin another stretch."""
+    """Return the row of each tick, and the ticks at which another range begins."""
     favour = 1.0 / np.arange(1, len(clips) + 1)
     rows, entered, tick = np.empty(ticks, dtype=np.int32), [], 0
     while tick < ticks:
@@ -120,7 +120,7 @@ def _stretches(ticks, clips, random):
 
 
 def some_coverage(options, clips, how, random):
-    """Windows of clips that each hold about one speed and turn rate; a tenth of the clips goes backwards."""
+    """Return windows of clips with about one speed and turn rate each; a tenth of the clips goes backwards."""
     counts = [max(0, clip.frame_count - round(RATE_HZ)) for clip in clips]
     owner = np.repeat(np.arange(len(clips)), counts).astype(np.int32)
     speed = random.uniform(0.6, 3.0, len(clips))[owner] + 0.15 * random.normal(size=len(owner))

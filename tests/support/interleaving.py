@@ -32,7 +32,7 @@ class Step:
 
 
 class Abandoned(Exception):
-    """The first transaction was to be rolled back."""
+    """Error that rolls back the first transaction on request."""
 
 
 def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:

@@ -10,7 +10,7 @@ FRAMES = 48
 
 
 def walks(count=12, *, names=None, frames=FRAMES, seed=0):
-    """Walks of one duration at speeds that rise from clip to clip, played faster here and slower there."""
+    """Return walks of one duration whose speed rises from clip to clip, played at varying speed."""
     random = np.random.default_rng(seed)
     speeds = np.linspace(0.9, 1.7, count)
     clips = []

@@ -12,7 +12,7 @@ HZ = 60.0
 
 
 def chain(joints=4):
-    """A straight chain of bones of 30 cm that stands on its root, with a tip at its end."""
+    """Return an upright chain of bones of 30 cm on its root, with a tip at its end."""
     offsets = np.zeros((joints, 3))
     offsets[1:, 1] = 0.3
     parents = np.arange(-1, joints - 1, dtype=np.int32)
@@ -45,7 +45,7 @@ def aligned_set(skeleton, poses, time_functions=None, keyframes=None):
 
 
 def warps(count, frames, seed=0):
-    """Time functions (count, N) whose slopes rise and fall, each in its own way."""
+    """Return time functions (count, N), each with its own varying slope."""
     random = np.random.default_rng(seed)
     phase = np.linspace(0.0, np.pi, frames - 1)
     slopes = np.exp(
@@ -55,7 +55,7 @@ def warps(count, frames, seed=0):
 
 
 def bending_chains(count=20, frames=30, seed=0, joints=4, size=0.1):
-    """Chains that sway: a few random smooth functions in every channel."""
+    """Return swaying chains: a few random smooth functions in every channel."""
     random = np.random.default_rng(seed)
     skeleton = chain(joints)
     basis = SplineBasis.clamped(frames, 7)

@@ -1,4 +1,4 @@
-"""Motion files of fifty megabytes, and what reading them takes, measured in a process of its own."""
+"""Motion files of fifty megabytes, and the memory needed to read them, measured in a separate process."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def rubbish() -> bytes:
 
 
 def read_and_measure(make: Callable[[], bytes], folder: str) -> None:
-    """Write to `folder`/result what became of the file, and the bytes that reading it took beyond the file itself."""
+    """Write the outcome of reading a file, and the memory used beyond the file itself, to `folder`/result."""
     data = make()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     try:

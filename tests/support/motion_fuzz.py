@@ -1,4 +1,4 @@
-"""Break motion files at random and see that every reader answers with a motion or an error of its own, and soon.
+"""Fuzzing of readers: randomly broken motion files must give a motion or an error of the reader, in bounded time.
 
 As a program it runs for the given seconds of processor time: `python -m tests.support.motion_fuzz 3600 [seed]`. A file
 that makes a reader fail otherwise is kept in the current folder.
@@ -114,7 +114,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def main(seconds: float, seed: int) -> None:
-    """Break files until so much processor time is used, and print how many ended how.
+    """Break files for the given processor time, and print the number of each outcome.
 
     Processor time, since on a busy machine the clock on the wall says nothing about the reader.
     """

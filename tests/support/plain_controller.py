@@ -1,4 +1,4 @@
-"""The runtime loop of motion matching once more, for comparison: plain Python, written from its definition.
+"""Reference implementation of the runtime loop of motion matching in plain Python, written from its definition.
 
 Ground positions are complex numbers z + i·x, so that a heading is a factor exp(i·theta).
 """

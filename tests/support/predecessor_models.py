@@ -86,7 +86,7 @@ def flat(seed=1, joints=ANIMATED):
 
 
 def layout_2(seed=1, *, by_columns=True):
-    """By the first trainer, with a component of time in each column, or by the later one."""
+    """Return a document of layout 2, by the first trainer, with components of time in columns, or by the later one."""
     mean, vectors = time(np.random.default_rng(seed + 100))
     if by_columns:
         mean = (0.02 * np.random.default_rng(seed).normal(size=TIME_COEFFICIENTS)).tolist()

@@ -1,4 +1,4 @@
-"""A project in memory, for tests of what workers do with it, and a small evaluation."""
+"""Project in memory for tests of the functions of job kinds, and a small evaluation."""
 
 import hashlib
 from dataclasses import dataclass, field

@@ -89,7 +89,7 @@ KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, 
 
 @dataclass
 class Desk:
-    """Submits and works in the project `lab`."""
+    """Submitter and worker in the project `lab`."""
 
     database: Database
     clock: AdjustableClock
@@ -108,11 +108,11 @@ class Desk:
     # -- submitting ----------------------------------------------------------------------------------------------------
 
     def submit(self, kind: str = "errand", **fields: Any) -> str:
-        """Submit one job; its id."""
+        """Submit one job; return its id."""
         return self.submit_many(JobCreate(kind=kind, **fields))[0]
 
     def submit_many(self, *requests: JobCreate) -> list[str]:
-        """Submit jobs at once; their ids."""
+        """Submit jobs at once; return their ids."""
         made = self.database.write(self.user, submission.submit, self.project, requests)
         return [job.id for job in made]
 
@@ -133,7 +133,7 @@ class Desk:
         return list(self.database.read(self.user, reading.list_outputs, job_id).items)
 
     def things(self, count: int, collection: str = "raw") -> list[str]:
-        """Make things to work on; their item ids."""
+        """Create items to work on; return their ids."""
         drafts = [
             Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
         ]
@@ -164,7 +164,7 @@ class Desk:
         return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
 
     def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
-        """Say that the worker lives."""
+        """Send a heartbeat."""
         return self.database.write(
             _as_attempt(lease), queue.heartbeat, lease.job, lease.fence, Heartbeat(progress=progress), self.policy
         )
@@ -187,7 +187,7 @@ class Desk:
         )
 
     def reap(self) -> int:
-        """Take back what is overdue."""
+        """Reclaim overdue jobs."""
         return self.database.write(SYSTEM, reap_page, self.policy).taken
 
     def write_id(self) -> str:

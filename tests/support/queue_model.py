@@ -37,12 +37,12 @@ class ModelJob:
 
 @dataclass
 class ModelQueue:
-    """All jobs, and what can be done with them. Times are given in."""
+    """All jobs of the model and the operations on them. Callers pass the time."""
 
     jobs: dict[str, ModelJob] = field(default_factory=dict)
 
     def submit(self, job: ModelJob) -> None:
-        """Add a job; where it goes depends on those it comes after."""
+        """Add a job; its state depends on those of its dependencies."""
         self.jobs[job.id] = job
         upstream = [self.jobs[other].state for other in job.after]
         if any(state in ("failed", "cancelled") for state in upstream):
@@ -51,7 +51,7 @@ class ModelQueue:
             job.state = "waiting"
 
     def claim(self, now_us: int, most: int) -> list[str]:
-        """Ids of the jobs a worker gets, in order."""
+        """Return the ids of the jobs that a worker gets, in order."""
         taken: list[str] = []
         busy = {job.key for job in self.jobs.values() if job.state == "running" and job.key is not None}
         queued = [job for job in self.jobs.values() if job.state == "queued" and job.run_at_us <= now_us]
@@ -123,7 +123,7 @@ class ModelQueue:
         return "queued"
 
     def reap(self, now_us: int) -> None:
-        """Take back what is overdue."""
+        """Reclaim overdue jobs."""
         for job in list(self.jobs.values()):
             if job.state != "running" or job.lease_expires_us > now_us:
                 continue
@@ -157,7 +157,7 @@ class ModelQueue:
         return [job for job in self.jobs.values() if job_id in job.after and job.state == "waiting"]
 
     def states(self) -> dict[str, tuple[str, int, int, int]]:
-        """State, fence, attempts and interruptions of every job."""
+        """Return state, fence, attempts and interruptions of every job."""
         return {job.id: (job.state, job.fence, job.attempt, job.interruptions) for job in self.jobs.values()}
 
     def ids(self) -> Iterable[str]:

@@ -16,7 +16,7 @@ HOSTILE = (
 
 
 class Page(HTMLParser):
-    """A page taken apart: are its tags balanced, what does it say, what would it fetch or run?"""
+    """Parsed page: whether its tags are balanced, its text, and the resources and scripts that it would load."""
 
     def __init__(self, source):
         super().__init__()
@@ -60,7 +60,7 @@ class Page(HTMLParser):
 
 
 def is_sound(source):
-    """Balanced, one id each, nothing fetched, no code but the page's own."""
+    """Check that tags are balanced, ids unique, no resources loaded, and no scripts but the page's own."""
     page = Page(source)
     assert set(page.ids.values()) == {1}
     for link in page.links:

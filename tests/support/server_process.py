@@ -59,14 +59,14 @@ class MareyProcess:
         self.process.send_signal(number)
 
     def kill(self) -> None:
-        """End it as a power cut would."""
+        """Kill the process."""
         assert self.process is not None
         with contextlib.suppress(ProcessLookupError):
             self.process.kill()
         self.process.wait(30)
 
     def wait_until_dead(self, seconds: float = 60) -> int:
-        """Wait until it has ended by itself."""
+        """Wait until the process has ended by itself."""
         assert self.process is not None
         return self.process.wait(seconds)
 
@@ -85,7 +85,7 @@ class MareyProcess:
 
 
 class ServerProcess(MareyProcess):
-    """`marey serve` on a port of its own; `environment` is what whoever started it told it."""
+    """`marey serve` on its own port, with the variables in `environment`."""
 
     def __init__(self, folder: Path, database_url: str | None = None, **environment: str) -> None:
         super().__init__(folder / "server.log")
@@ -98,7 +98,7 @@ class ServerProcess(MareyProcess):
             self.environment["MAREY_DATABASE_URL"] = database_url
 
     def start(self, *, workers: int = 0, fault: str | None = None) -> Self:
-        """Start, and wait until it can serve."""
+        """Start the server, and wait until it is ready."""
         environment = self.environment | ({"MAREY_FAULT": fault} if fault else {})
         self.spawn(["marey_client.cli", "serve", "--workers", str(workers)], environment)
         assert self.process is not None
@@ -114,7 +114,7 @@ class ServerProcess(MareyProcess):
 
     @property
     def token(self) -> str:
-        """The first administrator's."""
+        """Token of the first administrator."""
         return (self.data / "admin.token").read_text().strip()
 
     def client(self, *, patient: bool = True, port: int | None = None) -> Marey:
@@ -123,17 +123,17 @@ class ServerProcess(MareyProcess):
         return Marey(url, self.token, retries=PATIENT if patient else ONCE)
 
     def check_database(self) -> None:
-        """Fail when what `marey db fsck` does finds anything."""
+        """Fail if `marey db fsck` finds a defect."""
         with closing(connect_database(self._settings)) as database:
             findings = list(check_store(database))
         assert not findings, "\n".join(map(str, findings))
 
 
 class WorkerProcess(MareyProcess):
-    """`python -m marey_worker`, started apart from the server, so that it outlives it."""
+    """`python -m marey_worker`, started separately, so that it outlives the server."""
 
     def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
-        """Start; it finds the server by itself."""
+        """Start the worker, which finds the server by itself."""
         environment = {"MAREY_FAULT": fault} if fault else {}
         arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
         self.spawn(arguments, environment, stdin=f"{token}\n".encode())
@@ -142,7 +142,7 @@ class WorkerProcess(MareyProcess):
 
 @contextlib.contextmanager
 def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerProcess]:
-    """A server with one worker, until the block ends; it must end well."""
+    """Run a server with one worker inside the block; check its exit status at the end."""
     process = ServerProcess(folder, database_url).start(workers=1)
     try:
         yield process

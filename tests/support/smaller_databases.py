@@ -1,4 +1,4 @@
-"""Databases with clips or rows really taken out, to compare with results that were computed without doing so."""
+"""Databases without some clips or rows, for comparison with results that are computed without removing them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from marey_motion.matching.database import DatabaseClip, MatchingDatabase
 
 
 def without_sources(database: MatchingDatabase, sources: Collection[str]) -> MatchingDatabase:
-    """The database without the clips of these sources. Raises `MotionError` for unknown ones, and when none is left."""
+    """Return the database without the clips of these sources. Raises `MotionError` if one is unknown or none is
+    left."""
     removed = rows_of_sources(database.clips, sources)
     return _gathered(database, [clip for clip in database.clips if not removed[clip.start]], ~removed)
 
 
 def without_rows(database: MatchingDatabase, removed: Flags) -> MatchingDatabase:
-    """The database without these rows (N,); where rows inside a clip go, what is left of it are clips of their own.
+    """Return the database without these rows (N,); the remaining parts of a clip become clips.
 
     A part of a clip is named by its uid and its frames, as "walk#120-480". Its last row cannot be chosen, since nothing
     follows it.

@@ -1,4 +1,4 @@
-"""Small suites over databases made by hand, for tests of what evaluations suggest."""
+"""Small suites over databases with known contents, for tests of suggestions."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def named(tracks, prefix="clip"):
 
 
 def wandering_tracks(count=8, seed=3):
-    """Clips of some use, and two that are too fast for anything that is asked."""
+    """Return useful clips, and two that are faster than every trial."""
     fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
     return [*named(random_tracks(count, seed)), *fast]
 
@@ -40,17 +40,17 @@ def with_mirrored(tracks):
 
 
 def simulated(database, options=OPTIONS):
-    """Records of the whole suite."""
+    """Return the records of the whole suite."""
     return run_suite(database, options, trials=suite_trials(options))
 
 
 def evaluated(database, options=OPTIONS):
-    """The database's evaluation, without a baseline."""
+    """Evaluate the database, without a baseline."""
     return assemble(database, options, suite_trials(options), simulated(database, options))
 
 
 def same_to_the_bit(database, records, other, other_records):
-    """Whether two sets of trials agree in every bit, their rows named by clip and frame."""
+    """Return whether two sets of trials are equal to the bit, with rows named by clip and frame."""
     return all(
         np.array_equal(getattr(one, name), getattr(two, name), equal_nan=name.endswith("_cost"))
         for one, two in zip(records, other_records, strict=True)

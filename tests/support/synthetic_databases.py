@@ -1,4 +1,4 @@
-"""Matching databases made of roots on exact paths and poses of a few sines: nothing between a test and the rule."""
+"""Matching databases of roots on exact paths and poses of a few sines, for exact expectations."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -45,7 +45,7 @@ def studio_body() -> MatchingBody:
 
 
 def gait_pose(frames: int, speed_m_s: float, phase: float = 0.0) -> NDArray[np.float64]:
-    """(frames, 15) pose features that repeat with the stride and grow with the speed."""
+    """Compute pose features (frames, 15) that repeat with the stride and grow with the speed."""
     angle = 2 * np.pi * (0.8 + 0.25 * speed_m_s) * np.arange(frames) / 60 + phase
     amplitude = 0.1 + 0.1 * speed_m_s
     return np.stack([amplitude * np.sin(angle + 0.7 * d) for d in range(POSE_DIMENSIONS)], axis=1)
@@ -65,7 +65,7 @@ def path_track(trial: Trial, **options: Any) -> Track:
 
 
 def random_tracks(count: int, seed: int) -> list[Track]:
-    """Roots that wander: asymmetric, of different lengths, each with its own gait."""
+    """Return wandering roots: asymmetric, of different lengths, each with its own gait."""
     rng = np.random.default_rng(seed)
     tracks = []
     for _ in range(count):
@@ -81,7 +81,7 @@ def random_tracks(count: int, seed: int) -> list[Track]:
 
 
 def mirrored_track(track: Track) -> Track:
-    """Reflected in x; of the pose, the first half of the dimensions plays left and the second right."""
+    """Reflect a track in x; the first half of the pose's dimensions is the left side, the second the right."""
     mirror = np.array([-1.0, 1.0])
     left, right, middle = track.pose[:, :6], track.pose[:, 6:12], track.pose[:, 12:]
     signs = np.array([-1.0, 1.0, 1.0])
@@ -137,7 +137,7 @@ def index_of(database: MatchingDatabase) -> SearchIndex:
 
 
 def fitted(features: NDArray[np.float64]) -> Normaliser:
-    """Means, and one scale per group as the definitions have it, without weights."""
+    """Fit means and one scale per group by their definitions, without weights."""
     spread = features.std(axis=0)
     groups = ((0, 15), (15, 21), (21, 27))
     scale = np.concatenate([np.full(stop - start, max(spread[start:stop].mean(), 1e-3)) for start, stop in groups])
@@ -166,7 +166,7 @@ def _features(track: Track, wraps: bool) -> NDArray[np.float64]:
 
 
 def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A loop and as much of its next rounds as is looked ahead; the closing step is the mean of its neighbours."""
+    """Extend a loop by its next rounds as far as it looks ahead; the closing step is the mean of its neighbours."""
     heading, position = track.headings, track.positions
 
     def local(step: int) -> tuple[NDArray[np.float64], float]:
@@ -207,7 +207,7 @@ def switches(record: TrialRecord) -> int:
 
 
 def on_the_circle(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Speeds in m/s and turn rates in deg/s after the approach."""
+    """Compute speeds in m/s and turn rates in deg/s after the approach."""
     speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
     turn_rate = np.degrees(np.diff(record.headings)) * 60
     return speed[180:], turn_rate[180:]

@@ -69,7 +69,7 @@ def _slow(item: pytest.Item) -> bool:
 
 
 def _fault_on_other_database(item: pytest.Item) -> bool:
-    """Whether a fault case runs on the other database: its name decides, so that both get about half of the cases."""
+    """Return whether a fault case runs on the other database; its name decides, so that each gets about half."""
     backend = backend_of(item)
     if not _fault(item) or backend is None or item.get_closest_marker("every_database"):
         return False
@@ -99,12 +99,12 @@ LEFT_OUT = pytest.StashKey[Counter[str]]()
 
 
 def examples(count: int) -> int:
-    """How many examples a property test draws that draws `count` in the tier `test`."""
+    """Return the number of examples of a property test that draws `count` in the tier `test`."""
     return max(1, count * hypothesis.settings.default.max_examples // EXAMPLES)
 
 
 def steps(count: int) -> int:
-    """How many steps a state machine takes that takes `count` in the tier `test`."""
+    """Return the number of steps of a state machine that takes `count` in the tier `test`."""
     return count * hypothesis.settings.default.stateful_step_count // STEPS
 
 
