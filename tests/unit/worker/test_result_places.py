@@ -1,5 +1,7 @@
 """Places of results of jobs with many clips, and effects of a clip that cannot be used."""
 
+import io
+import zipfile
 from math import radians
 
 import pytest
@@ -167,6 +169,26 @@ def test_a_clip_that_was_deleted_while_the_job_waited_keeps_no_other_from_being_
     project.into = "out"
     result = run(project)
     assert (len(project.staged), codes(result)) == (1, ["no-clip"])
+
+
+def test_a_target_skeleton_that_cannot_be_used_refuses_the_job_with_its_name(project):
+    mapping = {"schema": "marey/skeleton-mapping@1", "joints": {"pelvis": "Sphere"}}
+    project.parts["skeleton_a", 1, "mapping"] = mapping
+    with pytest.raises(JobRefused, match=r"skeleton a: .*Sphere"):
+        KINDS["retarget"](project)
+    assert project.staged == []
+
+
+def test_clips_with_the_same_place_have_files_of_their_own_in_an_archive(project):
+    again(project, 0, item="clip_other")
+    again(project, 0, revision=2)
+    again(project, 0, revision=3)
+    result = export.run(project, ExportParams())
+    with zipfile.ZipFile(io.BytesIO(project.blobs[result["archive"]["blob"]])) as archive:
+        names = sorted(archive.namelist())
+    assert names == sorted(set(names))
+    assert names[-2:] == ["walks/left.bvh", "walks/right.bvh"]
+    assert (len(names), result["clips"]) == (5, 5)
 
 
 def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from marey_motion import documents
@@ -45,7 +46,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             except (MotionError, NoSuchThing) as error:
                 refused.append({"name": _place(pin), "item": pin.item, "code": error.code, "detail": str(error)})
                 continue
-            name = file.name if file.name not in written else f"{pin.item}-{file.name.rpartition('/')[2]}"
+            name = _free_name(pin, file.name, written)
             written.add(name)
             target.writestr(_entry(name), file.data)
     if not written:
@@ -98,6 +99,13 @@ def _place(pin: PinnedInput) -> str:
     """Return a path inside the archive that cannot lead outside of the folder it is extracted to."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
+
+
+def _free_name(pin: PinnedInput, name: str, taken: Collection[str]) -> str:
+    """Return the name of a file, or one with the item, or with item and revision, if an earlier file has it."""
+    file = name.rpartition("/")[2]
+    candidates = (name, f"{pin.item}-{file}", f"{pin.item}-{pin.revision}-{file}")
+    return next(one for one in candidates if one not in taken)
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
