@@ -21,6 +21,7 @@ from marey_motion.formats import ImportOptions, read_motion, write_motion, write
 from marey_motion.gait import generate_gait
 
 LONGEST_S = 10
+"""Longest processor time in seconds that a reader may need for a broken file."""
 Seed = tuple[str, bytes, bytes | None]
 # Pieces that mean something to one of the readers, to be put where they do not belong.
 _PIECES = [

@@ -20,6 +20,8 @@ from marey_server.store.database.connections import Database
 
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 USER_SCOPES = ("read", "write", "jobs")
+PATIENCE_S = 240
+"""Longest wait for an answer, a little shorter than a test may take: machines do other things at the same time."""
 
 
 @dataclass
@@ -40,7 +42,7 @@ class Server:
         """Return a client that shows `token`."""
         if token not in self._clients:
             headers = {"Authorization": f"Bearer {token}"} if token else {}
-            self._clients[token] = httpx.Client(base_url=self.api, headers=headers, timeout=60)
+            self._clients[token] = httpx.Client(base_url=self.api, headers=headers, timeout=PATIENCE_S)
         return self._clients[token]
 
     def make_user(self, name: str, *, administrator: bool = False, scopes: tuple[str, ...] = USER_SCOPES) -> str:
