@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from marey_motion import quaternions
 from marey_motion.clip import Clip
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import generate_gait, studio_skeleton
@@ -80,6 +81,19 @@ class TestRestPose:
         tilted[:, 3 + 4 * elbow : 7 + 4 * elbow] = [np.cos(0.05), 0.0, np.sin(0.05), 0.0]
         clip = joined(replace(standing, poses=tilted).sliced(0, 3), walk)
         assert [w.frames for w in check_clip(clip) if w.code == "rest-pose-frame"] == [(0, 3)]
+
+    @pytest.mark.parametrize(("turn_deg", "dropped"), [(0.3, (20, 0)), (1.0, (0, 0))])
+    def test_a_pose_near_that_of_the_rig_is_rest_and_another_is_not(
+        self, walk: Clip, turn_deg: float, dropped: tuple[int, int]
+    ) -> None:
+        rest = walk.skeleton.rest_rotations.copy()
+        for side, angle in (("Left", -1.0), ("Right", 1.0)):  # arms down: no T
+            rest[walk.skeleton.index_of(f"{side}Arm")] = quaternions.from_axis_angle((0.0, 0.0, 1.0), angle)
+        turned = quaternions.multiply(rest, quaternions.from_axis_angle((1.0, 0.0, 0.0), np.radians(turn_deg)))
+        poses = walk.poses.copy()
+        poses[:20, 3:] = turned.reshape(-1)
+        clip = replace(walk, skeleton=replace(walk.skeleton, rest_rotations=rest), poses=poses)
+        assert without_rest_pose(clip)[1] == dropped
 
     def test_a_clip_of_nothing_but_rest_is_told_and_left_whole(self, standing: Clip) -> None:
         warning = found(standing, "rest-pose-frame")

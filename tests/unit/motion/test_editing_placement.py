@@ -133,6 +133,9 @@ def test_drift_is_taken_out_little_by_little(profile: str) -> None:
     assert np.allclose(turned[:61], 0.0, atol=1e-5)
     assert np.allclose(turned[179:], 0.3, atol=1e-5)
     assert np.all(np.diff(turned) > -1e-5)
+    place = 30 / 119
+    share = place if profile == "linear" else place**2 * (3.0 - 2.0 * place)
+    assert np.isclose(turned[90], 0.3 * share, atol=1e-5)
     # What follows moves rigidly with the end of the range.
     assert np.allclose(
         np.linalg.norm(after[180:] - after[179], axis=-1),

@@ -70,6 +70,13 @@ def test_sections_that_share_their_ends_are_refused_with_a_hint():
     assert len(read(document, end_index="exclusive").segments) == 2
 
 
+def test_sections_that_share_more_than_their_ends_are_refused_without_the_hint():
+    document = {"sections": [{"start_idx": 0, "end_idx": 10}, {"start_idx": 9, "end_idx": 20}]}
+    with pytest.raises(FormatError, match="overlaps it") as refused:
+        read(document)
+    assert "exclusive" not in str(refused.value)
+
+
 def test_labels_that_overlap_can_be_read_one_by_one():
     document = {"semantic_annotation": {"left": [1, 2, 3], "both": [3, 4]}}
     with pytest.raises(FormatError, match="overlaps it") as refused:

@@ -4,6 +4,7 @@ import sqlite3
 import threading
 import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import psycopg
 import pytest
@@ -241,6 +242,24 @@ def test_writes_go_on_while_somebody_reads_for_long(tmp_path, database, monkeypa
             written.result(database_module.BUSY_TIMEOUT_MS / 2000)
     database.write(SYSTEM, user_names)
     assert (tmp_path / "marey.db-wal").stat().st_size == 0
+
+
+@on_sqlite
+def test_the_length_of_the_log_is_looked_at_once_in_some_seconds(tmp_path, database, monkeypatch):
+    clock = SimpleNamespace(now_s=1000.0)
+    monkeypatch.setattr(database_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=time.sleep))
+    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
+
+    def length_after_a_write(size):
+        row = {"key": f"at {clock.now_s}", "value": "x" * size}
+        database.write(SYSTEM, lambda tx: tx.execute(tx.insert_or_ignore(server_state, row)))
+        return (tmp_path / "marey.db-wal").stat().st_size
+
+    assert length_after_a_write(2**21) == 0
+    clock.now_s += database_module.WAL_CHECK_EVERY_S - 1.0
+    assert length_after_a_write(2**21) > 2**20
+    clock.now_s += 1.0
+    assert length_after_a_write(1) == 0
 
 
 @on_postgres

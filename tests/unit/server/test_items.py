@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tests.support.store_fixtures import declared, motion_tree, skeleton_tree
+from tests.support.store_fixtures import Lab, declared, motion_tree, skeleton_tree
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
@@ -357,6 +357,19 @@ def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(
     assert paths == [last.path, f"{last.path}/b"]
 
 
+def test_a_folder_moves_however_long_the_paths_of_others_are(lab):
+    folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
+    lab.write(collections.create_collection, "lab", CollectionCreate(path="a/b"))
+    deep = "/".join(["d" * 200] * 5)  # twenty characters remain
+    other = Lab(lab.database, "other")
+    for who in (lab, other):
+        who.write(collections.create_collection, who.name, CollectionCreate(path=deep))
+    change = CollectionChange(path="m" * 100)
+    lab.write(collections.move_collection, "lab", folder.id, change, expected_rev=None)
+    paths = [one.path for one in lab.read(collections.list_collections, "lab").items]
+    assert {change.path, f"{change.path}/b", deep} < set(paths)
+
+
 def test_collections_refuse_what_would_tangle_them(lab):
     a = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="ab/c"))
@@ -405,8 +418,6 @@ def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab, rig, data
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(rig, joints=2)}).error_code == "wrong-joints"
     moved_root = motion_tree(rig) | {"translations": np.zeros((5, 1, 3), "<f4"), "translated_joints": ["j0"]}
     assert refused(lab, Kind.CLIP, {"motion": moved_root}).error_code == "root-translated"
-    from tests.support.store_fixtures import Lab
-
     elsewhere = Lab(database, "elsewhere").add_skeleton()
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(elsewhere)}).error_code == "no-skeleton"
 
@@ -481,8 +492,6 @@ def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):
 
 
 def test_an_item_is_found_only_under_its_own_kind_and_project(lab, rig, database):
-    from tests.support.store_fixtures import Lab
-
     elsewhere = Lab(database, "elsewhere")
     with pytest.raises(NotFoundProblem):
         lab.read(items.read_item, "lab", Kind.CLIP, rig.id)

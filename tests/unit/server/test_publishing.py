@@ -12,7 +12,7 @@ from tests.support.tiers import examples
 
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import documents, items, projects
+from marey_server.store import documents, events, items, projects
 from marey_server.store.database import prepared
 from marey_server.store.items import Draft, StoredDocument, publishing, references
 
@@ -279,6 +279,13 @@ def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab):
     assert not lab.read(items.read_staleness, "lab", Kind.STUDY, new.item).stale
 
 
+def test_the_event_of_a_revision_names_it_and_its_place(lab):
+    (clip, _), _ = (publish(lab, clip_draft(seed=seed), rig_draft()) for seed in range(2))
+    told = [(one.kind, one.body) for one in lab.read(events.list_events, "lab", after=0) if one.subject == clip.item]
+    body = {"item_kind": "clip", "name": "walk", "collection": "raw", "job": None}
+    assert told == [("item.created", {**body, "revision": 1}), ("item.revised", {**body, "revision": 2})]
+
+
 def test_many_publishers_of_one_skeleton_make_one(lab):
     def run(tx, number):
         project_row = projects.require(tx, "lab")
@@ -289,6 +296,21 @@ def test_many_publishers_of_one_skeleton_make_one(lab):
     assert len({future.result(60)[0].item for future in futures}) == 1
     assert len(listed(lab, Kind.CLIP)) == 8
     assert len(listed(lab, Kind.SKELETON)) == 1
+
+
+def test_two_results_with_one_name_are_refused(lab):
+    with pytest.raises(InvalidProblem) as refused:
+        publish(lab, rig_draft(), rig_draft(bone_m=0.6))
+    assert refused.value.error_code == "duplicate-output"
+    assert listed(lab, Kind.SKELETON) == ()
+
+
+def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(lab, monkeypatch):
+    publish(lab, rig_draft(), clip_draft())
+    monkeypatch.setattr(publishing, "write_head", lambda *_args: False)
+    with pytest.raises(ConflictProblem, match="'walk' is being changed") as refused:
+        publish(lab, rig_draft(), clip_draft(seed=1))
+    assert refused.value.error_code == "contended"
 
 
 def test_many_publishers_of_one_name_make_its_revisions(lab):

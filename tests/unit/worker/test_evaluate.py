@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.evaluation_results import synthetic_result
 from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
@@ -87,6 +88,11 @@ def test_what_the_mathematics_refuses_is_not_tried_again(project):
     project.inputs["clips"] = project.inputs["clips"][:1] * 2
     with pytest.raises(JobRefused, match="the same uid"):
         evaluate.run(project, PARAMS)
+
+
+def test_the_headline_counts_the_clips_and_those_that_no_trial_plays():
+    headline = evaluate.headline_of(synthetic_result(clips=6, unused=2))
+    assert (headline["clips"], headline["unused_clips"]) == (6, 2)
 
 
 def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project):

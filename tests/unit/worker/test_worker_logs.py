@@ -11,6 +11,16 @@ def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise():
     assert _form_named("text") == "text"
 
 
+@pytest.mark.parametrize("form", ["json", "text"])
+def test_a_worker_logs_in_the_form_that_its_environment_names(server, start_worker, capfd, form):
+    worker = start_worker(env={"MAREY_LOG_FORM": form})
+    server.ended(server.submit("add", {"a": 1, "b": 1}))
+    assert worker.stop() == 0
+    lines = capfd.readouterr().err.splitlines()
+    assert any("works for" in line for line in lines)
+    assert {line.startswith("{") for line in lines} == {form == "json"}
+
+
 def test_a_form_or_a_level_that_is_none_is_refused_with_those_there_are():
     with pytest.raises(MareyError, match="MAREY_LOG_FORM is 'xml'; it must be json or text"):
         _form_named("xml")
