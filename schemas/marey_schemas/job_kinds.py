@@ -170,7 +170,7 @@ EXPORT = KindDeclaration(
     description="Exports clips as files of one format in one archive.",
     params=job_params.ExportParams,
     implementation="marey_worker.kinds.export:run",
-    version=2,
+    version=3,
     inputs={"clips": InputSpec(kind=Kind.CLIP, many=True, description="The clips to export.")},
     outputs={"archive": "file"},
 )
