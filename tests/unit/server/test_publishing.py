@@ -298,13 +298,6 @@ def test_many_publishers_of_one_skeleton_make_one(lab):
     assert len(listed(lab, Kind.SKELETON)) == 1
 
 
-def test_two_results_with_one_name_are_refused(lab):
-    with pytest.raises(InvalidProblem) as refused:
-        publish(lab, rig_draft(), rig_draft(bone_m=0.6))
-    assert refused.value.error_code == "duplicate-output"
-    assert listed(lab, Kind.SKELETON) == ()
-
-
 def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(lab, monkeypatch):
     publish(lab, rig_draft(), clip_draft())
     monkeypatch.setattr(publishing, "write_head", lambda *_args: False)
