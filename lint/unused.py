@@ -1,7 +1,8 @@
 """Rule: code that only tests call is dead. Every function, class and method is named by other code of the product.
 
 Names count, not bindings: a method is used when any code names an attribute like it. Names in the docs' code blocks
-and in benchmarks count, too: their readers are users of the SDK and of the library.
+and in benchmarks count, too: their readers are users of the SDK and of the library. Only the function that contains a
+local function can name it.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ from collections.abc import Iterator
 
 from lint.sources import Definition, House, Module, Offence
 
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
 _WORD = re.compile(r"[A-Za-z_]\w*")
 # Called by a framework: Tornado, pydantic, logging, SQLAlchemy, httpx.
 _CALLED_BY_NAME = {
     "get", "head", "post", "put", "patch", "delete", "options", "initialize", "prepare", "data_received", "on_finish",
     "on_connection_close", "write_error", "log_exception", "set_default_headers", "compute_etag", "find_handler",
-    "model_post_init", "emit", "format", "formatTime", "formatException", "filter", "convert", "run", "gather",
-    "process_bind_param", "process_result_value", "auth_flow", "settings_customise_sources",
+    "emit", "format", "formatTime", "formatException", "filter", "convert", "run", "gather", "process_bind_param",
+    "process_result_value", "auth_flow", "settings_customise_sources",
 }  # fmt: skip
 _ENTRY_DECORATORS = {"command", "callback", "validator", "field_validator", "model_validator", "listens_for", "reads"}
 _ENTRY_DECORATORS |= {"writes", "overload", "field_serializer", "model_serializer", "compiles", "register"}
@@ -35,6 +38,26 @@ def find(house: House) -> Iterator[Offence]:
             yield Offence(
                 module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
             )
+        for name, node in module.definitions:
+            if not isinstance(node, ast.ClassDef):
+                yield from _unused_locals(module, name, node)
+
+
+def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offence]:
+    """Find functions inside a function that the function does not name."""
+    named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
+    for node in _locals(outer):
+        if node.name not in named and not node.decorator_list:
+            yield Offence(module.path, node.lineno, f"{module.name}.{name}.{node.name}", f"{node.name} is not used")
+
+
+def _locals(node: ast.AST) -> Iterator[Function]:
+    """Yield the functions that a function contains, without those of local functions and classes."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, Function):
+            yield child
+        elif not isinstance(child, ast.ClassDef):
+            yield from _locals(child)
 
 
 def _is_entry(node: Definition) -> bool:

@@ -98,6 +98,21 @@ def test_a_function_that_only_its_definition_names_is_unused():
     assert found == ["marey_x.a.dead", "marey_x.a.A.dead_too"]
 
 
+def test_a_local_function_is_used_only_where_its_own_function_names_it():
+    text = """
+def f():
+    def body(): ...
+    def used(): ...
+    return used
+
+@register
+def g(body):
+    return f, body
+"""
+    found = [offence.subject for offence in unused.find(house({"marey_x.a": text}))]
+    assert found == ["marey_x.a.f.body"]
+
+
 def test_names_in_the_docs_are_used():
     modules = {"marey_x.a": "def of_the_sdk(): ...\n"}
     assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))

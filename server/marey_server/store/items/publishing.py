@@ -74,10 +74,6 @@ def _load_parts(tx: Transaction, drafts: Sequence[Draft]) -> list[_Loaded]:
     contents = [_contents(draft) for draft in drafts]
     stored = {one.digest for parts in contents for one in parts.values() if isinstance(one, StoredDocument)}
     loaded = documents.load_bodies(tx, stored)
-
-    def body(content: PreparedDocument | StoredDocument) -> Tree:
-        return content.body if isinstance(content, PreparedDocument) else loaded[content.digest]
-
     answer = []
     for draft, parts in zip(drafts, contents, strict=True):
         bodies = {
