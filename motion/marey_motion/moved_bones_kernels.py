@@ -33,7 +33,7 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
             bz = np.float64(moved[f, e, 2]) - np.float64(moved[f, s, 2])
             a, c = _length(ax, ay, az), _length(bx, by, bz)
             w, x, y, z = 1.0, 0.0, 0.0, 0.0
-            if min(a, c) > shortest_bone:
+            if a > shortest_bone and c > shortest_bone:
                 ax, ay, az, bx, by, bz = ax / a, ay / a, az / a, bx / c, by / c, bz / c
                 mx, my, mz = ax + bx, ay + by, az + bz
                 w = 0.5 * (mx * mx + my * my + mz * mz)

@@ -410,6 +410,22 @@ def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio):
     assert found.rotations.tobytes() == rotations.tobytes()
 
 
+def test_a_bone_beyond_the_range_of_single_precision_does_not_turn(studio):
+    clip = with_moved_joints(studio, "left_knee", "left_ankle", "left_toe")
+    translations = clip.translations.copy()
+    translations[5, :2] = 3e38  # ankle and toe are infinitely far away, so that the bone between them has no direction
+    clip = replace(clip, translations=translations)
+    joints = {name: studio.joint(name) for name in ("left_ankle", "left_toe")}
+
+    found = follow_moved_bones(clip, joints)
+    with np.errstate(invalid="ignore"):
+        rotations, largest = bones_followed_by_numpy(clip, joints)
+
+    assert found.largest_turn_deg == largest
+    assert len(largest) == 1
+    assert found.rotations.tobytes() == rotations.tobytes()
+
+
 def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio):
     clip, plan = with_moved_joints(studio, "left_elbow", "left_knee"), plan_between(studio, studio)
     result = retarget(clip, plan)
