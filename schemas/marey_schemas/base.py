@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
 
 class Request(BaseModel):
@@ -51,6 +51,7 @@ class Tagged(Options):
     model_config = ConfigDict(json_schema_extra=_require_tag)
     tag: ClassVar[str]
 
-    def model_post_init(self, _context: Any) -> None:
-        """Count the tag as given, so that documents without defaults contain it."""
-        self.model_fields_set.add(self.tag)
+    @model_serializer(mode="wrap")
+    def _with_tag(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Write the tag also into documents without defaults or without fields that were not set."""
+        return {**serialise(self), self.tag: getattr(self, self.tag)}

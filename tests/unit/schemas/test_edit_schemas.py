@@ -31,6 +31,17 @@ def test_what_is_left_out_is_the_default_and_commands_keep_their_names() -> None
     assert short.model_dump(mode="json", exclude_unset=True) == {"commands": [{"command": "smooth"}]}
 
 
+def test_defaults_may_be_left_out_but_not_the_names_of_commands_constraints_and_limits() -> None:
+    command = {
+        "command": "constrain",
+        "constraints": [{"kind": "look_at", "joint": "Head", "point_m": [0.0, 1.0, 2.0]}],
+        "limits": [{"kind": "hinge", "joint": "Neck", "angle_deg": [-10.0, 10.0]}],
+    }
+    edit = edit_of(commands=[command])
+    assert edit.model_dump(mode="json", exclude_defaults=True) == {"commands": [command]}
+    assert edit_of(**edit.model_dump(mode="json", exclude_defaults=True)) == edit
+
+
 def test_the_clips_that_commands_name_are_listed_once() -> None:
     both = [
         {"command": "concatenate", "source": "clip_a"},
