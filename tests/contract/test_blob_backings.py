@@ -2,13 +2,14 @@
 
 import os
 import threading
+from types import SimpleNamespace
 
 import pytest
 from tests.support.store_fixtures import Lab
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProblem
-from marey_server.store import blobs, garbage
+from marey_server.store import blob_backings, blobs, garbage
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.blobs import Spool, digest_of
 
@@ -152,6 +153,25 @@ class TestDatabaseBlobs(BlobBackingContract):
     @pytest.fixture
     def backing(self):
         return DatabaseBlobs()
+
+
+def test_many_small_blobs_take_time_in_proportion_to_their_number(monkeypatch):
+    lengths_asked = []
+    written = []
+
+    class Counted(bytes):
+        def __len__(self):
+            lengths_asked.append(self)
+            return super().__len__()
+
+    inserting = SimpleNamespace(run_each=lambda _connection, rows: written.append(len(rows)))
+    monkeypatch.setattr(blob_backings, "_INSERT_CHUNK", inserting)
+    monkeypatch.setattr(blob_backings, "BYTES_PER_STATEMENT", 4000)
+
+    DatabaseBlobs().write(None, {str(number): [Counted(10)] for number in range(1000)})
+
+    assert written == [400, 400, 200]
+    assert len(lengths_asked) == 1000
 
 
 class TestDirectoryBlobs(BlobBackingContract):

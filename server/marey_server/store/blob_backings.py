@@ -68,12 +68,14 @@ class DatabaseBlobs:
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Store the bytes of blobs in rows of 1 MiB, several rows with one statement."""
         rows: list[dict[str, Any]] = []
+        size_bytes = 0
         for digest, chunks in contents.items():
             for position, chunk in enumerate(chunks):
                 rows.append({"digest": digest, "position": position, "data": chunk})
-                if sum(len(row["data"]) for row in rows) >= BYTES_PER_STATEMENT:
+                size_bytes += len(chunk)
+                if size_bytes >= BYTES_PER_STATEMENT:
                     _INSERT_CHUNK.run_each(connection, rows)
-                    rows = []
+                    rows, size_bytes = [], 0
         _INSERT_CHUNK.run_each(connection, rows)
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
