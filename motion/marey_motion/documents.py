@@ -101,7 +101,7 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
 
 
 def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a clip to part `motion` as plain values and arrays, which whoever stores it checks against its schema.
+    """Convert a clip to part `motion` as plain values and arrays; the store checks it against its schema.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ class FollowedBones:
 
     @property
     def warning(self) -> CheckWarning | None:
-        """A warning for the user, or None where no bone has moved."""
+        """A warning for the user, or None if no bone has moved."""
         if not self.largest_turn_deg:
             return None
         name, most = max(self.largest_turn_deg.items(), key=lambda item: item[1])

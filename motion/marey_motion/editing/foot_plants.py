@@ -231,7 +231,7 @@ def _at_distance(points: Floats, centres: Floats, lengths: Floats) -> Floats:
 
 
 def _turn_between(before: Floats, after: Floats) -> Floats:
-    """Compute the shortest rotations (F, 4) between vectors (F, 3); identity where one has no length."""
+    """Compute the shortest rotations (F, 4) between vectors (F, 3); identity if one has no length."""
     known = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > 1e-6
     turns = quaternions.identity(len(before))
     turns[known] = quaternions.between_vectors(before[known], after[known])

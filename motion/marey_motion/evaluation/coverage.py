@@ -183,7 +183,7 @@ def cell_edges(values: Sequence[float], step: float) -> Floats:
 
 
 def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn_edges: Floats) -> float:
-    """Compute 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 where there is no data.
+    """Compute 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 if there is no data.
 
     The cells are those of the map and, where the grid itself is one-sided, their mirror images.
 

@@ -1,4 +1,4 @@
-"""Verdict on a data set, by rules that anybody can check.
+"""Verdict on a data set by simple rules.
 
 A trial counts as followed when the character, on average over it,
 

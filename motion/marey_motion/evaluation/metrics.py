@@ -295,7 +295,7 @@ def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
 
 
 def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> float | None:
-    """Apply the measure to the values; None where there are none."""
+    """Apply the measure to the values; None if there are none."""
     return float(measure(values)) if len(values) else None
 
 

@@ -32,7 +32,7 @@ class BvhHeader:
     """Everything in a BVH file before its numbers.
 
     `offsets[joint]`, `channels[joint]` follow the order of the joints in the file; `data_start` is the byte and
-    `data_line` the line where the numbers begin; `frame_time_s` is None where the file leaves it out.
+    `data_line` the line where the numbers begin; `frame_time_s` is None if the file leaves it out.
     """
 
     names: list[str] = field(default_factory=list)

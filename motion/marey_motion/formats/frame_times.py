@@ -29,7 +29,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
 
     Parameters
     ----------
-    frame_time_s : float or None    seconds between frames; None where the file does not say
+    frame_time_s : float or None    seconds between frames; None if the file does not say
     file : str    name of the file, for messages
     warnings : list of CheckWarning    receives the warnings
 

@@ -156,7 +156,7 @@ def number_problem(word: str) -> str:
 
 
 def decode_name(name: bytes) -> str:
-    """Decode a joint name: UTF-8, or Latin-1 where it is not, without control characters.
+    """Decode a joint name: UTF-8, or Latin-1 if it is not, without control characters.
 
     Parameters
     ----------

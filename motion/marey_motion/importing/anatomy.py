@@ -43,7 +43,7 @@ class Anatomy:
 
     @cached_property
     def _resting(self) -> dict[str, Any] | None:
-        """Part `mapping`; None where the rest pose leaves axes open that a motion can show."""
+        """Part `mapping`; None if the rest pose leaves axes open that a motion can show."""
         try:
             if rest_pose_doubts(self.skeleton, self.mapping):
                 return None

@@ -13,7 +13,7 @@ from marey_motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Indices of joints, None where none was found.
+    """Indices of joints, None if none was found.
 
     `hips` is the last joint that both feet hang from; the pairs are (left, right), `feet` being the ankles and `hands`
     the wrists. `by_names` is false where the joints were found by the skeleton's build alone, which fits animals too.

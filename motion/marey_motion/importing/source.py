@@ -27,7 +27,7 @@ class SourceMotion:
     format : str    name of the format
     joint_names, display_names, parents, offsets, rest_rotations    as in `Skeleton`, in the file's unit and axes
     end_sites : tuple of (int, (3,) float64)    joint and offset of each
-    root_positions : (F, 3) float64, optional    in the file's unit; None where the file holds no motion
+    root_positions : (F, 3) float64, optional    in the file's unit; None if the file holds no motion
     rotations : (F, J, 4) float32, optional    unit, sign-continuous in time
     translations : (F, k, 3) float64, optional    local positions of joints below the root that replace their offsets,
         in the file's unit
@@ -124,7 +124,7 @@ class ImportedMotion:
 
     Parameters
     ----------
-    clip : Clip, optional    the motion; None where the file holds a skeleton alone
+    clip : Clip, optional    the motion; None if the file holds a skeleton alone
     skeleton : Skeleton    its joints
     source : SourceInfo    record of the import
     warnings : tuple of CheckWarning    findings of the checks

@@ -198,7 +198,7 @@ def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
 def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[UpAxis, float]:
     """Find the signed axis nearest to the mean direction from the feet to the head (or hips), and its cosine.
 
-    The cosine is 0 where legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
+    The cosine is 0 if legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
     """
     assert landmarks.feet is not None
     feet = positions[:, list(landmarks.feet)].mean(axis=1)

@@ -155,7 +155,7 @@ class MatchingDatabase:
     poses : (N, 3 + 4·J) float32    joint 0 relative to the root (position in metres and rotation), then local rotations
     contacts : (N, 2) bool    whether the left and the right foot stand
     translations : (N, k, 3) float32    local translations in metres that replace the offsets of the k
-        `translated_joints`, as in a clip; None where no clip has any
+        `translated_joints`, as in a clip; None if no clip has any
     notes : what was left out or looks doubtful
     """
 

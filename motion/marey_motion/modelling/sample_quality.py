@@ -20,7 +20,7 @@ class FootQuality:
     Parameters
     ----------
     below_floor_share : share of frames in which at least one foot is under height 0
-    below_floor_mean_cm : how deep the lowest foot is in those frames; 0 where there are none
+    below_floor_mean_cm : how deep the lowest foot is in those frames; 0 if there are none
     lowest_cm : mean over the motions of their lowest foot
     slide_m_s : mean speed on the ground of feet in the frames where feet of the training examples mostly stand
     """

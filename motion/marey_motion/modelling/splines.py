@@ -122,7 +122,7 @@ class SplineBasis:
         """
         frames = values.shape[-2]
         if frames != self.frame_count:
-            raise MotionError(f"{frames} samples where the knots span {self.frame_count} canonical frames")
+            raise MotionError(f"{frames} samples for knots that span {self.frame_count} canonical frames")
         return np.asarray(self._fitting @ values, dtype=np.float64)
 
     @property

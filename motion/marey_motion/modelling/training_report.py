@@ -34,7 +34,7 @@ class ExampleReport:
     Parameters
     ----------
     log_likelihood : natural logarithm of its density
-    held_out_log_likelihood : under a mixture fitted without it; None where that was not asked for
+    held_out_log_likelihood : under a mixture fitted without it; None if that was not asked for
     left_out_error_cm : mean distance of its joints when the other examples' components reconstruct it, as many as kept
     outlier : its likelihood stands out from the others'
     """
@@ -192,7 +192,7 @@ def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
 def _feet(
     primitive: MotionPrimitive, aligned: AlignedSet, poses: Floats, sampled: Floats | None
 ) -> tuple[FootQuality | None, FootQuality | None]:
-    """Measure feet of the examples and of samples; None where the skeleton has no known feet."""
+    """Measure feet of the examples and of samples; None if the skeleton has no known feet."""
     joints = find_landmarks(primitive.skeleton).ground_joints
     if not joints:
         return None, None

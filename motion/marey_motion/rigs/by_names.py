@@ -22,7 +22,7 @@ class NameMatch:
 
     Parameters
     ----------
-    rig : str, optional    name of the rig; None where the names are everyday words of no particular tool
+    rig : str, optional    name of the rig; None if the names are everyday words of no particular tool
     joints : dict of str to int    index by standard name
     signature_share : float    share of the rig's signature that was found, 0 to 1
     """

@@ -37,7 +37,7 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
-    """Compute the mean of each headline over the trials that define it; 0 where none does.
+    """Compute the mean of each headline over the trials that define it; 0 if none does.
 
     Parameters
     ----------

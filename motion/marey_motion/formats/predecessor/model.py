@@ -225,7 +225,7 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Read the time of a model, None where it has none, and which form it has.
+    """Read the time of a model, None if it has none, and which form it has.
 
     Layout 2 was written by two trainers. The first one puts a component into each column of its vectors and means
     increments; the later one puts it into each row, and means coefficients as layout 3 does.

@@ -38,7 +38,7 @@ class JointPosition:
     ----------
     joint : by its own name or its standard name
     at : moment
-    target_m : (x, y, z) metres; None where the coordinate is free
+    target_m : (x, y, z) metres; None if the coordinate is free
     tolerance_m, weight : positive
     """
 
@@ -110,7 +110,7 @@ class RootPosition:
 
     Parameters
     ----------
-    target_m : (x, z) metres; None where the coordinate is free
+    target_m : (x, z) metres; None if the coordinate is free
     """
 
     at: Moment
