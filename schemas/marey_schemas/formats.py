@@ -41,12 +41,12 @@ class FileFormat:
     media_type : of written files
     reads, writes : contents that its reader understands and its writer can write
     units : units of length that it is written in; more than one: the caller chooses
-    begins : pattern that only the beginning of such a file matches; None where the name alone identifies it
+    begins : pattern that only the beginning of such a file matches; None if the name alone identifies it
     other_endings : endings that identify a named file, but that folders are not searched for
     euler : its rotations are Euler angles, whose orders an export keeps from the import
     archive : its files are ZIP archives with an ending of their own
     companion : format of a second file that its reader takes
-    needs_companion : why that file is needed; empty where it is optional
+    needs_companion : why that file is needed; empty if it is optional
     unread : why there is no reader, for files that people expect to be read
     """
 

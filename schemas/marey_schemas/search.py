@@ -228,7 +228,7 @@ class SearchRequest(RefineOptions):
             raise ValueError(f"steps: {total} constraints in all; at most {MOST_CONSTRAINTS} are possible")
         if total * self.candidates > MOST_CANDIDATE_CONSTRAINTS:
             most = MOST_CANDIDATE_CONSTRAINTS // total
-            raise ValueError(f"candidates: at most {most} where there are {total} constraints")
+            raise ValueError(f"candidates: at most {most} are possible with {total} constraints")
         return self
 
     @property
