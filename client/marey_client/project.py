@@ -119,7 +119,7 @@ class ProjectHandle(ProjectItems):
         priority: int = 0,
         cache: Cache = "use",
     ) -> Job:
-        """Submit the retargeting of clips, a folder by its path, or folders and clips, to the skeleton with this id.
+        """Submit a job that retargets clips, or folders given by path, to the skeleton with this id.
 
         Uses the newest joint mapping of each skeleton.
         """
@@ -136,7 +136,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Submit the annotation of clips, by a method or a method with its options, below the folder `into`.
+        """Submit a job that annotates clips by a method and its options; the results go below the folder `into`.
 
         Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
         `options` are the others of `AnnotateParams`.
@@ -148,7 +148,7 @@ class ProjectHandle(ProjectItems):
     def cut(
         self, annotations: Annotations, *, into: str, priority: int = 0, cache: Cache = "use", **options: Any
     ) -> Job:
-        """Submit the cutting of clips along the segments of annotations, into folders below `into`.
+        """Submit a job that cuts clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
         """
@@ -165,7 +165,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Submit the alignment of clips of one skeleton, all of which show the same action.
+        """Submit a job that aligns clips of one skeleton, all of which show the same action.
 
         `options` are those of `AlignParams`, for example `rate_hz=30` or `layer="steps"`. If a layer or labels are
         named and no annotations are given, the annotations of the clips are used.
@@ -183,7 +183,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Submit the editing of clips, a folder by its path, or folders and clips, by commands or a stored edit.
+        """Submit a job that edits clips, or folders given by path, by commands or a stored edit.
 
         The results go to the folder `into`, or get a `suffix`, or with `in_place=True` are the next revisions of the
         clips themselves. `options` are those of `EditParams`.
@@ -201,7 +201,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Submit the evaluation of clips of one skeleton: a folder by its path, or folders and clips.
+        """Submit a job that evaluates clips of one skeleton, or folders of them given by path.
 
         `options` are those of `EvaluateParams`, for example `name="walks-eval"` or `database={"mirroring": "add"}`;
         `normaliser` is an evaluation, or its id, with which the result will be comparable.
@@ -223,7 +223,7 @@ class ProjectHandle(ProjectItems):
         cache: Cache = "use",
         **options: Any,
     ) -> Job:
-        """Submit the training of a model on clips that were aligned with each other: a folder, or several of them.
+        """Submit a job that trains a model on clips that were aligned with each other, given as one or several folders.
 
         `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
         """

@@ -23,7 +23,7 @@ Places = Annotated[
 ]
 KindOf = Annotated[
     str | None,
-    typer.Option("--kind", help="Kind of the thing, if several things have the same name; collection: a folder."),
+    typer.Option("--kind", help="Kind of the item, if several have the same name; `collection` selects the folder."),
 ]
 
 
