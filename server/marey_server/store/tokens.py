@@ -122,7 +122,7 @@ def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = list
 
 
 def revoke_token(tx: Transaction, token_id: str) -> None:
-    """Revoke a token of the caller, or, for administrators, of anybody. Raises `NotFoundProblem`.
+    """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
     A token may always revoke itself.
     """

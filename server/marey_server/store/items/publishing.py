@@ -96,8 +96,10 @@ def _contents(draft: Draft) -> dict[str, PreparedDocument | StoredDocument]:
 
 
 def _in_turns(loaded: Sequence[_Loaded]) -> Iterator[list[_Loaded]]:
-    """Split drafts into groups that can be published together: of one kind, found in one way, at different places, and
-    after all that they refer to. Drafts with the same place keep their order.
+    """Split drafts into groups that can be published together, each after all drafts that it refers to.
+
+    The drafts of a group have the same kind, the same `reuse` and different places. Drafts with the same place keep
+    their order.
     """
     by_name = {one.draft.name_in_batch: one for one in loaded}
     turns: dict[str, int] = {}
