@@ -63,7 +63,7 @@ class Stances:
     Parameters
     ----------
     points : (K, P, 3) positions over the floor, centred on the pelvis, metres
-    facing : (K, 2) unit (x, z) directions, None where the body does not show them
+    facing : (K, 2) unit (x, z) directions, None if the body does not show them
     """
 
     points: AnyFloats

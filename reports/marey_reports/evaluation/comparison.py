@@ -169,7 +169,7 @@ def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
 
 
 def _shift(old: TrialResult, new: TrialResult) -> float:
-    """Compute the change of the mean offset in metres; 0 where one of the two is not defined."""
+    """Compute the change of the mean offset in metres; 0 if one of the two is not defined."""
     first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
     return 0.0 if first is None or second is None else second - first
 

@@ -55,7 +55,7 @@ class CostView(NamedTuple):
 
 
 def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
-    """Draw the clip of median cost and the one of the highest; None where there is only the reference."""
+    """Draw the clips with the median and the highest cost; return None if there is only the reference."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
         return None

@@ -167,7 +167,7 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
 
 
 def _deviations(judged: Floats) -> Floats:
-    """Convert log-likelihoods to robust deviations from the median; 0 where they do not differ."""
+    """Convert log-likelihoods to robust deviations from the median; 0 if they do not differ."""
     away = judged - np.median(judged)
     spread = DEVIATION_OF_MEDIAN * float(np.median(np.abs(away)))
     return np.asarray(away / spread if spread > 0.0 else np.zeros(len(judged)), dtype=np.float64)

@@ -16,7 +16,7 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Draw errors of searches for targets from examples; None where they were not measured."""
+    """Draw errors of searches for targets from examples; None if they were not measured."""
     check = subject.check
     if check is None:
         return None

@@ -81,7 +81,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
 
 
 def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
-    """Draw the error of rebuilt examples over the number of components; None where it was not measured."""
+    """Draw the error of rebuilt examples over the number of components; None if it was not measured."""
     errors = subject.report.reconstruction
     if errors is None:
         return None
