@@ -94,7 +94,7 @@ class _Cutting:
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
-        """Return the annotated clip with its name and place, at submission if clips are inputs of the job.
+        """Return the annotated clip with its name and place; if clips are inputs of the job, those at submission.
 
         In that case only inputs may determine the results, because the results are cached for jobs with the same
         inputs. Raises `MotionError`, `NoSuchThing`.
