@@ -25,7 +25,7 @@ from marey_motion.editing.smoothing import smooth
 from marey_motion.editing.take import MOST_NUMBERS, EditedBody, EditFinding, Take, motion_of, require_finite, settled
 from marey_motion.errors import EditError, MotionError
 from marey_motion.motion import Motion
-from marey_schemas.editing.commands import Concatenate, Paste
+from marey_schemas.editing.commands import Concatenate, NamedCommand, Paste
 from marey_schemas.editing.edits import AnyCommand
 
 COMMANDS: Mapping[str, Callable[..., Take | tuple[Take, ...]]] = {
@@ -111,6 +111,12 @@ def edit_clip(
     )  # fmt: skip
     takes: tuple[Take, ...] = (first,)
     for number, command in enumerate(commands):
+        if not isinstance(command, NamedCommand):
+            raise EditError(
+                f"a {type(command).__name__} is not a command; `EditDocument.model_validate` makes one of a document",
+                code="command-invalid",
+                where=f"commands[{number}]",
+            )
         try:
             takes = tuple(one for take in takes for one in apply_command(take, command))
         except MotionError as error:

@@ -13,7 +13,7 @@ from tests.support.edited_takes import make_breathing_walk, make_walk, require_s
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import COMMANDS, EditedClip, apply_edit, edit_clip
 from marey_motion.errors import EditError, MotionError
-from marey_schemas.editing.commands import NamedCommand, Rotate, Scale, Split, Trim
+from marey_schemas.editing.commands import Mirror, NamedCommand, Rotate, Scale, Split, Trim
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 
@@ -62,6 +62,13 @@ def test_every_command_gives_sound_clips_of_the_frames_it_promises(command: dict
         "retime": int((walk.frame_count - 1) / 0.7) + 1,
     }
     assert frames == expected.get(name, walk.frame_count)
+
+
+@pytest.mark.parametrize("document", [{"command": "mirror"}, ("mirror", {})])
+def test_a_document_in_place_of_a_command_is_refused_with_the_way_to_make_one(document: Any) -> None:
+    with pytest.raises(EditError, match=r"EditDocument\.model_validate") as refused:
+        edit_clip(make_walk(), [Mirror(), document])
+    assert refused.value.where == "commands[1]"
 
 
 def test_a_saved_edit_gives_the_same_bytes_every_time() -> None:
