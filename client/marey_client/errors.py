@@ -69,7 +69,7 @@ class NoAnnotations(MareyError):
 
 
 class JobUnsuccessful(MareyError):
-    """A job that was waited for failed or was cancelled; `job` says how."""
+    """An awaited job failed or was cancelled; `job` contains its final state."""
 
     def __init__(self, message: str, job: Any) -> None:
         super().__init__(message)
@@ -80,7 +80,7 @@ class JobUnsuccessful(MareyError):
 
 
 class WaitedTooLong(MareyError):
-    """A job had not ended when the time to wait was over; it goes on."""
+    """A job did not end within the time to wait; it continues on the server."""
 
 
 # The server's problem documents, by status

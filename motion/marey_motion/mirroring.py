@@ -43,10 +43,11 @@ class _Mirror:
 
 
 def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
-    """Reflect a motion in x, so that left limbs do what right ones did.
+    """Reflect a motion in x, which exchanges the motion of left and right limbs.
 
-    Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; twice is the
-    motion itself. A joint that has no counterpart, such as a prop in one hand, moves with its parent as before.
+    Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; reflecting
+    twice gives the original motion. A joint that has no counterpart, such as a prop in one hand, moves with its parent
+    as before.
 
     Parameters
     ----------

@@ -118,7 +118,7 @@ class Revision(Answer):
 
 
 class LineageEdge(Answer):
-    """One step of an item's history: what a revision was made from, or what was made from it."""
+    """One step of an item's history: an input of a revision, or a result computed from it."""
 
     item: str
     kind: Kind

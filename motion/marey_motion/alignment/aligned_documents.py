@@ -128,7 +128,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
 
 def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
-    """Restore the clip that a stored example was made from: its frames at the set's rate, in its own time and place.
+    """Restore the source clip of a stored example: its frames at the set's rate, in its own time and place.
 
     Parameters
     ----------

@@ -233,7 +233,7 @@ def _hold_steps(series: TrialSeries) -> int:
 
 
 def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
-    """Compute the seconds from a switch until the speed stays right; None if the next switch comes first."""
+    """Compute the seconds from a switch until the speed stays right; None if the next switch is earlier."""
     wanted = series.wanted_speeds_m_s[first:stop]
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
     hold = _hold_steps(series)

@@ -136,7 +136,7 @@ def _run_ahead(
     threads: int,
     cancelled: CancelCallback,
 ) -> None:
-    """Run trials, `threads` at a time, each handed over as it ends."""
+    """Run trials, `threads` at a time, and pass each record to `keep` when the trial ends."""
     waiting = list(reversed(trials))
     running: dict[Future[TrialRecord], Trial] = {}
     with ThreadPoolExecutor(max_workers=threads, thread_name_prefix="trial") as pool:

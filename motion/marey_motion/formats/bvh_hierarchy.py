@@ -80,7 +80,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
 
 def _read_hierarchy(lines: TextLines) -> BvhHeader:
-    """Read up to the line MOTION; files of one skeleton share what was read of the first of them."""
+    """Read up to the line MOTION; files with equal hierarchies share the parsed hierarchy of the first one."""
     motion = _MOTION_LINE.search(lines.data, 0, _LONGEST_KEPT)
     key = None if motion is None else hashlib.sha256(lines.data[: motion.end()]).digest()
     kept = None if key is None else _KNOWN.get(key)

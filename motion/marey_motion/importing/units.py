@@ -359,7 +359,7 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
-    """Check that hands and feet are on one ground well below the hips, which no body lying on its side has."""
+    """Check that hands and feet are on one ground well below the hips, unlike those of a body lying on its side."""
     assert body.leg is not None
     return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
 

@@ -56,7 +56,7 @@ class FeatureLayout:
 
 
 def feature_layout(options: DatabaseOptions, body: MatchingBody) -> FeatureLayout:
-    """List the dimensions that options ask for; 27 unless joints or horizons are added.
+    """List the dimensions selected by options; 27 unless joints or horizons are added.
 
     Parameters
     ----------

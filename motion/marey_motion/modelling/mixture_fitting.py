@@ -194,7 +194,7 @@ class _Fitting:
 
 
 def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> tuple[LatentMixture, bool]:
-    """Fit a mixture of so many components; also return whether the fit converged."""
+    """Fit a mixture with a given number of components; also return whether the fit converged."""
     examples, dimensions = latents.shape
     if count == 1:
         return _normal(latents, options.regularisation, shrink=examples <= dimensions + 1), True

@@ -86,7 +86,7 @@ def train_primitive(
 
     Raises
     ------
-    ModelError    if no model can be made of the examples
+    ModelError    if no model can be trained on the examples
     """
     check_examples(aligned)
     with one_thread():
@@ -105,7 +105,7 @@ def train_primitive(
 
 
 def check_examples(aligned: AlignedSet) -> None:
-    """Check that a model can be made of examples.
+    """Check that a model can be trained on examples.
 
     Parameters
     ----------

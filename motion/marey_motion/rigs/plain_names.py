@@ -1,4 +1,4 @@
-"""Joint names without what an exporter put before or after all of them.
+"""Joint names without prefixes and suffixes that an exporter added to all of them.
 
 Duplicating an armature, joining scenes and converting files leave marks on every joint: "Hips.001", "hero_Hips",
 "Hips_jnt", "Hips_07". None of them says anything of a body, but together they hide the names of every known rig.

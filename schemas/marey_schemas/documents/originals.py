@@ -22,7 +22,7 @@ CONTENT = {
 
 
 class StoredOriginal(Request):
-    """An imported file, with the digest of the content that was made from it."""
+    """Imported file, with the digest of the content that the import created from it."""
 
     name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest

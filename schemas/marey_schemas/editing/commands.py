@@ -202,7 +202,7 @@ class FlipAxes(NamedCommand):
 
 
 class FixDrift(NamedCommand):
-    """Spread a wanted shift and turn of the body over a range of frames; those after it get all of it."""
+    """Spread a shift and a turn of the body over a range of frames; the frames after it are moved by all of it."""
 
     command: Literal["fix_drift"] = "fix_drift"
     shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range.")

@@ -1,4 +1,4 @@
-"""Resources that measure coverage during a recording session: they receive frames and say what to record next.
+"""Resources that measure coverage during a recording: they receive frames and return motions to record next.
 
 A stream is stored in a row, which is updated before each answer, so that nothing is lost if the server dies.
 """

@@ -181,7 +181,7 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
 
 
 def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
-    """Split files into runs that are published together; a graph is one by itself, since it names models before it."""
+    """Split files into runs that are published together; a graph is a separate run, because it names earlier models."""
     for is_graph, run in itertools.groupby(files, lambda file: file.graph is not None):
         if is_graph:
             yield from ([file] for file in run)

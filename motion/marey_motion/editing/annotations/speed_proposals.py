@@ -62,12 +62,11 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMini
 
 
 def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposal | None = None) -> Layer:
-    """Propose a segment `reach_left` or `reach_right` each time a wrist goes far from its place of rest and returns.
+    """Propose a segment `reach_left` or `reach_right` each time a wrist leaves its rest position and returns.
 
-    The place of rest is the position of the wrist at the start of the clip, as seen from the hips in the direction of
-    the body, with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one
-    after. The keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one
-    there.
+    The rest position is that of the wrist at the start of the clip, in the frame of the hips and the body's heading,
+    with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one after. The
+    keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one there.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ class Filling:
 
 @dataclass(frozen=True)
 class Addition:
-    """One step of filling: what a candidate adds to the set and all candidates before it."""
+    """One step of filling: the gain of a candidate beside the set and all earlier candidates."""
 
     filling: Filling
     filled_s: float

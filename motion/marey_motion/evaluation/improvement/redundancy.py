@@ -1,4 +1,4 @@
-"""Redundant clips of a data set: every used one left out in turn, and a plan of several removals."""
+"""Redundancy of the clips of a data set: the effect of leaving out each used clip, and a plan of several removals."""
 
 from __future__ import annotations
 

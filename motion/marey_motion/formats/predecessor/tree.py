@@ -1,4 +1,4 @@
-"""The predecessor's cluster trees over samples of a model, nested nodes, and ours made of them and the other way round.
+"""The predecessor's cluster trees over samples of a model, as nested nodes, and their conversion to ours and back.
 
 A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Ours keeps
 the samples in the order of the tree and single precision; means follow from them.

@@ -147,7 +147,7 @@ def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tu
 
 
 def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line]) -> None:
-    """Draw lines, each in the colour of the clip it leaves; a jump that is taken more often is thicker and darker."""
+    """Draw lines, each in the colour of the clip it leaves; more frequent jumps are thicker and darker."""
     from matplotlib.collections import PathCollection
     from matplotlib.path import Path
 

@@ -215,7 +215,7 @@ class _Publication:
     # -- finding -------------------------------------------------------------------------------------------------------
 
     def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
-        """Return the items that drafts add to or stand for, by the drafts' names."""
+        """Return the existing items to which drafts add revisions or which have their content, by the drafts' names."""
         if reuse == "new":
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
