@@ -74,6 +74,7 @@ def test_what_loops_already_hardly_changes() -> None:
 def test_a_loop_needs_some_frames() -> None:
     with pytest.raises(EditError, match="at least 4 frames, there are 3"):
         apply_edit(make_walk().sliced(0, 3), [CloseLoop()])
+    assert apply_edit(make_walk().sliced(0, 4), [CloseLoop()]).frame_count == 4
 
 
 @pytest.mark.parametrize("in_place", [False, True])

@@ -51,6 +51,15 @@ def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: Resampl
     assert refused.value.code == "edit-too-large"
 
 
+def test_a_result_of_the_greatest_size_is_made_and_a_larger_one_is_refused() -> None:
+    walk, slow = make_walk(), Retime(speed=0.5)
+    frames = 2 * walk.frame_count - 1
+    most = frames * walk.poses.shape[1]
+    assert apply_edit(walk, [slow], most_numbers=most).frame_count == frames
+    with pytest.raises(EditError, match=f"the result would have {frames} frames"):
+        apply_edit(walk, [slow], most_numbers=most - 1)
+
+
 def test_a_mirrored_mirror_image_is_the_motion() -> None:
     walk = make_breathing_walk(turn_rate_rad_s=0.5)
     once = apply_edit(walk, [Mirror()])
