@@ -219,7 +219,7 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Lay out points with frames first for one, last for the other: the inner loop runs along the latter."""
+    """Lay out the points of two motions with frames as the first axis of one and the last axis of the other."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
             f"points must be (frames, points, 3), of the same points in both, not {a.shape} and {b.shape}"

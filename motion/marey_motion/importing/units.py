@@ -161,7 +161,7 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Decide where the body does not simply stand along y: it may lie or climb, or the file may have another axis."""
+    """Choose the upward axis if the body is not upright along y: it may lie or climb, or the axis is another one."""
     rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
     if rest_cosine > 0.0:

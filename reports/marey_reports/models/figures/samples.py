@@ -41,7 +41,7 @@ class Reach(NamedTuple):
 
 
 def reach_of(subject: ModelSubject) -> list[Reach]:
-    """Compute the range of wrists and ankles in 98 of 100 moments, of examples and as many samples, at least 200."""
+    """Compute the range of wrists and ankles, without extreme moments, of examples and of at least 200 samples."""
     frames = evenly(subject.primitive.frame_count, FRAMES)
     drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
     sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]
