@@ -6,6 +6,7 @@ import hashlib
 import json
 import socket
 import time
+from asyncio import Future
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -15,9 +16,13 @@ import msgpack
 import numpy as np
 import pytest
 from tests.support.rest_server import Server
+from tornado.iostream import IOStream
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
+from marey_server.http import reply
+from marey_server.http.exchange import JOINED_BYTES
+from marey_server.http.negotiation import MediaType
 from marey_server.store.blobs import Spool
 
 JOINTS = ("hips", "knee", "foot")
@@ -426,6 +431,34 @@ def test_security_headers_are_on_every_answer(owner: httpx.Client):
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
         assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
         assert "Access-Control-Allow-Origin" not in answer.headers
+
+
+def test_a_large_answer_is_sent_from_the_memory_that_holds_it(owner: httpx.Client, monkeypatch: pytest.MonkeyPatch):
+    skeleton = make(owner, "skeletons", "three joints", hierarchy=HIERARCHY)
+    path = f"/projects/lab/clips/{make(owner, 'clips', 'long', motion=motion(skeleton['id'], 4000))['id']}/parts/motion"
+    bodies: list[bytes] = []
+    written: list[object] = []
+    encode, write = reply.encode, IOStream.write
+
+    def encoding(content: reply.Content, media: MediaType) -> bytes:
+        bodies.append(encode(content, media))
+        return bodies[-1]
+
+    def writing(stream: IOStream, data: bytes | memoryview) -> Future[None]:
+        written.append(data)
+        return write(stream, data)
+
+    monkeypatch.setattr(reply, "encode", encoding)
+    monkeypatch.setattr(IOStream, "write", writing)
+    answer = owner.get(path, headers={"Accept": "application/json"})
+    (body,) = bodies
+    assert len(body) > JOINED_BYTES
+    assert any(data is body for data in written)
+    assert answer.content == body
+    assert answer.headers["Content-Length"] == str(len(body))
+    head = owner.head(path, headers={"Accept": "application/json"})
+    assert (head.content, head.headers["Content-Length"]) == (b"", str(len(body)))
+    assert owner.get(path).status_code == 200
 
 
 # -- bytes ----------------------------------------------------------------------------------------------------------

@@ -22,6 +22,8 @@ from marey_server.process.services import Services
 
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
+JOINED_BYTES = 256 * 1024
+"""Size of a body above which headers are sent first, because Tornado copies a body that it sends with them."""
 _LENGTH = re.compile("[0-9]{1,4300}")
 """Pattern of a Content-Length; the number of digits is limited because `int` refuses very long ones."""
 _SECURITY_HEADERS = {
@@ -76,13 +78,15 @@ class Exchange(RequestHandler):
 
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
-    def send(self, rendered: Rendered) -> None:
-        """Set status, headers and body of the response."""
+    def send(self, rendered: Rendered, *, whole_bytes: int | None = None) -> None:
+        """Set status, headers and body of the response, or the start of its body, which has `whole_bytes` in all."""
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
         if rendered.status not in (204, 304):
-            self.set_header("Content-Length", str(len(rendered.body)))
+            self.set_header("Content-Length", str(len(rendered.body) if whole_bytes is None else whole_bytes))
+            if len(rendered.body) > JOINED_BYTES:
+                self.flush()
             self.write(rendered.body)
 
     async def flush_within(self, seconds: float) -> None:

@@ -122,8 +122,7 @@ class BlobSender(Resource):
 
     async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:
         """Send the pieces of a blob, each read after the one before was sent."""
-        self.send(first)
-        self.set_header("Content-Length", str(opened.stop - opened.start))
+        self.send(first, whole_bytes=opened.stop - opened.start)
         if self.request.method == "HEAD":
             return
         position = opened.start + len(first.body)

@@ -29,8 +29,8 @@ LONGEST_WAIT_FOR_PLACE_S = 20.0
 """Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-KEPT_BLOCK_BYTES = 8 * 2**20
-"""Size in bytes above which freed blocks are returned to the system at once."""
+KEPT_BLOCK_BYTES = 20 * 2**20
+"""Size in bytes above which freed blocks are returned to the system at once; writing a clip as JSON takes 17 MB."""
 KEPT_BYTES = 32 * 2**20
 """Free bytes at the end of a heap above which they are returned; each thread has its own heap."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
