@@ -7,7 +7,7 @@ from marey_motion.editing.annotations.layers import COMMANDS
 from marey_schemas.editing.annotation_commands import AnnotationCommand
 
 
-def test_each_command_that_travels_says_what_the_function_of_its_name_takes():
+def test_each_command_that_travels_says_what_the_function_of_its_name_takes() -> None:
     models = get_args(get_args(AnnotationCommand)[0])
     travelling = {get_args(model.model_fields["command"].annotation)[0]: model for model in models}
     assert travelling.keys() == COMMANDS.keys()

@@ -2,9 +2,15 @@
 
 import os
 import threading
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Barrier
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from sqlalchemy import Connection
+from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
 from marey_server.access.principal import SYSTEM
@@ -12,6 +18,8 @@ from marey_server.errors import InvalidProblem, NotFoundProblem, StorageFullProb
 from marey_server.store import blob_backings, blobs, garbage
 from marey_server.store.blob_backings import CHUNK_BYTES, DatabaseBlobs, DirectoryBlobs
 from marey_server.store.blobs import Spool, digest_of
+from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Transaction
 
 SIZES = (0, 1, 1000, CHUNK_BYTES - 1, CHUNK_BYTES, CHUNK_BYTES + 1, 3 * CHUNK_BYTES + 17)
 OLD_US = 2 * 24 * 3600 * 1_000_000
@@ -21,13 +29,13 @@ class BlobBackingContract:
     """Subclasses give `backing`."""
 
     @pytest.fixture
-    def store(self, database, backing):
+    def store(self, database: Database, backing: Any) -> Lab:
         database.blobs = backing
         return Lab(database)
 
     @pytest.fixture(params=["bytes", "spool"])
-    def as_content(self, request):
-        def spooled(data):
+    def as_content(self, request: pytest.FixtureRequest) -> Any:
+        def spooled(data: bytes) -> Spool:
             spool = Spool()
             for start in range(0, len(data), 70_000):
                 spool.write(data[start : start + 70_000])
@@ -35,7 +43,7 @@ class BlobBackingContract:
 
         return bytes if request.param == "bytes" else spooled
 
-    def test_bytes_of_any_size_come_back_whole_and_in_ranges(self, store, as_content):
+    def test_bytes_of_any_size_come_back_whole_and_in_ranges(self, store: Lab, as_content: Any) -> None:
         for size in SIZES:
             data = os.urandom(size)
             digest = store.write(blobs.put_blob, as_content(data))
@@ -51,33 +59,33 @@ class BlobBackingContract:
                 start = max(start, 0)
                 assert store.read(blobs.read_range, digest, start, stop) == data[start:stop], (size, start, stop)
 
-    def test_large_blobs_are_read_in_pieces(self, store):
+    def test_large_blobs_are_read_in_pieces(self, store: Lab) -> None:
         digest = store.write(blobs.put_blob, os.urandom(5 * CHUNK_BYTES))
         pieces = store.read(
             lambda tx: [len(piece) for piece in tx.blobs.read(tx.connection, digest, 0, 5 * CHUNK_BYTES)]
         )
         assert max(pieces) <= CHUNK_BYTES
 
-    def test_the_same_bytes_again_are_stored_once(self, store):
+    def test_the_same_bytes_again_are_stored_once(self, store: Lab) -> None:
         data = os.urandom(2 * CHUNK_BYTES)
         assert store.write(blobs.put_blob, data) == store.write(blobs.put_blob, data, who=store.reader)
         assert store.read(blobs.read_blob, digest_of(data)) == data
 
-    def test_the_same_bytes_sent_at_once_by_many_are_stored_once(self, store):
+    def test_the_same_bytes_sent_at_once_by_many_are_stored_once(self, store: Lab) -> None:
         data = os.urandom(CHUNK_BYTES + 9)
         senders = [store.owner, store.reader, store.contributor, store.stranger] * 2
         futures = [store.database.submit_write(who, blobs.put_blob, data) for who in senders]
         assert {future.result(60) for future in futures} == {digest_of(data)}
         assert store.read(blobs.read_blob, digest_of(data), who=store.stranger) == data
 
-    def test_bytes_that_are_not_the_announced_ones_are_refused(self, store):
+    def test_bytes_that_are_not_the_announced_ones_are_refused(self, store: Lab) -> None:
         with pytest.raises(InvalidProblem):
             store.write(blobs.put_blob, b"changed", expected=digest_of(b"original"))
         with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest_of(b"changed"))
 
-    def test_bytes_of_a_write_that_failed_do_not_exist(self, store):
-        def fail(tx):
+    def test_bytes_of_a_write_that_failed_do_not_exist(self, store: Lab) -> None:
+        def fail(tx: Transaction) -> None:
             blobs.put_blob(tx, b"never")
             raise RuntimeError("on the way")
 
@@ -88,8 +96,10 @@ class BlobBackingContract:
         assert store.write(blobs.put_blob, b"never") == digest_of(b"never")
         assert store.read(blobs.read_blob, digest_of(b"never")) == b"never"
 
-    def test_a_full_disk_refuses_the_bytes_and_leaves_nothing(self, store, backing, monkeypatch):
-        def fill_up(self, connection, contents):
+    def test_a_full_disk_refuses_the_bytes_and_leaves_nothing(
+        self, store: Lab, backing: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def fill_up(self: object, connection: Connection, contents: Any) -> None:
             next(iter(next(iter(contents.values()))))
             raise OSError(28, "No space left on device")
 
@@ -100,7 +110,7 @@ class BlobBackingContract:
         with pytest.raises(NotFoundProblem):
             store.read(blobs.require_readable, digest_of(b"too much"))
 
-    def test_garbage_is_collected_with_its_bytes(self, store, backing, clock):
+    def test_garbage_is_collected_with_its_bytes(self, store: Lab, backing: Any, clock: AdjustableClock) -> None:
         digest = store.write(blobs.put_blob, b"nobody's")
         assert garbage.collect_garbage(store.database).blobs == 0
         clock.advance(OLD_US / 1e6)
@@ -112,11 +122,13 @@ class BlobBackingContract:
         garbage.collect_garbage(store.database, grace_us=-1)
         assert store.read(lambda tx: b"".join(tx.blobs.read(tx.connection, digest, 0, 8))) == b""
 
-    def test_a_blob_deleted_by_a_transaction_that_rolls_back_keeps_its_bytes(self, store, clock):
+    def test_a_blob_deleted_by_a_transaction_that_rolls_back_keeps_its_bytes(
+        self, store: Lab, clock: AdjustableClock
+    ) -> None:
         digest = store.write(blobs.put_blob, b"still here")
         clock.advance(OLD_US / 1e6)
 
-        def fail(tx):
+        def fail(tx: Transaction) -> None:
             assert garbage.delete_blobs(tx, [digest]) == 1
             raise RuntimeError("on the way")
 
@@ -124,7 +136,7 @@ class BlobBackingContract:
             store.write(fail)
         assert store.read(blobs.read_blob, digest) == b"still here"
 
-    def test_bytes_sent_again_while_strays_are_swept_survive(self, store, clock):
+    def test_bytes_sent_again_while_strays_are_swept_survive(self, store: Lab, clock: AdjustableClock) -> None:
         """Whoever comes first: the blob is there in the end."""
         data = b"swept and sent"
         for _ in range(5):
@@ -133,7 +145,7 @@ class BlobBackingContract:
             store.write(garbage.delete_blobs, [digest_of(data)], who=SYSTEM)
             start = threading.Barrier(2)
 
-            def sweep(start=start):
+            def sweep(start: Barrier = start) -> None:
                 start.wait(10)
                 garbage.collect_garbage(store.database, grace_us=0)
 
@@ -145,22 +157,22 @@ class BlobBackingContract:
             found = store.read(blobs.readable, [digest_of(data)])
             assert not found or store.read(blobs.read_blob, digest_of(data)) == data
 
-    def test_it_says_that_it_can_be_written(self, store, backing):
+    def test_it_says_that_it_can_be_written(self, store: Lab, backing: Any) -> None:
         backing.check_writable()
 
 
 class TestDatabaseBlobs(BlobBackingContract):
     @pytest.fixture
-    def backing(self):
+    def backing(self) -> DatabaseBlobs:
         return DatabaseBlobs()
 
 
-def test_many_small_blobs_take_time_in_proportion_to_their_number(monkeypatch):
+def test_many_small_blobs_take_time_in_proportion_to_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
     lengths_asked = []
     written = []
 
     class Counted(bytes):
-        def __len__(self):
+        def __len__(self) -> int:
             lengths_asked.append(self)
             return super().__len__()
 
@@ -176,13 +188,13 @@ def test_many_small_blobs_take_time_in_proportion_to_their_number(monkeypatch):
 
 class TestDirectoryBlobs(BlobBackingContract):
     @pytest.fixture
-    def backing(self, tmp_path):
+    def backing(self, tmp_path: Path) -> DirectoryBlobs:
         return DirectoryBlobs(tmp_path / "blobs")
 
-    def test_files_without_rows_are_swept_and_others_stay(self, store, backing):
+    def test_files_without_rows_are_swept_and_others_stay(self, store: Lab, backing: DirectoryBlobs) -> None:
         kept = store.write(blobs.put_blob, b"kept")
 
-        def fail(tx):
+        def fail(tx: Transaction) -> None:
             blobs.put_blob(tx, b"stray")
             raise RuntimeError("on the way")
 
@@ -198,8 +210,8 @@ class TestDirectoryBlobs(BlobBackingContract):
         assert set(backing.stray_digests(older_than_s=-10)) == {kept}
         assert store.read(blobs.read_blob, kept) == b"kept"
 
-    def test_an_interrupted_write_leaves_no_file_under_the_name(self, store, backing):
-        def broken():
+    def test_an_interrupted_write_leaves_no_file_under_the_name(self, store: Lab, backing: DirectoryBlobs) -> None:
+        def broken() -> Iterator[bytes]:
             yield b"half"
             raise RuntimeError("cut off")
 
@@ -208,7 +220,7 @@ class TestDirectoryBlobs(BlobBackingContract):
         assert list(backing.stray_digests(older_than_s=-10)) == []
         assert list((backing.root / "incoming").iterdir()) == []
 
-    def test_a_directory_that_cannot_be_written_is_told(self, backing):
+    def test_a_directory_that_cannot_be_written_is_told(self, backing: DirectoryBlobs) -> None:
         (backing.root / "incoming").rmdir()
         with pytest.raises(OSError, match="incoming"):
             backing.check_writable()

@@ -61,7 +61,7 @@ def puts(path: str) -> Callable[[Transaction], object]:
 @pytest.mark.parametrize("first", ["put", "delete"])
 def test_what_is_put_into_a_folder_while_it_is_deleted_goes_with_it_or_stands_in_a_new_one(
     lab: Lab, other: Database, below: str, first: str
-):
+) -> None:
     folders = make(lab, "old", "old/x")
 
     def delete(tx: Transaction) -> None:
@@ -80,7 +80,7 @@ def test_what_is_put_into_a_folder_while_it_is_deleted_goes_with_it_or_stands_in
 @pytest.mark.parametrize("first", ["put", "move"])
 def test_what_is_put_into_a_folder_while_it_moves_goes_along_or_stands_in_a_new_one(
     lab: Lab, other: Database, below: str, first: str
-):
+) -> None:
     folders = make(lab, "old", "old/x")
 
     def move(tx: Transaction) -> None:

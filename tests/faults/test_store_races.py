@@ -38,7 +38,9 @@ def removes(name: str | None) -> Act:
 
 @pytest.mark.parametrize("ousted_by", ["removal", "demotion"])
 @pytest.mark.parametrize("wants", ["to add a friend", "to be owner again", "to remove the other"])
-def test_an_owner_who_is_being_ousted_changes_no_member_any_more(lab: Lab, other: Database, ousted_by: str, wants: str):
+def test_an_owner_who_is_being_ousted_changes_no_member_any_more(
+    lab: Lab, other: Database, ousted_by: str, wants: str
+) -> None:
     stays, goes = lab.owner, lab.maintainer
     lab.write(puts(goes.user_name, Role.OWNER))
     ousting = removes(goes.user_name) if ousted_by == "removal" else puts(goes.user_name, Role.READER)
@@ -55,7 +57,9 @@ def test_an_owner_who_is_being_ousted_changes_no_member_any_more(lab: Lab, other
 
 
 @pytest.mark.parametrize("commit", [True, False])
-def test_two_results_of_one_name_become_two_revisions_and_neither_is_lost(lab: Lab, other: Database, commit: bool):
+def test_two_results_of_one_name_become_two_revisions_and_neither_is_lost(
+    lab: Lab, other: Database, commit: bool
+) -> None:
     item = lab.add_skeleton("rig")
 
     def publishes(bone_m: float) -> Act:

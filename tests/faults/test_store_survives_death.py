@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.support import store_writer
+from tests.support.store_fixtures import Lab
 from tests.support.store_writer import FILES
 
 from marey_schemas.kinds import Kind
@@ -19,11 +20,11 @@ from marey_server.store.blobs import digest_of
 class Writer:
     """Runs one kind of work in a process of its own, with a fault or without."""
 
-    def __init__(self, lab, url, folder):
+    def __init__(self, lab: Lab, url: str, folder: str) -> None:
         self._args = [sys.executable, store_writer.__file__, url, lab.owner.user_id, lab.owner.user_name]
         self._folder = folder
 
-    def run(self, work, fault=""):
+    def run(self, work: str, fault: str = "") -> int:
         """Exit status: 0, or minus the signal that ended it."""
         environment = {**os.environ, "MAREY_FAULT": fault}
         done = subprocess.run([*self._args, work, self._folder], env=environment, capture_output=True, timeout=60)
@@ -35,17 +36,17 @@ in_rows_and_in_files = pytest.mark.parametrize("backing", ["rows", "files"])
 
 
 @pytest.fixture
-def backing():
+def backing() -> str:
     return "rows"
 
 
 @pytest.fixture
-def folder(backing, tmp_path):
+def folder(backing: str, tmp_path: Path) -> str:
     return "" if backing == "rows" else str(tmp_path / "blobs")
 
 
 @pytest.fixture
-def writer(lab, database_url, folder):
+def writer(lab: Lab, database_url: str, folder: str) -> Writer:
     from marey_server.store.blob_backings import DirectoryBlobs
 
     if folder:
@@ -53,16 +54,16 @@ def writer(lab, database_url, folder):
     return Writer(lab, database_url, folder)
 
 
-def stored(lab):
+def stored(lab: Lab) -> list[bool]:
     there = lab.read(blobs.readable, [digest_of(data) for data in FILES])
     return [digest_of(data) in there for data in FILES]
 
 
-def published(lab):
+def published(lab: Lab) -> list[str]:
     return [one.name for one in lab.read(items.list_items, "lab", Kind.STUDY, sort="name").items]
 
 
-def assert_sound(lab):
+def assert_sound(lab: Lab) -> None:
     assert list(fsck.check_store(lab.database)) == []
 
 
@@ -74,7 +75,9 @@ def assert_sound(lab):
         ("blob.put.after_commit@2:kill", [True, True, False]),
     ],
 )
-def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left, backing):
+def test_a_sender_that_dies_leaves_whole_blobs(
+    lab: Lab, writer: Writer, fault: str, left: list[bool], backing: str
+) -> None:
     assert writer.run("send", fault) == -signal.SIGKILL
     assert stored(lab) == left
     assert_sound(lab)
@@ -85,7 +88,7 @@ def test_a_sender_that_dies_leaves_whole_blobs(lab, writer, fault, left, backing
 
 @pytest.mark.every_database
 @pytest.mark.parametrize(("fault", "left"), [("publish.before_commit:kill", 0), ("publish.after_commit:kill", 3)])
-def test_a_publisher_that_dies_leaves_everything_or_nothing(lab, writer, fault, left):
+def test_a_publisher_that_dies_leaves_everything_or_nothing(lab: Lab, writer: Writer, fault: str, left: int) -> None:
     writer.run("send")
     assert writer.run("publish", fault) == -signal.SIGKILL
     assert len(published(lab)) == left
@@ -97,7 +100,7 @@ def test_a_publisher_that_dies_leaves_everything_or_nothing(lab, writer, fault, 
 
 
 @in_rows_and_in_files
-def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab, writer, backing):
+def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, writer: Writer, backing: str) -> None:
     writer.run("send")
     assert writer.run("collect", "garbage.before_commit:kill") == -signal.SIGKILL
     assert stored(lab) == [True, True, True]
@@ -107,7 +110,7 @@ def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab, writer, ba
     assert_sound(lab)
 
 
-def test_without_a_fault_nobody_dies(lab, writer):
+def test_without_a_fault_nobody_dies(lab: Lab, writer: Writer) -> None:
     assert [writer.run(work) for work in ("send", "publish", "collect")] == [0, 0, 0]
     assert len(published(lab)) == 3
     assert stored(lab) == [True, True, True]

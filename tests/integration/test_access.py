@@ -13,7 +13,9 @@ from marey_schemas.access import Role
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.declarations import Access, writes
 from marey_server.store import projects
+from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import project
+from marey_server.store.transaction import Transaction
 
 CANARY = "canary-5e0f2b"
 ROLES = ("none", "stranger", "reader", "contributor", "maintainer", "owner", "admin", "attempt")
@@ -129,7 +131,7 @@ def house(server: Server) -> House:
     return House(server, tokens, variables)
 
 
-def send(house: House, route, role: str) -> httpx.Response:
+def send(house: House, route: tuple[Any, ...], role: str) -> httpx.Response:
     """The request of a route, with everything right but perhaps the caller."""
     operation, variables = route[1], dict(house.variables)
     headers: dict[str, str] = {}
@@ -191,7 +193,7 @@ def expected(access: Access, scope: str | None, role: str, public: bool) -> set[
 ROUTES = [(resource, operation) for resource in RESOURCES for operation in resource.operations.values()]
 
 
-def find_wrong_answers(house: House, routes) -> list[str]:
+def find_wrong_answers(house: House, routes: list[Any]) -> list[str]:
     """Send every route as every role; list the answers that differ from the declaration."""
     wrong = []
     for route in routes:
@@ -217,18 +219,18 @@ def find_wrong_answers(house: House, routes) -> list[str]:
     return wrong
 
 
-def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House):
+def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House) -> None:
     """One test for the whole table: a house full of canaries is built once per database."""
     wrong = find_wrong_answers(house, ROUTES)
     assert not wrong, "\n".join(wrong)
 
 
-def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.MonkeyPatch):
+def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control: members are changed without asking for the caller's role, and the walk reports it."""
     routes = [route for route in ROUTES if route[0].path == "/projects/{project}/members/{user}"]
     assert not find_wrong_answers(house, routes)
 
-    def see_without_asking(tx, name, **_kwargs):
+    def see_without_asking(tx: Transaction, name: str, **_kwargs: Any) -> ProjectRow:
         return projects.find_by_id(tx, tx.execute(select(project.c.id).where(project.c.name == name)).scalar_one())
 
     monkeypatch.setattr(projects, "require", see_without_asking)
@@ -237,7 +239,7 @@ def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.
     assert any("GET" in line and "as stranger" in line and "should be refused" in line for line in wrong), wrong
 
 
-def test_only_these_routes_ask_for_more_than_a_contributor():
+def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
     """A second home on purpose: whoever lowers the role of one of them changes this list, too."""
     high = {
         f"{operation.method} {resource.path}": operation.access.value
@@ -260,17 +262,17 @@ def test_only_these_routes_ask_for_more_than_a_contributor():
     }
 
 
-def test_a_change_cannot_be_declared_for_readers():
+def test_a_change_cannot_be_declared_for_readers() -> None:
     with pytest.raises(TypeError, match="contributor"):
         writes(access=Access.READER)
 
 
-def is_about_nobody(resource, role: str, code: str) -> bool:
+def is_about_nobody(resource: Any, role: str, code: str) -> bool:
     """Sign-in with a wrong password is refused whoever asks; it says nothing about the caller."""
     return resource.template().endswith("/login")
 
 
-def test_an_attempt_ends_with_its_own_token_and_no_other(house: House):
+def test_an_attempt_ends_with_its_own_token_and_no_other(house: House) -> None:
     template = "/jobs/{job}/attempts/{fence}/fail".format(**house.variables)
     body = {"write_id": "12345678", "code": "gave-up"}
     for role in ROLES:
@@ -281,7 +283,7 @@ def test_an_attempt_ends_with_its_own_token_and_no_other(house: House):
     assert attempt.get("/projects/lab").status_code in (401, 404)
 
 
-def test_a_public_project_is_read_by_everybody_but_not_its_members_and_events(house: House):
+def test_a_public_project_is_read_by_everybody_but_not_its_members_and_events(house: House) -> None:
     owner = house.server.client(house.tokens["owner"])
     etag = owner.get("/projects/lab").headers["ETag"]
     owner.patch("/projects/lab", json={"visibility": "public"}, headers={"If-Match": etag})
@@ -298,7 +300,7 @@ def test_a_public_project_is_read_by_everybody_but_not_its_members_and_events(ho
 
 
 @pytest.mark.parametrize("scope", ["read", "write", "jobs", "read!project=lab", "write!project=other"])
-def test_a_token_allows_no_more_than_its_scopes(house: House, scope: str):
+def test_a_token_allows_no_more_than_its_scopes(house: House, scope: str) -> None:
     owner = house.server.client(house.tokens["owner"])
     made = owner.post("/tokens", json={"name": "narrow", "scopes": [scope]})
     assert made.status_code == 201
@@ -310,13 +312,13 @@ def test_a_token_allows_no_more_than_its_scopes(house: House, scope: str):
     assert writes == 201 if scope == "write" else writes in (403, 404)
 
 
-def test_nobody_makes_a_token_that_reaches_further_than_his_own(house: House):
+def test_nobody_makes_a_token_that_reaches_further_than_his_own(house: House) -> None:
     reader = house.server.client(house.tokens["reader"])
     made = reader.post("/tokens", json={"name": "more", "scopes": ["admin"]})
     assert made.status_code == 403
 
 
-def test_a_revoked_token_stops_working_at_once(house: House):
+def test_a_revoked_token_stops_working_at_once(house: House) -> None:
     reader = house.server.client(house.tokens["reader"])
     assert reader.post("/logout").status_code == 204
     assert reader.get("/me").status_code == 401

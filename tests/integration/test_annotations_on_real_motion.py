@@ -1,11 +1,14 @@
 """Proposals on real takes: walks cut into steps, hands that are raised."""
 
 from collections import Counter
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from marey_motion.clip import Clip
 from marey_motion.editing.annotations.layers import Layer
 from marey_motion.editing.annotations.speed_proposals import propose_reaches
 from marey_motion.editing.annotations.step_proposals import propose_steps
@@ -18,7 +21,7 @@ from marey_schemas.options.annotations import WristContactProposal
 SUBJECTS = ("02", "05", "07", "09", "16")
 
 
-def annotate(folder: Path, pattern: str, propose) -> dict[str, tuple[float, Layer]]:
+def annotate(folder: Path, pattern: str, propose: Callable[..., Any]) -> dict[str, tuple[float, Layer]]:
     """Frame rate and layer of every take."""
     names = sorted(str(path.relative_to(folder)) for path in folder.glob(pattern))
     companions = {pairing.file: pairing.companion for pairing in pair_companions(names)}
@@ -41,12 +44,12 @@ def walks(mocap: Path) -> dict[str, tuple[float, Layer]]:
     return found
 
 
-def test_five_subjects_walk_sixty_steps_with_each_foot(walks):
+def test_five_subjects_walk_sixty_steps_with_each_foot(walks: dict[str, tuple[float, Layer]]) -> None:
     steps = Counter(segment.label for _, layer in walks.values() for segment in layer.segments)
     assert steps["step_left"] >= 60 <= steps["step_right"]
 
 
-def test_steps_follow_each_other_left_and_right_and_last_as_steps_do(walks):
+def test_steps_follow_each_other_left_and_right_and_last_as_steps_do(walks: dict[str, tuple[float, Layer]]) -> None:
     for rate_hz, layer in walks.values():
         steps = [one for one in layer.segments if one.label.startswith("step_")]
         for before, after in pairwise(steps):
@@ -56,14 +59,14 @@ def test_steps_follow_each_other_left_and_right_and_last_as_steps_do(walks):
             assert sum(one.start <= keyframe.frame < one.end for keyframe in layer.keyframes) == 1
 
 
-def test_jumps_runs_and_punches_hold_no_steps_of_a_walk(walks):
+def test_jumps_runs_and_punches_hold_no_steps_of_a_walk(walks: dict[str, tuple[float, Layer]]) -> None:
     for name in ("02_05", "16_01", "16_03", "16_35", "16_45", "09_01"):
         (layer,) = [layer for place, (_, layer) in walks.items() if name in place]
         assert not [one for one in layer.segments if one.label.startswith("step_")]
 
 
-def test_each_raised_hand_is_one_reach_of_the_right_hand_with_a_contact(mocap):
-    def propose(clip, body):
+def test_each_raised_hand_is_one_reach_of_the_right_hand_with_a_contact(mocap: Path) -> None:
+    def propose(clip: Clip, body: MatchingBody) -> Layer:
         return propose_reaches(clip, body, WristContactProposal(release=True))
 
     found = annotate(mocap, "bandai-namco-2/*raise-up-right-hand*.bvh", propose)

@@ -4,13 +4,15 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.timeout(300)
 
 
-def demo(folder, *arguments):
+def demo(folder: Any, *arguments: Any) -> Any:
     surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
     command = [sys.executable, "-m", "marey_client.cli", "demo", "--data", str(folder / "data"), *arguments]
     done = subprocess.run(command, env=surroundings, capture_output=True, text=True, cwd=folder, timeout=240)
@@ -18,7 +20,7 @@ def demo(folder, *arguments):
     return done
 
 
-def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(tmp_path):
+def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(tmp_path: Path) -> None:
     done = demo(tmp_path)
     told = done.stdout
     assert f"ls demo --token-file {tmp_path}/data/admin.token" in done.stderr

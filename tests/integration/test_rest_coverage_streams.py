@@ -1,7 +1,9 @@
 """Coverage of performances over HTTP: frames in any media type, what is missing out, each answer once and for all."""
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -9,6 +11,8 @@ import numpy as np
 import pytest
 from tests.support.rest_server import Server, running
 
+from marey_motion.arrays import Floats
+from marey_motion.clip import Clip
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
@@ -20,13 +24,13 @@ RATE_HZ = 60.0
 
 
 @pytest.fixture(scope="module")
-def walk():
+def walk() -> Clip:
     """Five seconds at 1.5 m/s, turning 50 degrees a second to the left."""
     return generate_gait(1.5, math.radians(50.0), 5.0, frame_rate_hz=RATE_HZ)
 
 
 @pytest.fixture
-def skeleton(owner: httpx.Client, walk) -> str:
+def skeleton(owner: httpx.Client, walk: Clip) -> str:
     mapping = map_joints(walk.skeleton)
     parts = {
         "hierarchy": skeleton_to_document(walk.skeleton).model_dump(mode="json", by_alias=True),
@@ -39,19 +43,21 @@ def skeleton(owner: httpx.Client, walk) -> str:
     return str(made.json()["id"])
 
 
-def begin(client: httpx.Client, **body) -> dict[str, Any]:
+def begin(client: httpx.Client, **body: Any) -> dict[str, Any]:
     made = client.post(STREAMS, json={"frame_rate_hz": RATE_HZ, **body})
     assert made.status_code == 201, made.text
     return made.json()
 
 
-def send(client: httpx.Client, stream: dict[str, Any], media_type: str = MSGPACK, **frames) -> httpx.Response:
+def send(client: httpx.Client, stream: dict[str, Any], media_type: str = MSGPACK, **frames: Any) -> httpx.Response:
     body = encode_tree(frames, media_type)
     url = f"{STREAMS}/{stream['id']}/frames"
     return client.post(url, content=body, headers={"Content-Type": media_type})
 
 
-def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(owner, skeleton, walk) -> None:
+def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(
+    owner: httpx.Client, skeleton: str, walk: Clip
+) -> None:
     stream = begin(owner, skeleton=skeleton)
     assert stream["index"] == 0.0
     assert stream["performer"] is None
@@ -72,7 +78,7 @@ def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(owner, 
     assert nearest["path"][0] == [0.0, 0.0, 0.0]
 
 
-def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float):
+def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float) -> Floats:
     """Roots (n, 3) that go where they face."""
     headings = math.radians(turn_rate_deg_s) * np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
     steps = speed_m_s / RATE_HZ * np.stack((np.sin(headings), np.cos(headings)), axis=-1)
@@ -85,7 +91,7 @@ def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("media_type", [JSON, MSGPACK, BSON])
-def test_frames_come_in_every_media_type(owner, media_type) -> None:
+def test_frames_come_in_every_media_type(owner: httpx.Client, media_type: str) -> None:
     stream = begin(owner)
     roots = circling(2.0, -50.0, 3.0)
     progress = send(owner, stream, media_type, offset=0, roots=roots, ends_take=True).json()
@@ -96,7 +102,7 @@ def test_frames_come_in_every_media_type(owner, media_type) -> None:
     assert progress["performer"] is None
 
 
-def test_the_map_is_there_for_who_looks_on(owner, server) -> None:
+def test_the_map_is_there_for_who_looks_on(owner: httpx.Client, server: Server) -> None:
     stream = begin(owner, speeds_m_s=[2.0, 1.0], turn_rates_deg_s=[-50.0, 0.0, 50.0], least_s=2.0, target_count=1)
     assert (stream["speeds_m_s"], stream["delay_s"], stream["missing_s"]) == ([1.0, 2.0], 0.5, 12.0)
     send(owner, stream, offset=0, roots=circling(2.0, -50.0, 3.0), ends_take=True)
@@ -113,7 +119,7 @@ def test_the_map_is_there_for_who_looks_on(owner, server) -> None:
     assert (listed["id"], listed["offset"]) == (stream["id"], 181)
 
 
-def test_the_same_frames_again_get_the_same_answer_and_count_once(owner) -> None:
+def test_the_same_frames_again_get_the_same_answer_and_count_once(owner: httpx.Client) -> None:
     stream = begin(owner)
     roots = circling(2.0, 50.0, 3.0)
     first = send(owner, stream, offset=0, roots=roots[:100])
@@ -125,7 +131,7 @@ def test_the_same_frames_again_get_the_same_answer_and_count_once(owner) -> None
     assert (late["code"], late["context"]) == ("coverage-offset", {"offset": 181})
 
 
-def test_frames_that_leave_a_gap_are_told_where_to_go_on(owner) -> None:
+def test_frames_that_leave_a_gap_are_told_where_to_go_on(owner: httpx.Client) -> None:
     stream = begin(owner)
     roots = circling(2.0, 50.0, 1.0)
     send(owner, stream, offset=0, roots=roots[:10])
@@ -135,7 +141,7 @@ def test_frames_that_leave_a_gap_are_told_where_to_go_on(owner) -> None:
     assert send(owner, stream, offset=10, roots=roots[10:20]).json()["offset"] == 20
 
 
-def test_a_pause_begins_a_new_take(owner) -> None:
+def test_a_pause_begins_a_new_take(owner: httpx.Client) -> None:
     stream = begin(owner)
     roots = circling(2.0, 0.0, 1.5)
     send(owner, stream, offset=0, roots=roots)
@@ -147,7 +153,9 @@ def test_a_pause_begins_a_new_take(owner) -> None:
     assert len(later["changed"]) == 1
 
 
-def test_any_server_goes_on_where_another_one_left_off(owner, server: Server, open_database, tmp_path, walk, skeleton):
+def test_any_server_goes_on_where_another_one_left_off(
+    owner: httpx.Client, server: Server, open_database: Callable[..., Any], tmp_path: Path, walk: Clip, skeleton: str
+) -> None:
     straight, moved = begin(owner, skeleton=skeleton), begin(owner, skeleton=skeleton)
     token = owner.headers["Authorization"].removeprefix("Bearer ")
     with running(open_database(), tmp_path / "other") as other:
@@ -158,7 +166,7 @@ def test_any_server_goes_on_where_another_one_left_off(owner, server: Server, op
             assert send(either, moved, offset=offset, poses=poses).json() == expected
 
 
-def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
+def test_it_goes_on_from_what_an_evaluation_found(owner: httpx.Client) -> None:
     measured = {
         "options": {"grid": {"speeds_m_s": [1.0, 2.0], "turn_rates_deg_s": [0.0]}, "coverage_least_s": 3.0},
         "coverage": {"seconds": {"dtype": "<f8", "shape": [2, 1], "data": [[5.0], [1.5]]}},
@@ -185,7 +193,9 @@ def test_it_goes_on_from_what_an_evaluation_found(owner) -> None:
         (None, 1.0, "coverage: Field required"),
     ],
 )
-def test_an_evaluation_without_a_map_that_makes_sense_is_refused(owner, seconds, least_s, said) -> None:
+def test_an_evaluation_without_a_map_that_makes_sense_is_refused(
+    owner: httpx.Client, seconds: list[list[float]] | None, least_s: float, said: str
+) -> None:
     grid = {"speeds_m_s": [1.0, 2.0], "turn_rates_deg_s": [0.0]}
     document = {
         "schema": "marey/evaluation@1", "verdict": "", "headline": {},
@@ -199,7 +209,7 @@ def test_an_evaluation_without_a_map_that_makes_sense_is_refused(owner, seconds,
     assert said in refused["detail"].replace("(1, 1)", "1 cells")
 
 
-def test_a_skeleton_that_tells_no_direction_is_refused(owner) -> None:
+def test_a_skeleton_that_tells_no_direction_is_refused(owner: httpx.Client) -> None:
     chain = {"schema": "marey/skeleton@1", "joints": [{"name": "j", "parent": -1, "offset": [0, 1, 0]}]}
     made = owner.post("/projects/lab/skeletons", json={"name": "chain", "parts": {"hierarchy": chain}})
     refused = problem(owner.post(STREAMS, json={"frame_rate_hz": 60, "skeleton": made.json()["id"]}), 422)
@@ -218,11 +228,11 @@ def test_a_skeleton_that_tells_no_direction_is_refused(owner) -> None:
         ({}, "required"),
     ],
 )
-def test_streams_that_make_no_sense_are_refused(owner, body, said) -> None:
+def test_streams_that_make_no_sense_are_refused(owner: httpx.Client, body: dict[str, Any], said: str) -> None:
     assert said in problem(owner.post(STREAMS, json=body), 422)["detail"]
 
 
-def test_a_grid_of_which_one_side_is_given_has_its_limit_too(owner) -> None:
+def test_a_grid_of_which_one_side_is_given_has_its_limit_too(owner: httpx.Client) -> None:
     refused = owner.post(STREAMS, json={"frame_rate_hz": 60, "turn_rates_deg_s": [step / 4 for step in range(200)]})
     assert refused.status_code == 201
     speeds = [0.05 * step for step in range(1, 201)]
@@ -231,7 +241,9 @@ def test_a_grid_of_which_one_side_is_given_has_its_limit_too(owner) -> None:
     assert "2200 cells" in problem(too_many, 422)["detail"]
 
 
-def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleton, walk) -> None:
+def test_frames_that_make_no_sense_are_refused_and_change_nothing(
+    owner: httpx.Client, skeleton: str, walk: Clip
+) -> None:
     stream, rootless = begin(owner, skeleton=skeleton), begin(owner)
     poses = np.array(walk.poses[:10])
     long = poses.copy()
@@ -260,7 +272,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(owner, skeleto
         assert owner.get(f"{STREAMS}/{one['id']}").json()["rev"] == 1
 
 
-def test_joints_that_move_in_their_parents_count(owner, skeleton, walk) -> None:
+def test_joints_that_move_in_their_parents_count(owner: httpx.Client, skeleton: str, walk: Clip) -> None:
     child = walk.skeleton.joint_names[1]
     shifted = np.broadcast_to(walk.skeleton.offsets[1], (walk.frame_count, 1, 3)).astype(np.float32)
     plain, moved = begin(owner, skeleton=skeleton), begin(owner, skeleton=skeleton)
@@ -274,7 +286,7 @@ def test_joints_that_move_in_their_parents_count(owner, skeleton, walk) -> None:
     assert answer.json()["performer"]["x_m"] != pytest.approx(wanted["performer"]["x_m"], abs=0.1)
 
 
-def test_a_stream_is_made_once_per_key_and_deleted_for_good(owner) -> None:
+def test_a_stream_is_made_once_per_key_and_deleted_for_good(owner: httpx.Client) -> None:
     key = {"Idempotency-Key": "stream-1"}
     first, again = (owner.post(STREAMS, json={"frame_rate_hz": 60}, headers=key) for _ in range(2))
     assert again.json() == first.json()
@@ -295,7 +307,7 @@ def test_readers_look_on_and_cannot_send(server: Server) -> None:
     assert problem(refused, 403)["code"] == "insufficient-role"
 
 
-def test_of_senders_who_send_at_once_one_is_taken(owner) -> None:
+def test_of_senders_who_send_at_once_one_is_taken(owner: httpx.Client) -> None:
     stream = begin(owner)
     roots = circling(1.0, 0.0, 1.0)
     with ThreadPoolExecutor(8) as pool:

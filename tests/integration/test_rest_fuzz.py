@@ -3,6 +3,7 @@
 `--tier soak` searches longer.
 """
 
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from urllib.parse import quote
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, assume, given, seed, settings
+from schemathesis import APIOperation, Case
 from schemathesis.checks import not_a_server_error
 from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import (
@@ -44,7 +46,7 @@ DOCUMENT = build_document(RouteTable(None, RESOURCES), version("marey"))
 
 
 @pytest.fixture(scope="module")
-def fuzzed(tmp_path_factory: pytest.TempPathFactory):
+def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, dict[str, str | None], dict[str, Any]]]:
     """A server with a private project, the names of what is in it, and three callers."""
     folder: Path = tmp_path_factory.mktemp("fuzzed")
     url = f"sqlite:///{folder / 'marey.db'}"
@@ -70,14 +72,14 @@ def furnish(server: Server, token: str) -> dict[str, object]:
     }  # fmt: skip
 
 
-def operations():
+def operations() -> list[APIOperation[Any, Any, Any, Any]]:
     """Every operation of the document."""
     schema = schemathesis.openapi.from_dict(DOCUMENT, config=CONFIGURATION)
     results: Any = schema.get_all_operations()
     return [result.ok() for result in results]
 
 
-def probes():
+def probes() -> Iterator[pytest.ParameterSet]:
     """Every operation with fitting requests, and with unfit ones where there is something to get wrong."""
     for operation in operations():
         yield pytest.param(operation, GenerationMode.POSITIVE, id=f"{operation.label} fitting")
@@ -86,7 +88,11 @@ def probes():
 
 
 @pytest.mark.parametrize(("operation", "mode"), list(probes()))
-def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(fuzzed, operation, mode):
+def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(
+    fuzzed: tuple[Server, dict[str, str | None], dict[str, Any]],
+    operation: APIOperation[Any, Any, Any, Any],
+    mode: GenerationMode,
+) -> None:
     server, callers, things = fuzzed
     names = {parameter.name for parameter in operation.path_parameters}
     nothing: dict[str, str] = {}
@@ -103,7 +109,7 @@ def test_every_answer_is_as_published_and_none_is_a_fault_of_ours(fuzzed, operat
             suppress_health_check=list(HealthCheck),
         )
         @given(case=strategy)
-        def probe(case):
+        def probe(case: Case[Any]) -> None:
             assume(len(quote(str(case.query or ""))) < LONGEST_QUERY)
             for name, token in callers.items():
                 headers = {"Authorization": f"Bearer {token}"} if token else {}

@@ -96,7 +96,7 @@ def statuses(answer: httpx.Response) -> dict[str, str]:
     return {entry["name"]: entry["status"] for entry in answer.json()["entries"]}
 
 
-def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: httpx.Client):
+def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: httpx.Client) -> None:
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as packed:
         packed.writestr("walk.bvh", bvh())
@@ -123,7 +123,7 @@ def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: http
     assert info["source"]["file_name"] == "take/walk.bvh"
 
 
-def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client):
+def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client) -> None:
     def part(file_name: str) -> bytes:
         head = f'--B\r\nContent-Disposition: form-data; name="files"; filename="{file_name}"\r\n\r\n'
         return head.encode() + bvh() + b"\r\n"
@@ -139,7 +139,7 @@ def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner:
     assert (taken["name"], taken["status"]) == ("walk.bvh", "created")
 
 
-def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(owner: httpx.Client):
+def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(owner: httpx.Client) -> None:
     first = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
     again = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]
     assert (again["status"], again["item"], again["revision"]) == ("unchanged", first["item"], 1)
@@ -149,7 +149,7 @@ def test_the_same_file_again_changes_nothing_and_a_new_take_makes_a_revision(own
     assert len(owner.get("/projects/lab/skeletons").json()["items"]) == 1
 
 
-def test_files_can_be_named_by_digest(owner: httpx.Client, server: Server):
+def test_files_can_be_named_by_digest(owner: httpx.Client, server: Server) -> None:
     data = bvh()
     digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
     request = {"files": [{"name": "walk.bvh", "blob": digest}], "collection": "raw"}
@@ -160,14 +160,14 @@ def test_files_can_be_named_by_digest(owner: httpx.Client, server: Server):
     assert stranger.get(f"/blobs/{digest}").status_code == 404
 
 
-def test_the_original_comes_back_byte_for_byte_under_its_name(owner: httpx.Client):
+def test_the_original_comes_back_byte_for_byte_under_its_name(owner: httpx.Client) -> None:
     item = send(owner, {"take/Gang é.bvh": bvh()}).json()["entries"][0]["item"]
     original = owner.get(f"/projects/lab/clips/{item}/export")
     assert original.content == bvh()
     assert "filename*=UTF-8''Gang%20%C3%A9.bvh" in original.headers["Content-Disposition"]
 
 
-def test_an_exported_bvh_moves_as_the_imported_one(owner: httpx.Client):
+def test_an_exported_bvh_moves_as_the_imported_one(owner: httpx.Client) -> None:
     item = send(owner, {"walk.bvh": bvh()}, unit="cm").json()["entries"][0]["item"]
     exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": "bvh", "unit": "m"})
     assert exported.headers["Content-Disposition"].startswith('attachment; filename="walk.bvh"')
@@ -180,14 +180,14 @@ def test_an_exported_bvh_moves_as_the_imported_one(owner: httpx.Client):
 
 
 @pytest.mark.parametrize("file_format", ["npz", "predecessor", "json"])
-def test_clips_leave_in_other_formats(owner: httpx.Client, file_format: str):
+def test_clips_leave_in_other_formats(owner: httpx.Client, file_format: str) -> None:
     item = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]["item"]
     exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": file_format})
     assert exported.status_code == 200, exported.text
     assert len(exported.content) > 1000
 
 
-def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client):
+def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client) -> None:
     skeleton = send(owner, {"walk.bvh": bvh()}).json()["entries"][0]["skeleton"]
     other_body = bvh(1).replace(b"OFFSET 0 -42 0", b"OFFSET 0 -45 0")
     answer = send(owner, {"run.bvh": bvh(1), "tall.bvh": other_body}, skeleton=skeleton)
@@ -198,7 +198,7 @@ def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client):
     assert motion["skeleton"] == {"item": skeleton, "revision": 1}
 
 
-def test_unknown_options_and_empty_requests_are_refused(owner: httpx.Client):
+def test_unknown_options_and_empty_requests_are_refused(owner: httpx.Client) -> None:
     assert send(owner, {"walk.bvh": bvh()}, colour="red").json()["errors"][0]["pointer"] == "/colour"
     assert send(owner, {"walk.bvh": bvh()}, unit="mile").status_code == 422
     multipart = {"Content-Type": "multipart/form-data; boundary=b"}
@@ -208,7 +208,7 @@ def test_unknown_options_and_empty_requests_are_refused(owner: httpx.Client):
     assert (cut.status_code, cut.json()["code"]) == (400, "bad-multipart")
 
 
-def test_large_imports_become_a_job(database: Database, tmp_path: Path):
+def test_large_imports_become_a_job(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path, import_files_now=2) as server:
         owner = server.client(server.make_project())
         files = {f"walk{number}.bvh": bvh(number) for number in range(3)}
@@ -222,7 +222,7 @@ def test_large_imports_become_a_job(database: Database, tmp_path: Path):
         assert owner.post("/blobs/missing", json={"digests": digests}).json()["missing"] == []
 
 
-def test_every_bvh_of_real_capture_comes_back_byte_for_byte(owner: httpx.Client, mocap: Path):
+def test_every_bvh_of_real_capture_comes_back_byte_for_byte(owner: httpx.Client, mocap: Path) -> None:
     files = sorted(mocap.glob("*/*.bvh"))[:40]
     assert files
     answer = send(owner, {str(path.relative_to(mocap)): path.read_bytes() for path in files})
@@ -234,7 +234,7 @@ def test_every_bvh_of_real_capture_comes_back_byte_for_byte(owner: httpx.Client,
         assert owner.get(f"/projects/lab/clips/{entry['item']}/export").content == path.read_bytes()
 
 
-def test_events_tell_what_happened_and_can_be_followed(owner: httpx.Client):
+def test_events_tell_what_happened_and_can_be_followed(owner: httpx.Client) -> None:
     send(owner, {"walk.bvh": bvh()})
     told = owner.get("/projects/lab/events").json()["items"]
     assert [event["kind"] for event in told if event["kind"].startswith("item.")] == ["item.created"] * 2

@@ -77,7 +77,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
         started.process.wait()
 
 
-def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_the_owner_reads(process: Process):
+def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_the_owner_reads(process: Process) -> None:
     file = process.folder / "admin.token"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     me = httpx.get(f"{process.address}/api/v1/me", headers={"Authorization": f"Bearer {process.token}"}).json()
@@ -91,7 +91,7 @@ def test_a_fresh_folder_gets_a_database_and_an_administrator_whose_token_only_th
     assert again.end() == 0
 
 
-def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process):
+def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process) -> None:
     headers = {"Authorization": f"Bearer {process.token}", "X-Request-Id": "trace-me-please"}
     httpx.get(f"{process.address}/api/v1/projects/secret-name", headers=headers)
     process.end()
@@ -103,7 +103,7 @@ def test_requests_are_logged_as_json_with_who_what_and_how_long(process: Process
     assert not any("secret-name" in json.dumps(line) or process.token in json.dumps(line) for line in process.lines)
 
 
-def test_questions_for_readiness_are_not_logged(process: Process):
+def test_questions_for_readiness_are_not_logged(process: Process) -> None:
     before = len(process.lines)
     for _ in range(3):
         assert httpx.get(f"{process.address}/readyz").status_code == 200
@@ -113,7 +113,7 @@ def test_questions_for_readiness_are_not_logged(process: Process):
     assert any(line["message"].startswith("Running upgrade") for line in process.lines)
 
 
-def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process):
+def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process: Process) -> None:
     host, port = process.address.removeprefix("http://").split(":")
     body = json.dumps({"name": "slow"}).encode()
     head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {process.token}\r\n"
@@ -136,7 +136,7 @@ def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process:
     assert process.process.wait(30) == 0
 
 
-def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_path: Path):
+def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path) as server:
         client = httpx.Client(base_url=server.address)
         assert client.get("/readyz").json() == {"status": "ready"}
@@ -147,14 +147,14 @@ def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_pat
         assert client.get("/healthz").status_code == 200
 
 
-def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch):
+def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marey_server.store.fsck.schema_at_head", lambda _connection: False)
     refused = httpx.get(f"{server.address}/readyz")
     assert (refused.status_code, refused.json()["code"]) == (503, "not-ready")
     assert "db upgrade" in refused.json()["detail"]
 
 
-def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.Client):
+def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.Client) -> None:
     for name in ("lab", "private-name"):
         owner.get(f"/projects/{name}")
     text = httpx.get(f"{server.address}/metrics").text
@@ -164,14 +164,14 @@ def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.C
     assert "private-name" not in text
 
 
-def test_metrics_tell_how_many_requests_are_under_way(server: Server):
+def test_metrics_tell_how_many_requests_are_under_way(server: Server) -> None:
     asked = {"Authorization": f"Bearer {server.make_project()}", "Accept": "text/event-stream"}
     assert "marey_http_in_flight 1.0" in httpx.get(f"{server.address}/metrics").text  # this one
     with httpx.stream("GET", f"{server.api}/projects/lab/events", headers=asked):
         assert "marey_http_in_flight 2.0" in httpx.get(f"{server.address}/metrics").text
 
 
-def test_guessing_passwords_is_slowed_down(database: Database, tmp_path: Path):
+def test_guessing_passwords_is_slowed_down(database: Database, tmp_path: Path) -> None:
     stored = hash_password("correct horse battery")
     database.write(SYSTEM, users.create_user, UserCreate(name="ann"), password_hash=stored)
     with running(database, tmp_path, login_tries_per_minute=3) as server:
@@ -184,7 +184,7 @@ def test_guessing_passwords_is_slowed_down(database: Database, tmp_path: Path):
         assert client.post("/login", json={"name": "ben", "password": "guess"}).status_code == 401
 
 
-def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tmp_path: Path):
+def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tmp_path: Path) -> None:
     database.write(SYSTEM, users.ensure_first_administrator)
     stored = hash_password("correct horse battery")
     database.write(SYSTEM, users.create_user, UserCreate(name="ann"), password_hash=stored)
@@ -206,7 +206,7 @@ def test_signing_in_gives_a_token_and_signing_out_ends_it(database: Database, tm
         assert server.client().post("/login", json=again).status_code == 200
 
 
-def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process):
+def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process) -> None:
     process.end()
     told = "\n".join(line["message"] for line in process.lines)
     assert f"data: {process.folder}; database: {process.folder / 'marey.db'}" in told
@@ -215,7 +215,7 @@ def test_a_log_tells_where_everything_is_and_what_to_do_next(process: Process):
     assert process.token not in told
 
 
-def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Process):
+def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Process) -> None:
     headers = {"Authorization": f"Bearer {process.token}"}
     asked = httpx.post(f"{process.address}/api/v1/leases", json={"worker": "w", "kinds": ["retarget"]}, headers=headers)
     assert (asked.status_code, asked.json()) == (200, {"leases": []})
@@ -229,7 +229,7 @@ def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Pr
     assert logged == [("/api/v1/me", 200), ("/api/v1/leases", 401)]
 
 
-def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path):
+def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path) -> None:
     process = Process(tmp_path / "data", MAREY_LOCAL_WORKERS="1")
     try:
         deadline = time.monotonic() + 60
@@ -242,7 +242,7 @@ def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path):
 
 
 @pytest.mark.parametrize("path", ["/", "/api/v1"])
-def test_the_roots_tell_programs_where_to_go_and_lead_browsers_to_the_page(server: Server, path: str):
+def test_the_roots_tell_programs_where_to_go_and_lead_browsers_to_the_page(server: Server, path: str) -> None:
     with httpx.Client(base_url=server.address) as client:
         told = client.get(path).json()
         assert told["name"] == "Marey"

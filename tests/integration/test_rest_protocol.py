@@ -61,7 +61,7 @@ def clip(owner: httpx.Client) -> str:
 # -- forms ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_part_says_the_same_in_every_form(owner: httpx.Client, clip: str):
+def test_a_part_says_the_same_in_every_form(owner: httpx.Client, clip: str) -> None:
     trees = {}
     for name in (*MEDIA_TYPES, "application/msgpack; arrays=blocks", "application/bson; arrays=blocks"):
         answer = owner.get(f"{clip}/parts/motion", headers={"Accept": name})
@@ -74,7 +74,7 @@ def test_a_part_says_the_same_in_every_form(owner: httpx.Client, clip: str):
         assert tree == {key: value for key, value in first.items() if key != "poses"}
 
 
-def test_blocks_are_the_stored_bytes(owner: httpx.Client, clip: str):
+def test_blocks_are_the_stored_bytes(owner: httpx.Client, clip: str) -> None:
     answer = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/msgpack; arrays=blocks"})
     leaf = msgpack.unpackb(answer.content)["poses"]
     assert leaf["encoding"] == "blocks"
@@ -84,7 +84,7 @@ def test_blocks_are_the_stored_bytes(owner: httpx.Client, clip: str):
 
 
 @pytest.mark.parametrize("accept", [*MEDIA_TYPES, "application/msgpack; arrays=blocks"])
-def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, accept: str):
+def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, accept: str) -> None:
     def read(query: str) -> dict[str, Any]:
         answer = owner.get(f"{clip}/parts/motion{query}", headers={"Accept": accept})
         assert answer.status_code == 200, answer.text
@@ -99,19 +99,19 @@ def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, a
     np.testing.assert_array_equal(cut["poses"], np.delete(whole, slice(7, 11), axis=1)[5:])
 
 
-def test_models_come_in_every_form(owner: httpx.Client, clip: str):
+def test_models_come_in_every_form(owner: httpx.Client, clip: str) -> None:
     shown = owner.get(clip).json()
     assert msgpack.unpackb(owner.get(clip, headers={"Accept": "application/msgpack"}).content) == shown
     assert bson.decode(owner.get(clip, headers={"Accept": "application/bson"}).content) == shown
 
 
-def test_a_form_nobody_offers_is_refused_with_a_list(owner: httpx.Client, clip: str):
+def test_a_form_nobody_offers_is_refused_with_a_list(owner: httpx.Client, clip: str) -> None:
     refused = owner.get(clip, headers={"Accept": "image/png"})
     assert refused.status_code == 406
     assert refused.json()["context"]["offered"] == list(MEDIA_TYPES)
 
 
-def test_bodies_of_unknown_form_or_compressed_are_refused(owner: httpx.Client):
+def test_bodies_of_unknown_form_or_compressed_are_refused(owner: httpx.Client) -> None:
     assert owner.post("/projects", content=b"x", headers={"Content-Type": "text/csv"}).status_code == 415
     body = gzip.compress(json.dumps({"name": "zipped"}).encode())
     headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
@@ -121,7 +121,7 @@ def test_bodies_of_unknown_form_or_compressed_are_refused(owner: httpx.Client):
 # -- states and preconditions ---------------------------------------------------------------------------------------
 
 
-def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, clip: str):
+def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, clip: str) -> None:
     for path in (clip, f"{clip}/parts/motion"):
         etag = owner.get(path).headers["ETag"]
         again = owner.get(path, headers={"If-None-Match": etag})
@@ -130,7 +130,7 @@ def test_what_the_caller_holds_already_is_not_sent_again(owner: httpx.Client, cl
         assert other_form.status_code == 200
 
 
-def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str):
+def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str) -> None:
     etag = owner.get(clip).headers["ETag"]
     change = {"name": "run"}
     assert owner.patch(clip, json=change).status_code == 428
@@ -144,7 +144,7 @@ def test_a_change_says_which_state_it_changes(owner: httpx.Client, clip: str):
     assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": "*"}).status_code == 200
 
 
-def test_one_of_several_states_is_enough_for_a_change(owner: httpx.Client, clip: str):
+def test_one_of_several_states_is_enough_for_a_change(owner: httpx.Client, clip: str) -> None:
     first = owner.get(clip).headers["ETag"]
     second = owner.patch(clip, json={"name": "run"}, headers={"If-Match": f'{first}, "77.json"'}).headers["ETag"]
     assert owner.patch(clip, json={"name": "jump"}, headers={"If-Match": f'{first}, "77.json"'}).status_code == 412
@@ -158,7 +158,7 @@ def test_one_of_several_states_is_enough_for_a_change(owner: httpx.Client, clip:
     assert owner.delete(clip, headers={"If-Match": f"{second}, {third.headers['ETag']}"}).status_code == 204
 
 
-def test_a_member_at_one_of_several_states_is_changed_and_removed(server: Server, owner: httpx.Client):
+def test_a_member_at_one_of_several_states_is_changed_and_removed(server: Server, owner: httpx.Client) -> None:
     server.make_user("ben")
     ben = "/projects/lab/members/ben"
     owner.put(ben, json={"role": "reader"}).raise_for_status()
@@ -168,7 +168,7 @@ def test_a_member_at_one_of_several_states_is_changed_and_removed(server: Server
         assert owner.delete(ben, headers={"If-Match": states}).status_code == status
 
 
-def test_a_part_read_as_msgpack_can_be_replaced_with_json(owner: httpx.Client, clip: str):
+def test_a_part_read_as_msgpack_can_be_replaced_with_json(owner: httpx.Client, clip: str) -> None:
     etag = owner.get(f"{clip}/parts/motion", headers={"Accept": "application/msgpack"}).headers["ETag"]
     info = {"schema": "marey/clip-info@1", "subject": "somebody"}
     put = owner.put(f"{clip}/parts/info", json=info, headers={"If-Match": etag}, params={"message": "who it is"})
@@ -178,7 +178,7 @@ def test_a_part_read_as_msgpack_can_be_replaced_with_json(owner: httpx.Client, c
     assert history[0]["parts"]["motion"] == history[1]["parts"]["motion"]
 
 
-def test_a_pinned_revision_never_changes_and_says_so(owner: httpx.Client, clip: str):
+def test_a_pinned_revision_never_changes_and_says_so(owner: httpx.Client, clip: str) -> None:
     before = owner.get(f"{clip}/parts/motion", params={"revision": 1})
     owner.put(f"{clip}/parts/info", json={"schema": "marey/clip-info@1"}, headers={"If-Match": "*"})
     after = owner.get(f"{clip}/parts/motion", params={"revision": 1})
@@ -186,7 +186,7 @@ def test_a_pinned_revision_never_changes_and_says_so(owner: httpx.Client, clip: 
     assert "immutable" in after.headers["Cache-Control"]
 
 
-def test_members_can_be_made_only_where_there_is_none(server: Server, owner: httpx.Client):
+def test_members_can_be_made_only_where_there_is_none(server: Server, owner: httpx.Client) -> None:
     server.make_user("ben")
     put: dict[str, Any] = {"json": {"role": "reader"}, "headers": {"If-None-Match": "*"}}
     assert owner.put("/projects/lab/members/ben", **put).status_code == 200
@@ -196,7 +196,7 @@ def test_members_can_be_made_only_where_there_is_none(server: Server, owner: htt
 # -- idempotency ----------------------------------------------------------------------------------------------------
 
 
-def test_the_same_request_with_the_same_key_is_done_once(owner: httpx.Client):
+def test_the_same_request_with_the_same_key_is_done_once(owner: httpx.Client) -> None:
     key = {"Idempotency-Key": "make-walks"}
     first = owner.post("/projects/lab/collections", json={"path": "walks"}, headers=key)
     again = owner.post("/projects/lab/collections", json={"path": "walks"}, headers=key)
@@ -210,7 +210,7 @@ def test_the_same_request_with_the_same_key_is_done_once(owner: httpx.Client):
     assert owner.post("/projects/lab/collections", json={"path": "walks"}).status_code == 409
 
 
-def test_a_token_of_other_scopes_does_not_hear_what_the_first_was_answered(server: Server, owner: httpx.Client):
+def test_a_token_of_other_scopes_does_not_hear_what_the_first_was_answered(server: Server, owner: httpx.Client) -> None:
     def token(*scopes: str) -> httpx.Client:
         return server.client(owner.post("/tokens", json={"name": "t", "scopes": scopes}).json()["secret"])
 
@@ -224,7 +224,7 @@ def test_a_token_of_other_scopes_does_not_hear_what_the_first_was_answered(serve
     assert send(token("write", "read")).headers["Idempotent-Replayed"] == "true"
 
 
-def test_who_has_left_a_project_does_not_hear_his_answers_again(server: Server, owner: httpx.Client):
+def test_who_has_left_a_project_does_not_hear_his_answers_again(server: Server, owner: httpx.Client) -> None:
     ben = server.client(server.make_user("ben"))
     owner.put("/projects/lab/members/ben", json={"role": "contributor"}).raise_for_status()
 
@@ -242,7 +242,7 @@ def test_who_has_left_a_project_does_not_hear_his_answers_again(server: Server, 
 # -- lists ----------------------------------------------------------------------------------------------------------
 
 
-def test_pages_follow_each_other_and_lose_nothing_while_things_are_added(owner: httpx.Client):
+def test_pages_follow_each_other_and_lose_nothing_while_things_are_added(owner: httpx.Client) -> None:
     for number in range(7):
         make(owner, "skeletons", f"s{number}", hierarchy=HIERARCHY)
     seen = []
@@ -259,7 +259,7 @@ def test_pages_follow_each_other_and_lose_nothing_while_things_are_added(owner: 
     assert len(set(seen)) == len(seen)
 
 
-def test_lists_are_filtered_and_show_the_fields_asked_for(owner: httpx.Client, clip: str):
+def test_lists_are_filtered_and_show_the_fields_asked_for(owner: httpx.Client, clip: str) -> None:
     owner.patch(clip, json={"tags": ["raw", "checked"], "collection": "a/b"}, headers={"If-Match": "*"})
     for query in (
         "tag.in=raw,other",
@@ -285,7 +285,7 @@ def test_lists_are_filtered_and_show_the_fields_asked_for(owner: httpx.Client, c
         assert owner.get(f"/projects/lab/clips?{query}").json()["items"] == [], query
 
 
-def test_an_unknown_or_unfit_query_parameter_is_named(owner: httpx.Client):
+def test_an_unknown_or_unfit_query_parameter_is_named(owner: httpx.Client) -> None:
     refused = owner.get("/projects/lab/clips", params={"limit": "many", "colour": "red"})
     assert refused.status_code == 400
     assert [error["pointer"] for error in refused.json()["errors"]] == ["colour"]
@@ -293,7 +293,7 @@ def test_an_unknown_or_unfit_query_parameter_is_named(owner: httpx.Client):
     assert {error["pointer"] for error in refused.json()["errors"]} == {"limit", "frames.gte"}
 
 
-def test_a_cursor_of_another_list_or_made_up_is_refused(owner: httpx.Client):
+def test_a_cursor_of_another_list_or_made_up_is_refused(owner: httpx.Client) -> None:
     for number in range(3):
         make(owner, "skeletons", f"s{number}", hierarchy=HIERARCHY)
     cursor = owner.get("/projects/lab/skeletons", params={"limit": 1}).json()["next_cursor"]
@@ -305,7 +305,7 @@ def test_a_cursor_of_another_list_or_made_up_is_refused(owner: httpx.Client):
 # -- errors ---------------------------------------------------------------------------------------------------------
 
 
-def test_every_error_is_a_problem_document_with_the_request_id(owner: httpx.Client, server: Server):
+def test_every_error_is_a_problem_document_with_the_request_id(owner: httpx.Client, server: Server) -> None:
     answers = [
         owner.get("/nowhere"),
         owner.get("/projects/none"),
@@ -325,39 +325,41 @@ def test_every_error_is_a_problem_document_with_the_request_id(owner: httpx.Clie
     assert "Bearer" in answers[5].headers["WWW-Authenticate"]
 
 
-def test_what_is_wrong_with_a_body_is_pointed_at(owner: httpx.Client):
+def test_what_is_wrong_with_a_body_is_pointed_at(owner: httpx.Client) -> None:
     body = {"name": "UPPER", "visibility": "secret", "colour": "red", "title": 5}
     refused = owner.post("/projects", json=body)
     assert refused.status_code == 422
     assert {error["pointer"] for error in refused.json()["errors"]} == {"/name", "/visibility", "/colour", "/title"}
 
 
-def test_numbers_are_not_guessed_from_texts(owner: httpx.Client):
+def test_numbers_are_not_guessed_from_texts(owner: httpx.Client) -> None:
     assert owner.post("/uploads", json={"length": "5"}).status_code == 422
     assert owner.post("/uploads", json={"length": True}).status_code == 422
 
 
 @pytest.mark.parametrize("text", ["a\0b", "\0"])
-def test_a_nul_is_refused_wherever_it_stands(owner: httpx.Client, text: str):
+def test_a_nul_is_refused_wherever_it_stands(owner: httpx.Client, text: str) -> None:
     refused = owner.patch("/projects/lab", json={"title": text}, headers={"If-Match": "*"})
     assert (refused.status_code, refused.json()["errors"][0]["pointer"]) == (422, "/title")
     assert owner.get("/projects/lab/clips", params={"q": text}).status_code == 400
     assert owner.get("/projects/%00").status_code == 404
 
 
-def test_a_sane_request_id_is_kept_and_another_replaced(owner: httpx.Client):
+def test_a_sane_request_id_is_kept_and_another_replaced(owner: httpx.Client) -> None:
     assert owner.get("/me", headers={"X-Request-Id": "trace-0123.abc"}).headers["X-Request-Id"] == "trace-0123.abc"
     assert owner.get("/me", headers={"X-Request-Id": "<b>"}).headers["X-Request-Id"] != "<b>"
 
 
-def test_a_body_sent_in_chunks_is_stopped_at_its_limit(owner: httpx.Client):
+def test_a_body_sent_in_chunks_is_stopped_at_its_limit(owner: httpx.Client) -> None:
     refused = owner.post("/projects", content=(b"x" * 65536 for _ in range(40)))
     assert (refused.status_code, refused.json()["code"]) == (413, "too-large")
     assert owner.get("/me").status_code == 200
 
 
-def test_a_fault_of_ours_shows_nothing_of_its_inside(server: Server, owner: httpx.Client, monkeypatch, caplog):
-    def fail(*_args, **_kwargs):
+def test_a_fault_of_ours_shows_nothing_of_its_inside(
+    server: Server, owner: httpx.Client, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_args: Any, **_kwargs: Any) -> None:
         raise RuntimeError("the secret inside")
 
     monkeypatch.setattr("marey_server.handlers.projects.projects.read_project", fail)
@@ -387,7 +389,7 @@ def talk(server: Server, data: bytes) -> bytes:
             said += chunk
 
 
-def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server):
+def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server) -> None:
     head = b"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\nExpect: 100-continue\r\n\r\n"
     said = talk(server, head)
     assert said.startswith(b"HTTP/1.1 401")
@@ -395,12 +397,12 @@ def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server):
 
 
 @pytest.mark.parametrize("length", ["15, 15", "15\r\nContent-Length: 15", "0" * 50 + "15"])
-def test_a_length_that_is_said_twice_or_at_length_is_one_length(server: Server, length: str):
+def test_a_length_that_is_said_twice_or_at_length_is_one_length(server: Server, length: str) -> None:
     assert talk_of_a_project(server, length).startswith(b"HTTP/1.1 201")
 
 
 @pytest.mark.parametrize("length", ["\xb2", "15, 16", "+15", "-1", "9" * 5000])
-def test_a_length_that_is_no_number_is_refused(server: Server, length: str):
+def test_a_length_that_is_no_number_is_refused(server: Server, length: str) -> None:
     assert talk_of_a_project(server, length).startswith(b"HTTP/1.1 400")
 
 
@@ -410,7 +412,7 @@ def talk_of_a_project(server: Server, length: str) -> bytes:
     return talk(server, f'{head}Content-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1"))
 
 
-def test_the_headers_of_a_stream_of_events_come_without_its_body(server: Server):
+def test_the_headers_of_a_stream_of_events_come_without_its_body(server: Server) -> None:
     token = server.make_project()
     asked = f"Host: x\r\nAuthorization: Bearer {token}\r\nAccept: text/event-stream\r\n\r\n"
     said = talk(
@@ -421,12 +423,12 @@ def test_the_headers_of_a_stream_of_events_come_without_its_body(server: Server)
     assert following.startswith(b"HTTP/1.1 406")  # what was asked next over the same connection
 
 
-def test_a_head_without_end_is_cut_off(server: Server):
+def test_a_head_without_end_is_cut_off(server: Server) -> None:
     said = talk(server, b"GET /healthz HTTP/1.1\r\n" + b"X-Filler: " + b"y" * 100_000)
     assert b"200 OK" not in said
 
 
-def test_security_headers_are_on_every_answer(owner: httpx.Client):
+def test_security_headers_are_on_every_answer(owner: httpx.Client) -> None:
     for answer in (owner.get("/me"), owner.get("/nowhere"), owner.get("/docs")):
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
         assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
@@ -471,7 +473,7 @@ def put_bytes(client: httpx.Client, data: bytes) -> str:
 
 
 @pytest.mark.parametrize("size", [0, 1, 70_000, 3_500_000])
-def test_bytes_come_back_whole_and_in_ranges(owner: httpx.Client, size: int):
+def test_bytes_come_back_whole_and_in_ranges(owner: httpx.Client, size: int) -> None:
     data = np.random.default_rng(size).bytes(size)
     path = put_bytes(owner, data)
     whole = owner.get(path)
@@ -490,14 +492,16 @@ def test_bytes_come_back_whole_and_in_ranges(owner: httpx.Client, size: int):
     assert (beyond.status_code, beyond.headers["Content-Range"]) == (416, f"bytes */{size}")
 
 
-def test_bytes_under_a_wrong_name_are_refused_and_not_kept(owner: httpx.Client):
+def test_bytes_under_a_wrong_name_are_refused_and_not_kept(owner: httpx.Client) -> None:
     path = f"/blobs/sha256:{'0' * 64}"
     assert owner.put(path, content=b"other bytes").json()["code"] == "digest-mismatch"
     assert owner.get(path).status_code == 404
 
 
 @pytest.mark.parametrize("size", [10, 70_000])
-def test_a_disk_that_is_full_while_bytes_come_in_says_so(owner: httpx.Client, monkeypatch, size: int):
+def test_a_disk_that_is_full_while_bytes_come_in_says_so(
+    owner: httpx.Client, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
     whole = hashlib.sha256(bytes(size)).hexdigest()
 
     def full(_spool: Spool, _data: bytes) -> None:
@@ -510,7 +514,7 @@ def test_a_disk_that_is_full_while_bytes_come_in_says_so(owner: httpx.Client, mo
     assert owner.head(f"/blobs/sha256:{whole}").status_code == 404
 
 
-def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Server):
+def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Server) -> None:
     data = np.random.default_rng(1).bytes(2_500_000)
     made = owner.post("/uploads", json={"length": len(data)})
     path = made.headers["Location"].removeprefix("/api/v1")

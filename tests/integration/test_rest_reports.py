@@ -4,6 +4,7 @@ import base64
 import hashlib
 from typing import Any
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import httpx
 import pytest
@@ -131,7 +132,7 @@ def read_graphml(data: bytes) -> tuple[list[Any], list[Any], dict[str, Any]]:
     names = {key.get("id"): key.get("attr.name") for key in root.findall("g:key", space)}
     graph = root.find("g:graph", space)
 
-    def values(element):
+    def values(element: Element) -> dict[str, str]:
         return {names[data.get("key")]: data.text for data in element.findall("g:data", space)}
 
     nodes = {node.get("id"): values(node) for node in graph.findall("g:node", space)}

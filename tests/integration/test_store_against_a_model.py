@@ -1,7 +1,9 @@
 """Random operations on items, compared with a simple model in memory."""
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import hypothesis.strategies as st
 import pytest
@@ -17,10 +19,11 @@ from hypothesis.stateful import (
 from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples, steps
 
-from marey_schemas.items import ItemChange, ItemCreate
+from marey_schemas.items import Item, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, NotFoundProblem, PreconditionFailedProblem
 from marey_server.store import fsck, garbage, items
+from marey_server.store.database.connections import Database
 
 NAMES = st.sampled_from(["walk", "run", "Über"])
 PLACES = st.sampled_from(["", "a", "a/b", "c"])
@@ -67,10 +70,10 @@ class ItemsMachine(RuleBasedStateMachine):
         self.lab = Lab(self.database, f"run{self.runs}")
         self.world = World()
 
-    def write(self, function, item_id, *args, **kwargs):
+    def write(self, function: Callable[..., Any], item_id: str, *args: Any, **kwargs: Any) -> Item | None:
         return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
 
-    def attempt(self, item_id, expected, change, *, blocked=False):
+    def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
         """Run `change(expected_rev)`; True if it happened. The model decides which error there must be."""
         model = self.world.items[item_id]
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
@@ -86,7 +89,7 @@ class ItemsMachine(RuleBasedStateMachine):
         return error is None
 
     @rule(target=ids, name=NAMES, place=PLACES, tags=TAGS, text=TEXTS)
-    def create(self, name, place, tags, text):
+    def create(self, name: str, place: str, tags: tuple[Any, ...], text: str) -> Any:
         request = ItemCreate(name=name, collection=place, tags=tags, parts={"study": {"text": text}})
         try:
             made = self.lab.write(items.create_item, self.lab.name, Kind.STUDY, request)
@@ -101,7 +104,7 @@ class ItemsMachine(RuleBasedStateMachine):
     expectations = st.sampled_from(["any", "right", "wrong"])
 
     @rule(item_id=ids, text=TEXTS, expected=expectations)
-    def put_part(self, item_id, text, expected):
+    def put_part(self, item_id: str, text: str, expected: str) -> None:
         tree = {"text": text}
         put = lambda rev: self.write(items.put_part, item_id, "study", tree, expected_rev=rev)  # noqa: E731
         if self.attempt(item_id, expected, put):
@@ -110,7 +113,7 @@ class ItemsMachine(RuleBasedStateMachine):
                 self.world.items[item_id] = replace(model, history=(*model.history, text), rev=model.rev + 1)
 
     @rule(item_id=ids, name=NAMES, place=PLACES, tags=TAGS, expected=expectations)
-    def change(self, item_id, name, place, tags, expected):
+    def change(self, item_id: Any, name: Any, place: Any, tags: Any, expected: Any) -> None:
         request = ItemChange(name=name, collection=place, tags=tags)
         change = lambda rev: self.write(items.change_item, item_id, request, expected_rev=rev)  # noqa: E731
         if self.attempt(item_id, expected, change, blocked=self.world.occupied(name, place, item_id)):
@@ -118,14 +121,14 @@ class ItemsMachine(RuleBasedStateMachine):
             self.world.items[item_id] = replace(model, name=name, place=place, tags=tags, rev=model.rev + 1)
 
     @rule(item_id=ids, expected=expectations)
-    def delete(self, item_id, expected):
+    def delete(self, item_id: str, expected: str) -> None:
         delete = lambda rev: self.write(items.delete_item, item_id, expected_rev=rev)  # noqa: E731
         if self.attempt(item_id, expected, delete):
             model = self.world.items[item_id]
             self.world.items[item_id] = replace(model, deleted=True, rev=model.rev + 1)
 
     @rule(item_id=ids)
-    def restore(self, item_id):
+    def restore(self, item_id: Any) -> None:
         model = self.world.items[item_id]
         blocked = self.world.occupied(model.name, model.place, item_id)
         try:
@@ -141,11 +144,11 @@ class ItemsMachine(RuleBasedStateMachine):
             self.world.items[item_id] = replace(model, deleted=False, rev=model.rev + 1)
 
     @rule()
-    def collect_garbage(self):
+    def collect_garbage(self) -> None:
         garbage.collect_garbage(self.lab.database, grace_us=-1)
 
     @invariant()
-    def lists_agree(self):
+    def lists_agree(self) -> None:
         for deleted in (False, True):
             filters = items.ItemFilters(deleted=deleted)
             page = self.lab.read(items.list_items, self.lab.name, Kind.STUDY, filters, limit=1000, count=True)
@@ -157,7 +160,7 @@ class ItemsMachine(RuleBasedStateMachine):
             }
             assert page.count == len(found)
 
-    def teardown(self):
+    def teardown(self) -> None:
         for item_id, model in self.world.items.items():
             if not model.deleted:
                 for number, text in enumerate(model.history, 1):
@@ -166,7 +169,7 @@ class ItemsMachine(RuleBasedStateMachine):
         assert list(fsck.check_store(self.lab.database)) == []
 
 
-def test_items_are_what_the_model_says(database):
+def test_items_are_what_the_model_says(database: Database) -> None:
     machine = type("Machine", (ItemsMachine,), {"database": database, "runs": 0})
     run_state_machine_as_test(
         machine,

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from marey_motion.alignment.aligning import SourceExample
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
@@ -13,16 +14,16 @@ from marey_motion.rigs import map_joints
 
 
 @cache
-def walk(frames=60, speed=1.3, turn_rate=0.2):
+def walk(frames: int = 60, speed: float = 1.3, turn_rate: float = 0.2) -> Clip:
     """A walk at 60 Hz that begins at the origin and faces +z."""
     return generate_gait(speed, turn_rate, frames / 60.0)
 
 
-def body_of(clip):
+def body_of(clip: Clip) -> MatchingBody:
     return MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
 
 
-def played(clip, times):
+def played(clip: Clip, times: Floats) -> Clip:
     """Sample the clip at fractional frames by another library than the one under test."""
     frames = np.arange(clip.frame_count)
     root = np.stack([np.interp(times, frames, axis) for axis in clip.root_translations.T.astype(float)], axis=1)
@@ -34,7 +35,7 @@ def played(clip, times):
     return Clip(clip.skeleton, clip.frame_rate_hz, poses.astype(np.float32))
 
 
-def moved(clip, heading_rad, x, z):
+def moved(clip: Clip, heading_rad: float, x: float, z: float) -> Clip:
     """Rotate the clip to the left about the origin, then shift it on the ground."""
     turn = Rotation.from_euler("y", heading_rad)
     poses = clip.poses.astype(float).copy()
@@ -43,13 +44,13 @@ def moved(clip, heading_rad, x, z):
     return Clip(clip.skeleton, clip.frame_rate_hz, poses.astype(np.float32))
 
 
-def sine_warp(source_frames, frames, depth=0.06):
+def sine_warp(source_frames: int, frames: int, depth: float = 0.06) -> Floats:
     """Frames of a source at each frame of a motion of so many: rising from the first to the last, unevenly."""
     share = np.linspace(0.0, 1.0, frames)
     return (share + depth * np.sin(2.0 * np.pi * share)) * (source_frames - 1)
 
 
-def warped_walks(count=6, seed=3, frames=60):
+def warped_walks(count: int = 6, seed: int = 3, frames: int = 60) -> tuple[list[SourceExample], dict[str, Floats]]:
     """Examples of one walk, each with a warp of its own: frame of the walk at each frame of the example, by uid."""
     random = np.random.default_rng(seed)
     base = walk(frames)

@@ -3,13 +3,19 @@
 import io
 import json
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 
+from marey_reports.drawing.drawn import DrawnFigure
 
-def is_sound(figure):
+
+def is_sound(figure: DrawnFigure) -> DrawnFigure:
     """Check that both pictures are readable, the columns of each table equally long, and the caption not empty."""
     assert imread(io.BytesIO(figure.png)).shape[0] > 100
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
@@ -21,12 +27,12 @@ def is_sound(figure):
     return figure
 
 
-def rows_of(figure, table):
+def rows_of(figure: DrawnFigure, table: str) -> list[Any]:
     columns = figure.data["tables"][table]
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def cut_off(figure):
+def cut_off(figure: Figure) -> list[Any]:
     """List the texts of a matplotlib page that extend beyond its borders."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -37,7 +43,7 @@ def cut_off(figure):
     return [text.get_text() for text, box in boxes if not (page.contains(*box.min) and page.contains(*box.max))]
 
 
-def _labels_beyond(axes):
+def _labels_beyond(axes: Axes) -> Iterator[Any]:
     """List the labels of ticks outside the limits of their axis, which are not drawn."""
     for axis in (axes.xaxis, axes.yaxis):
         low, high = sorted(axis.get_view_interval())

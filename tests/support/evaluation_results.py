@@ -1,14 +1,18 @@
 """Evaluations made up for tests: no search and no clips, but measured as real ones are."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
+from marey_motion.arrays import Ints, Ints32
 from marey_motion.evaluation.coverage import Windows, coverage_of
 from marey_motion.evaluation.metrics import measure_trial, pooled_metrics
 from marey_motion.evaluation.relevance import count_switches, measure_usage
-from marey_motion.evaluation.result import EvaluationResult, Provenance
-from marey_motion.evaluation.scenario import reference, suite_trials
+from marey_motion.evaluation.result import Coverage, EvaluationResult, Provenance
+from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -41,7 +45,7 @@ class Making:
     names: tuple[str, ...] = ()
 
 
-def synthetic_result(options=SMALL, **making):
+def synthetic_result(options: EvaluationOptions = SMALL, **making: Any) -> EvaluationResult:
     """Return a plausible evaluation, the same for the same arguments."""
     how = Making(**making)
     random = np.random.default_rng(how.seed)
@@ -52,7 +56,13 @@ def synthetic_result(options=SMALL, **making):
     return evaluated(options, clips, trials, records, some_coverage(options, clips, how, random))
 
 
-def evaluated(options, clips, trials, records, coverage):
+def evaluated(
+    options: EvaluationOptions,
+    clips: tuple[Any, ...],
+    trials: Sequence[Any],
+    records: tuple[Any, ...],
+    coverage: Coverage,
+) -> EvaluationResult:
     """Measure records and assemble an evaluation."""
     outcomes = tuple(
         measure_trial(trial, reference(trial, RATE_HZ), record, options)
@@ -78,7 +88,7 @@ def evaluated(options, clips, trials, records, coverage):
     )
 
 
-def some_clips(how, random):
+def some_clips(how: Making, random: Generator) -> tuple[DatabaseClip, ...]:
     clips, start = [], 0
     for index in range(how.clips):
         stop = start + max(1, int(how.frames * random.uniform(0.3, 2.0)))
@@ -88,7 +98,7 @@ def some_clips(how, random):
     return tuple(clips)
 
 
-def wandering(trial, clips, sway_m, random):
+def wandering(trial: Trial, clips: tuple[Any, ...], sway_m: float, random: Generator) -> TrialRecord:
     """Return the record of a character that sways about its path and plays ranges of clips, the first most often."""
     guide = reference(trial, RATE_HZ)
     ticks = guide.tick_count
@@ -105,10 +115,11 @@ def wandering(trial, clips, sway_m, random):
     return TrialRecord(RATE_HZ, rows, positions, headings, status, 4.0 * pose_cost, 5.0 * pose_cost, pose_cost)
 
 
-def _stretches(ticks, clips, random):
+def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[Ints32, Ints]:
     """Return the row of each tick, and the ticks at which another range begins."""
     favour = 1.0 / np.arange(1, len(clips) + 1)
-    rows, entered, tick = np.empty(ticks, dtype=np.int32), [], 0
+    rows, tick = np.empty(ticks, dtype=np.int32), 0
+    entered: list[int] = []
     while tick < ticks:
         clip = clips[random.choice(len(clips), p=favour / favour.sum())]
         row = int(random.integers(clip.start, max(clip.start + 1, clip.stop - 20)))
@@ -119,12 +130,13 @@ def _stretches(ticks, clips, random):
     return rows, np.array(entered, dtype=np.int64)
 
 
-def some_coverage(options, clips, how, random):
+def some_coverage(options: EvaluationOptions, clips: tuple[Any, ...], how: Any, random: Generator) -> Coverage:
     """Return windows of clips with about one speed and turn rate each; a tenth of the clips goes backwards."""
     counts = [max(0, clip.frame_count - round(RATE_HZ)) for clip in clips]
     owner = np.repeat(np.arange(len(clips)), counts).astype(np.int32)
     speed = random.uniform(0.6, 3.0, len(clips))[owner] + 0.15 * random.normal(size=len(owner))
-    turn = random.uniform(*how.turns_deg_s, len(clips))[owner] + 5.0 * random.normal(size=len(owner))
+    least, most = how.turns_deg_s
+    turn = random.uniform(least, most, len(clips))[owner] + 5.0 * random.normal(size=len(owner))
     ahead = np.where(random.random(len(clips)) < 0.1, -1.0, 1.0)[owner]
     speed = np.abs(speed)
     windows = Windows(speed, np.radians(turn), speed * ahead, 0.1 * speed * random.normal(size=len(owner)))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from marey_motion.alignment.aligned import AlignedClip, AlignedSet, Placement
+from marey_motion.arrays import Floats
 from marey_motion.gait import generate_gait
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.motion import Motion
@@ -11,7 +12,7 @@ from marey_motion.skeleton import EndSite, Skeleton
 HZ = 60.0
 
 
-def chain(joints=4):
+def chain(joints: int = 4) -> Skeleton:
     """Return an upright chain of bones of 30 cm on its root, with a tip at its end."""
     offsets = np.zeros((joints, 3))
     offsets[1:, 1] = 0.3
@@ -21,19 +22,21 @@ def chain(joints=4):
     return Skeleton(names, parents, offsets, at_rest, (EndSite(joints - 1, np.array([0.0, 0.3, 0.0])),))
 
 
-def unit_poses(poses):
+def unit_poses(poses: Floats) -> Floats:
     """Poses (..., 3 + 4·J) with quaternions of unit length."""
     rotations = poses[..., 3:].reshape(*poses.shape[:-1], -1, 4)
     rotations = rotations / np.linalg.norm(rotations, axis=-1, keepdims=True)
     return np.concatenate((poses[..., :3], rotations.reshape(*poses.shape[:-1], -1)), axis=-1)
 
 
-def as_motion(poses):
+def as_motion(poses: Floats) -> Motion:
     frames = len(poses)
     return Motion(poses[:, :3].copy(), poses[:, 3:].reshape(frames, -1, 4).copy(), np.zeros((frames, 0, 3)), ())
 
 
-def aligned_set(skeleton, poses, time_functions=None, keyframes=None):
+def aligned_set(
+    skeleton: Skeleton, poses: Floats, time_functions: Floats | None = None, keyframes: dict[str, int] | None = None
+) -> AlignedSet:
     """A set of examples with poses (m, N, 3 + 4·J) and time functions (m, N), by default the identity."""
     clips = []
     for index, one in enumerate(poses):
@@ -44,7 +47,7 @@ def aligned_set(skeleton, poses, time_functions=None, keyframes=None):
     return AlignedSet(skeleton, HZ, tuple(clips), "clip_000@1", keyframes or {})
 
 
-def warps(count, frames, seed=0):
+def warps(count: int, frames: int, seed: int = 0) -> Floats:
     """Return time functions (count, N), each with its own varying slope."""
     random = np.random.default_rng(seed)
     phase = np.linspace(0.0, np.pi, frames - 1)
@@ -54,7 +57,7 @@ def warps(count, frames, seed=0):
     return np.concatenate((np.zeros((count, 1)), np.cumsum(slopes, axis=1)), axis=1)
 
 
-def bending_chains(count=20, frames=30, seed=0, joints=4, size=0.1):
+def bending_chains(count: int = 20, frames: int = 30, seed: int = 0, joints: int = 4, size: float = 0.1) -> AlignedSet:
     """Return swaying chains: a few random smooth functions in every channel."""
     random = np.random.default_rng(seed)
     skeleton = chain(joints)
@@ -65,7 +68,7 @@ def bending_chains(count=20, frames=30, seed=0, joints=4, size=0.1):
     return aligned_set(skeleton, unit_poses(basis.at_frames @ coefficients), warps(count, frames, seed))
 
 
-def walks(count=16, frames=40, seed=0):
+def walks(count: int = 16, frames: int = 40, seed: int = 0) -> AlignedSet:
     """Generated walks of many speeds and turn rates, which begin in the same phase."""
     random = np.random.default_rng(seed)
     clips = [generate_gait(0.9 + 0.7 * random.random(), 0.3 * random.standard_normal(), 1.0) for _ in range(count)]

@@ -1,8 +1,11 @@
 """Models as the predecessor wrote them, in every layout, made up of seeded numbers."""
 
 import json
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from marey_motion.formats.predecessor.skeleton import skeleton_document
 from marey_motion.gait import generate_gait
@@ -18,11 +21,11 @@ ANIMATED = SKELETON.joint_names[:12]
 """The others of the skeleton rest."""
 
 
-def knots(coefficients):
+def knots(coefficients: int) -> list[float]:
     return SplineBasis.clamped(FRAMES, coefficients).knots.tolist()
 
 
-def space(generator, joints):
+def space(generator: Generator, joints: tuple[str, ...]) -> tuple[list[float], list[list[float]]]:
     """Mean and components of a walk ahead with small turns of the joints, centimetres."""
     channels = 3 + 4 * len(joints)
     mean = np.zeros((COEFFICIENTS, channels))
@@ -34,7 +37,7 @@ def space(generator, joints):
     return mean.ravel().tolist(), vectors.tolist()
 
 
-def time(generator):
+def time(generator: Generator) -> tuple[list[float], list[list[float]]]:
     """Logarithms of the steps between coefficients, and components of them, one in each row."""
     steps = np.diff(np.linspace(0.0, FRAMES - 1.0, TIME_COEFFICIENTS) + 1.0, prepend=0.0)
     mean = np.log(steps) + generator.normal(scale=0.05, size=TIME_COEFFICIENTS)
@@ -44,13 +47,15 @@ def time(generator):
     return mean.tolist(), (0.2 * vectors).tolist()
 
 
-def mixture(generator, dimensions=SPATIAL + TEMPORAL):
+def mixture(
+    generator: Generator, dimensions: int = SPATIAL + TEMPORAL
+) -> tuple[list[float], list[list[float]], list[list[list[Any]]]]:
     shapes = generator.normal(size=(2, dimensions, dimensions))
     covariances = shapes @ shapes.transpose(0, 2, 1) / dimensions + 0.1 * np.eye(dimensions)
     return [0.4, 0.6], (0.3 * generator.normal(size=(2, dimensions))).tolist(), (0.1 * covariances).tolist()
 
 
-def layout_3(seed=1, joints=ANIMATED):
+def layout_3(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
     generator = np.random.default_rng(seed)
     mean, vectors = space(generator, joints)
     time_mean, time_vectors = time(generator)
@@ -71,7 +76,7 @@ def layout_3(seed=1, joints=ANIMATED):
     }  # fmt: skip
 
 
-def flat(seed=1, joints=ANIMATED):
+def flat(seed: int = 1, joints: tuple[str, ...] = ANIMATED) -> dict[str, Any]:
     """Return the members that layouts 1 and 2 share."""
     generator = np.random.default_rng(seed)
     mean, vectors = space(generator, joints)
@@ -85,7 +90,7 @@ def flat(seed=1, joints=ANIMATED):
     }  # fmt: skip
 
 
-def layout_2(seed=1, *, by_columns=True):
+def layout_2(seed: int = 1, *, by_columns: bool = True) -> dict[str, Any]:
     """Return a document of layout 2, by the first trainer, with components of time in columns, or by the later one."""
     mean, vectors = time(np.random.default_rng(seed + 100))
     if by_columns:
@@ -97,7 +102,7 @@ def layout_2(seed=1, *, by_columns=True):
     }  # fmt: skip
 
 
-def layout_1(seed=1):
+def layout_1(seed: int = 1) -> dict[str, Any]:
     mean, vectors = time(np.random.default_rng(seed + 100))
     return flat(seed) | {
         "npc_spatial": SPATIAL, "eigen_vectors_temporal_semantic": vectors, "mean_temporal_semantic_vector": mean,
@@ -107,7 +112,7 @@ def layout_1(seed=1):
     }  # fmt: skip
 
 
-def static(seed=1):
+def static(seed: int = 1) -> dict[str, Any]:
     mean, _ = space(np.random.default_rng(seed), SKELETON.joint_names)
     return {
         "name": "idle", "spatial_coeffs": np.reshape(mean, (COEFFICIENTS, -1)).tolist(), "knots": knots(COEFFICIENTS),
@@ -115,15 +120,21 @@ def static(seed=1):
     }  # fmt: skip
 
 
-LAYOUTS = {"3": layout_3, "2": layout_2, "2 later": lambda: layout_2(by_columns=False), "1": layout_1, "static": static}
+LAYOUTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "3": layout_3,
+    "2": layout_2,
+    "2 later": lambda: layout_2(by_columns=False),
+    "1": layout_1,
+    "static": static,
+}
 
 
-def tree(generator=None):
+def tree(generator: Any = None) -> dict[str, Any]:
     """A cluster tree over 40 samples: four branches, single samples at the ends."""
     generator = generator or np.random.default_rng(7)
     data = generator.normal(size=(40, SPATIAL + TEMPORAL))
 
-    def node(indices, level):
+    def node(indices: list[int], level: int) -> dict[str, Any]:
         parts = [indices[i::4] for i in range(4)] if len(indices) > 1 else []
         children = [node(part, level + 1) for part in parts if part]
         return {"mean": data[indices].mean(axis=0).tolist(), "indices": indices, "children": children}
@@ -139,7 +150,7 @@ def tree(generator=None):
 FILE, TREE_FILE = f"sha256:{'1' * 64}", f"sha256:{'2' * 64}"
 
 
-def imported():
+def imported() -> tuple[Mapping[str, Any], dict[str, Any]]:
     """The parts of a model with its tree that two files become, and the hierarchy of the skeleton."""
     planned, companion = plan_imports(["in/walk_mm.json", "in/walk_cluster_tree.json"])
     assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")

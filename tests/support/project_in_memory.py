@@ -1,16 +1,19 @@
 """Project in memory for tests of the functions of job kinds, and a small evaluation."""
 
 import hashlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
 from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput
-from marey_worker.context import NoSuchThing, Task
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_worker.context import Context, NoSuchThing, Task
 
 NOW = "2026-01-01T00:00:00Z"
 PARAMS = EvaluateParams(
@@ -19,10 +22,10 @@ PARAMS = EvaluateParams(
 
 
 @dataclass
-class ProjectInMemory:
+class ProjectInMemory(Context):
     """The project of a job in memory: a context without a pipe."""
 
-    scratch: object
+    scratch: Path
     task: Task = field(default_factory=lambda: Task(0, 1))
     threads: int = 1
     inputs: dict[str, Any] = field(default_factory=dict)
@@ -32,46 +35,46 @@ class ProjectInMemory:
     told: list[Any] = field(default_factory=list)
     into: str = ""
 
-    def document(self, kind, item, revision, part):
+    def document(self, kind: Kind, item: str, revision: int, part: str) -> dict[str, Any]:
         if (item, revision, part) not in self.parts:
             raise NoSuchThing(f"{item} has no {part}", f"no-{kind}")
         return self.parts[item, revision, part]
 
-    def documents(self, pins, part, *, required=True):
+    def documents(self, pins: Any, part: str, *, required: bool = True) -> Iterator[tuple[Any, ...]]:
         for pin in pins:
             held = self.parts.get((pin.item, pin.revision, part))
             assert held is not None or not required
             yield pin, held
 
-    def documents_of_each(self, pins, *parts):
+    def documents_of_each(self, pins: Any, *parts: Any) -> Iterator[tuple[Any, ...]]:
         for pin in pins:
             yield pin, tuple(self.parts.get((pin.item, pin.revision, part)) for part in parts)
 
-    def item(self, kind, item):
+    def item(self, kind: Kind, item: str) -> Item:
         return Item(
             id=item, kind=kind, name=item.upper(), collection="rigs", revision=1, created_at=NOW, updated_at=NOW, rev=1
         )
 
-    def blob(self, digest):
+    def blob(self, digest: str) -> bytes:
         return self.blobs[digest]
 
-    def put_file(self, path):
+    def put_file(self, path: Path) -> str:
         data = path.read_bytes()
         digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
         self.blobs[digest] = data
         return digest
 
-    def stage(self, outputs):
+    def stage(self, outputs: Sequence[StagedOutput]) -> None:
         self.staged += outputs
 
     def log(self, text: str) -> None:
         print(text)
 
-    def progress(self, done, total=None, note=""):
+    def progress(self, done: float, total: float | None = None, note: str = "") -> None:
         self.told.append((done, total, note))
 
 
-def add_clip(project, name, clip, skeleton="skeleton_a"):
+def add_clip(project: ProjectInMemory, name: str, clip: Clip, skeleton: str = "skeleton_a") -> None:
     ref = RevisionRef(item=skeleton, revision=1)
     project.parts[skeleton, 1, "hierarchy"] = skeleton_to_document(clip.skeleton).model_dump(by_alias=True)
     project.parts[f"clip_{name}", 1, "motion"] = clip_to_document(clip, ref).model_dump(by_alias=True)

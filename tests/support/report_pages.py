@@ -18,18 +18,20 @@ HOSTILE = (
 class Page(HTMLParser):
     """Parsed page: whether its tags are balanced, its text, and the resources and scripts that it would load."""
 
-    def __init__(self, source):
+    def __init__(self, source: str) -> None:
         super().__init__()
         self.opened: list[str] = []
         self.tags: Counter[str] = Counter()
         self.ids: Counter[str] = Counter()
         self.links: list[str] = []
-        self.attributes, self.words, self.scripts = set(), [], []
+        self.attributes: set[str] = set()
+        self.words: list[str] = []
+        self.scripts: list[str] = []
         self.feed(source)
         self.close()
         assert not self.opened
 
-    def handle_starttag(self, tag, attributes):
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str]]) -> None:
         self.tags[tag] += 1
         if tag not in VOID:
             self.opened.append(tag)
@@ -40,26 +42,26 @@ class Page(HTMLParser):
             if name in ("href", "src", "action", "data", "xlink:href"):
                 self.links.append(value)
 
-    def handle_startendtag(self, tag, attributes):
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str]]) -> None:
         self.handle_starttag(tag, attributes)
         if tag not in VOID:
             self.opened.pop()
 
-    def handle_endtag(self, tag):
+    def handle_endtag(self, tag: str) -> None:
         assert self.opened.pop() == tag
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         if self.opened and self.opened[-1] == "script":
             self.scripts.append(data)
         elif self.opened and self.opened[-1] != "style":
             self.words.append(data)
 
     @property
-    def text(self):
+    def text(self) -> str:
         return " ".join(" ".join(self.words).split())
 
 
-def is_sound(source):
+def is_sound(source: str) -> Page:
     """Check that tags are balanced, ids unique, no resources loaded, and no scripts but the page's own."""
     page = Page(source)
     assert set(page.ids.values()) == {1}

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from marey_motion.arrays import Floats
 from marey_motion.gait import generate_gait
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
@@ -16,7 +17,7 @@ FRAMES = 31
 RATE_HZ = 30.0
 
 
-def functions(basis, examples, count):
+def functions(basis: SplineBasis, examples: Floats, count: int) -> tuple[FunctionalComponents, Floats]:
     """Principal functions of examples (m, N, D), with scores of unit variance, and the scores (m, count)."""
     coefficients = basis.fit(examples)
     mean = coefficients.mean(axis=0)
@@ -36,14 +37,14 @@ def functions(basis, examples, count):
     return components, (left * np.sqrt(len(examples)))[:, :count]
 
 
-def walk_poses(speed_m_s, turn_rate_rad_s):
+def walk_poses(speed_m_s: float, turn_rate_rad_s: float) -> tuple[Skeleton, Floats]:
     """A second of walking in canonical time: generated, of FRAMES frames, continuous in sign."""
     clip = generate_gait(speed_m_s, turn_rate_rad_s, FRAMES / RATE_HZ + 0.5, RATE_HZ)
     return clip.skeleton, Motion.of(clip).poses[:FRAMES]
 
 
 @cache
-def walking(components=6, mixtures=2):
+def walking(components: int = 6, mixtures: int = 2) -> tuple[MotionPrimitive, Floats]:
     """Walks that differ in speed and turn rate; also their poses (m, N, D) and time functions (m, N)."""
     rng = np.random.default_rng(5)
     speeds, turns = rng.uniform(0.8, 1.6, 40), rng.uniform(-0.6, 0.6, 40)
@@ -66,7 +67,7 @@ def walking(components=6, mixtures=2):
     return primitive, latents
 
 
-def mixture_of(latents, count):
+def mixture_of(latents: Floats, count: int) -> LatentMixture:
     """A mixture about the first `count` parts of the latent vectors."""
     parts = np.array_split(latents[np.argsort(latents[:, 0], kind="stable")], count)
     floor = 0.05 * np.eye(latents.shape[1])
@@ -78,13 +79,13 @@ def mixture_of(latents, count):
 
 
 @cache
-def standard_joints():
+def standard_joints() -> dict[str, int]:
     """Joint index by standard name, of the walking skeleton."""
     skeleton = walking()[0].skeleton
     return {name: skeleton.index_of(joint) for name, joint in map_joints(skeleton).joints.items()}
 
 
-def sliding(dimensions=2, frames=9, rate_hz=30.0):
+def sliding(dimensions: int = 2, frames: int = 9, rate_hz: float = 30.0) -> MotionPrimitive:
     """A single joint whose root slides: positions are linear in the scores, one axis each, with one Gaussian."""
     skeleton = Skeleton(("root",), np.array([-1]), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     basis = SplineBasis.clamped(frames, 5)

@@ -1,12 +1,17 @@
 """Small suites over databases with known contents, for tests of suggestions."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from tests.support.synthetic_databases import arc_track, mirrored_track, random_tracks, synthetic_database
+from tests.support.synthetic_databases import Track, arc_track, mirrored_track, random_tracks, synthetic_database
 
+from marey_motion.arrays import Ints32
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import assemble, run_suite
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
 
 OPTIONS = EvaluationOptions(
@@ -15,17 +20,17 @@ OPTIONS = EvaluationOptions(
 UNWANTED = ("fast_000", "fast_001")
 
 
-def named(tracks, prefix="clip"):
+def named(tracks: list[Track], prefix: str = "clip") -> list[Track]:
     return [track._replace(uid=f"{prefix}_{number:03d}") for number, track in enumerate(tracks)]
 
 
-def wandering_tracks(count=8, seed=3):
+def wandering_tracks(count: int = 8, seed: int = 3) -> list[Track]:
     """Return useful clips, and two that are faster than every trial."""
     fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
     return [*named(random_tracks(count, seed)), *fast]
 
 
-def with_mirrored(tracks):
+def with_mirrored(tracks: list[Track]) -> MatchingDatabase:
     """A database of the tracks and their mirrored twins."""
     both = sorted(
         (one for track in tracks for one in (track, mirrored_track(track)._replace(uid=f"{track.uid}~mirrored"))),
@@ -39,17 +44,19 @@ def with_mirrored(tracks):
     return replace(database, clips=clips)
 
 
-def simulated(database, options=OPTIONS):
+def simulated(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) -> list[TrialRecord]:
     """Return the records of the whole suite."""
     return run_suite(database, options, trials=suite_trials(options))
 
 
-def evaluated(database, options=OPTIONS):
+def evaluated(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) -> EvaluationResult:
     """Evaluate the database, without a baseline."""
     return assemble(database, options, suite_trials(options), simulated(database, options))
 
 
-def same_to_the_bit(database, records, other, other_records):
+def same_to_the_bit(
+    database: MatchingDatabase, records: Any, other: MatchingDatabase, other_records: list[TrialRecord]
+) -> bool:
     """Return whether two sets of trials are equal to the bit, with rows named by clip and frame."""
     return all(
         np.array_equal(getattr(one, name), getattr(two, name), equal_nan=name.endswith("_cost"))
@@ -60,7 +67,7 @@ def same_to_the_bit(database, records, other, other_records):
     )
 
 
-def places(database, rows):
+def places(database: MatchingDatabase, rows: Ints32) -> list[tuple[str, int]]:
     """Clip and frame of each row; parts of clips are named and counted as in the whole clip."""
     found = []
     for index, row in zip(database.clip_of_row[rows].tolist(), rows.tolist(), strict=True):

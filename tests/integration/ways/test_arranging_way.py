@@ -5,17 +5,24 @@ import itertools
 import json
 import re
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from tests.support.server_process import ServerProcess
 
 from marey_client.cli import main
 from marey_client.imports import find_files
+from marey_client.marey import Marey
+from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import ItemChange
 from marey_schemas.options.imports import ImportOptions
+
+Command = Callable[..., SimpleNamespace]
 
 NAMES = (f"lab{number}" for number in itertools.count(1))
 
@@ -24,7 +31,7 @@ pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope=
 
 
 @pytest.fixture(scope="module")
-def takes(tmp_path_factory):
+def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three short walks."""
     folder = tmp_path_factory.mktemp("takes")
     for name, speed_m_s in (("a", 1.0), ("b", 1.2), ("c", 1.4)):
@@ -33,7 +40,7 @@ def takes(tmp_path_factory):
 
 
 @pytest.fixture
-def lab(marey, takes):
+def lab(marey: Marey, takes: Path) -> ProjectHandle:
     """A project with three clips: `raw/a`, `raw/b` and `raw/c`."""
     project = marey.create_project(ProjectCreate(name=next(NAMES)))
     project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
@@ -41,13 +48,19 @@ def lab(marey, takes):
 
 
 @pytest.fixture
-def run(server, lab, monkeypatch, capsys, tmp_path):
+def run(
+    server: ServerProcess,
+    lab: ProjectHandle,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> Command:
     """Runs a command, in which `lab` stands for the test's project; what it printed, with the same name for that."""
     monkeypatch.setenv("MAREY_URL", server.url)
     monkeypatch.setenv("MAREY_DATA", str(server.data))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
-    def command(*arguments, status=0, terminal=None):
+    def command(*arguments: str, status: int = 0, terminal: str | None = None) -> SimpleNamespace:
         words = [re.sub(r"^lab\b", lab.name, word) for word in arguments]
         monkeypatch.setattr(sys, "argv", ["marey", *words])
         stdin = io.StringIO(terminal or "")
@@ -62,11 +75,11 @@ def run(server, lab, monkeypatch, capsys, tmp_path):
     return command
 
 
-def clips(lab):
+def clips(lab: ProjectHandle) -> list[str]:
     return sorted(clip.path for clip in lab.clips.list())
 
 
-def test_items_and_folders_are_renamed_and_moved_with_their_ids(run, lab):
+def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, lab: ProjectHandle) -> None:
     ids = {clip.name: clip.id for clip in lab.clips.list()}
     assert "lab/raw/a is lab/raw/walk now" in run("mv", "lab/raw/a", "lab/raw/walk").stderr
     assert lab.clips.get(ids["a"]).path == "raw/walk"
@@ -99,12 +112,14 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run, lab):
         (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is not a kind of item"),
     ],
 )
-def test_what_cannot_be_is_told_and_changes_nothing(run, lab, arguments, status, told):
+def test_what_cannot_be_is_told_and_changes_nothing(
+    run: Command, lab: ProjectHandle, arguments: list[str], status: int, told: str
+) -> None:
     assert told in run(*arguments, status=status).stderr
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
-def test_what_was_removed_is_listed_and_comes_back(run, lab):
+def test_what_was_removed_is_listed_and_comes_back(run: Command, lab: ProjectHandle) -> None:
     assert "marey restore lab/raw/a brings it back" in run("rm", "lab/raw/a").stderr
     run("rm", "lab/raw", "--yes")
     assert clips(lab) == []
@@ -118,7 +133,9 @@ def test_what_was_removed_is_listed_and_comes_back(run, lab):
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
-def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_by_its_id(run, lab):
+def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_by_its_id(
+    run: Command, lab: ProjectHandle
+) -> None:
     first = next(lab.clips.list(path="raw/a")).id
     run("rm", "lab/raw/a")
     run("mv", "lab/raw/b", "lab/raw/a")
@@ -134,7 +151,7 @@ def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_
     assert next(lab.clips.list(path="raw/a")).id == first
 
 
-def test_of_things_of_one_name_the_kind_says_which(run, lab):
+def test_of_things_of_one_name_the_kind_says_which(run: Command, lab: ProjectHandle) -> None:
     skeleton = next(lab.skeletons.list())
     skeleton.change(ItemChange(collection="raw", name="a"))
     assert "lab/raw/a is the name of a skeleton and of a clip" in run("rm", "lab/raw/a", status=2).stderr
@@ -143,7 +160,7 @@ def test_of_things_of_one_name_the_kind_says_which(run, lab):
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
 
 
-def test_what_the_server_refuses_of_several_keeps_the_others_from_nothing(run, lab):
+def test_what_the_server_refuses_of_several_keeps_the_others_from_nothing(run: Command, lab: ProjectHandle) -> None:
     run("mv", "lab/raw/a", "lab/other/c")
     done = run("mv", "lab/raw/b", "lab/raw/c", "lab/other/", "--json", status=1)
     report = json.loads(done.stdout)
@@ -152,7 +169,7 @@ def test_what_the_server_refuses_of_several_keeps_the_others_from_nothing(run, l
     assert clips(lab) == ["other/b", "other/c", "raw/c"]
 
 
-def test_tags_are_added_and_taken_away(run, lab):
+def test_tags_are_added_and_taken_away(run: Command, lab: ProjectHandle) -> None:
     run("tag", "lab/raw/a", "lab/raw/b", "--add", "slow", "--add", "straight")
     assert "lab/raw/a: straight" in run("tag", "lab/raw/a", "--remove", "slow").stderr
     assert {clip.name: clip.item.tags for clip in lab.clips.list()} == {
@@ -162,12 +179,16 @@ def test_tags_are_added_and_taken_away(run, lab):
 
 
 @pytest.mark.parametrize(("answer", "status", "left"), [("n\n", 1, ["raw/a", "raw/b", "raw/c"]), ("y\n", 0, [])])
-def test_at_a_terminal_many_items_are_removed_after_a_yes(run, lab, answer, status, left):
+def test_at_a_terminal_many_items_are_removed_after_a_yes(
+    run: Command, lab: ProjectHandle, answer: str, status: int, left: list[str]
+) -> None:
     assert "remove 3 items (lab/raw/)?" in run("rm", "lab/raw", terminal=answer, status=status).stderr
     assert clips(lab) == left
 
 
-def test_a_disabled_user_is_let_in_again_and_an_administrator_made(run, marey, lab):
+def test_a_disabled_user_is_let_in_again_and_an_administrator_made(
+    run: Command, marey: Marey, lab: ProjectHandle
+) -> None:
     run("user", "create", "ada", "--without-password")
     assert "marey user enable ada" in run("user", "disable", "ada").stderr
     assert marey.users.get("ada").disabled
@@ -180,7 +201,7 @@ def test_a_disabled_user_is_let_in_again_and_an_administrator_made(run, marey, l
     assert "give --display-name or --administrator" in run("user", "change", "ada", status=2).stderr
 
 
-def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run, lab):
+def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
     assert "there is nothing at lab/rwa; marey ls lab shows" in run("ls", "lab/rwa", status=2).stderr
     (item,) = json.loads(run("ls", "lab/raw/a", "--json").stdout)["items"]
     assert (item["kind"], item["name"]) == ("clip", "a")

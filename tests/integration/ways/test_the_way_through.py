@@ -6,12 +6,19 @@ import os
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.command_line import CommandLine
+from tests.support.server_process import ServerProcess
 
 from marey_client import errors
+from marey_client.handles.clips import ClipHandle
+from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.imports import FILES_PER_IMPORT, find_files
+from marey_client.marey import Marey
+from marey_client.project import ProjectHandle
 from marey_motion.formats import read_motion, write_bvh
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import Login, ProjectCreate, UserCreate
@@ -26,7 +33,7 @@ pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope=
 
 
 @pytest.fixture(scope="module")
-def takes(tmp_path_factory):
+def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two walks and a broken file, in folders."""
     folder = tmp_path_factory.mktemp("takes")
     (folder / "turns").mkdir()
@@ -37,12 +44,12 @@ def takes(tmp_path_factory):
 
 
 @pytest.fixture
-def project(marey, request):
+def project(marey: Marey, request: pytest.FixtureRequest) -> ProjectHandle:
     name = hashlib.sha1(request.node.name.encode()).hexdigest()[:12]
     return marey.create_project(ProjectCreate(name=name))
 
 
-def target_skeleton(project):
+def target_skeleton(project: ProjectHandle) -> SkeletonHandle:
     """A skeleton of another rig, by way of a file that holds a pose of it."""
     from marey_motion.documents import mapping_to_document, skeleton_to_document
     from marey_motion.rigs import guess_axes, map_joints
@@ -58,7 +65,7 @@ def target_skeleton(project):
 
 
 @pytest.mark.check
-def test_the_readme_told_in_a_shell(run, takes, tmp_path, marey):
+def test_the_readme_told_in_a_shell(run: CommandLine, takes: Path, tmp_path: Path, marey: Marey) -> None:
     run("project", "create", "readme")
     upload = run("upload", takes, "--project", "readme", "--collection", "raw", "--json", status=1)
     entries = {entry["name"]: entry for entry in json.loads(upload.stdout)}
@@ -86,7 +93,7 @@ def test_the_readme_told_in_a_shell(run, takes, tmp_path, marey):
     assert json.loads(run("job", "show", jobs[0]["id"], "--json").stdout)["result"]["clips"] == 2
 
 
-def test_a_folder_is_listed_with_what_stands_directly_in_it(run, takes):
+def test_a_folder_is_listed_with_what_stands_directly_in_it(run: CommandLine, takes: Path) -> None:
     run("project", "create", "folders")
     run("upload", takes / "turns", "--project", "folders")
     run("upload", takes / "turns", "--project", "folders", "--collection", "a/b")
@@ -99,7 +106,9 @@ def test_a_folder_is_listed_with_what_stands_directly_in_it(run, takes):
         assert (shown["collections"], [item["name"] for item in shown["items"]]) == (folders, names)
 
 
-def test_a_clip_is_shown_with_its_skeleton_its_evidence_and_what_was_noticed(run, takes, tmp_path):
+def test_a_clip_is_shown_with_its_skeleton_its_evidence_and_what_was_noticed(
+    run: CommandLine, takes: Path, tmp_path: Path
+) -> None:
     text = (takes / "walk.bvh").read_text()
     (tmp_path / "more.bvh").write_text(text.replace("Frames: 120", "Frames: 119"))
     run("project", "create", "shown")
@@ -111,7 +120,9 @@ def test_a_clip_is_shown_with_its_skeleton_its_evidence_and_what_was_noticed(run
     assert "the header declares 119 frames" in told
 
 
-def test_the_history_of_a_clip_tells_that_its_source_has_changed(run, takes, marey, tmp_path):
+def test_the_history_of_a_clip_tells_that_its_source_has_changed(
+    run: CommandLine, takes: Path, marey: Marey, tmp_path: Path
+) -> None:
     run("project", "create", "history")
     run("upload", takes / "walk.bvh", "--project", "history", "--collection", "raw")
     studio = target_skeleton(marey.project("history"))
@@ -123,7 +134,7 @@ def test_the_history_of_a_clip_tells_that_its_source_has_changed(run, takes, mar
     assert "stale: clip walk has newer revisions than 1" in told
 
 
-def test_a_job_of_any_kind_is_handed_in_from_the_shell(run, takes, marey):
+def test_a_job_of_any_kind_is_handed_in_from_the_shell(run: CommandLine, takes: Path, marey: Marey) -> None:
     run("project", "create", "jobs")
     run("upload", takes / "walk.bvh", "--project", "jobs", "--collection", "raw")
     assert "retarget" in run("job", "kinds").stdout
@@ -138,21 +149,21 @@ def test_a_job_of_any_kind_is_handed_in_from_the_shell(run, takes, marey):
     assert "the kinds are import" in run("job", "submit", "jobs", "nothing", status=2).stderr
 
 
-def test_the_original_comes_back_byte_for_byte(run, takes, tmp_path):
+def test_the_original_comes_back_byte_for_byte(run: CommandLine, takes: Path, tmp_path: Path) -> None:
     run("project", "create", "originals")
     run("upload", takes / "walk.bvh", "--project", "originals")
     run("download", "originals/walk", "-o", tmp_path)
     assert (tmp_path / "walk.bvh").read_bytes() == (takes / "walk.bvh").read_bytes()
 
 
-def test_refusals_are_one_line_with_a_request_id_and_exit_status_1(run):
+def test_refusals_are_one_line_with_a_request_id_and_exit_status_1(run: CommandLine) -> None:
     done = run("project", "show", "absent", status=1)
     assert done.stderr.count("\n") == 1
     assert "request " in done.stderr
     assert done.stdout == ""
 
 
-def test_a_token_can_be_made_used_and_revoked(run, tmp_path):
+def test_a_token_can_be_made_used_and_revoked(run: CommandLine, tmp_path: Path) -> None:
     run("project", "create", "tokens")
     run("token", "create", "reader", "--scope", "read", "--output", tmp_path / "token")
     assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
@@ -164,7 +175,7 @@ def test_a_token_can_be_made_used_and_revoked(run, tmp_path):
     assert "bad-token" in run("project", "ls", "--token-file", tmp_path / "token", status=1).stderr
 
 
-def test_poses_come_whole_and_in_slices(project, takes):
+def test_poses_come_whole_and_in_slices(project: ProjectHandle, takes: Path) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
     (clip,) = project.clips.list()
     whole = clip.motion()
@@ -175,7 +186,7 @@ def test_poses_come_whole_and_in_slices(project, takes):
     assert np.array_equal(some.rotations, whole.rotations[10:20, 3:5])
 
 
-def test_items_are_changed_only_as_they_were_read(project, takes):
+def test_items_are_changed_only_as_they_were_read(project: ProjectHandle, takes: Path) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files)
     (clip,) = project.clips.list()
     stale = project.clips.get(clip.id)
@@ -188,7 +199,7 @@ def test_items_are_changed_only_as_they_were_read(project, takes):
     assert [one.name for one in project.clips.list()] == ["stroll"]
 
 
-def test_a_mapping_that_was_edited_is_a_new_revision(project):
+def test_a_mapping_that_was_edited_is_a_new_revision(project: ProjectHandle) -> None:
     studio = target_skeleton(project)
     mapping = studio.mapping()
     joints = {standard: joint for standard, joint in mapping.joints.items() if standard != "head"}
@@ -197,7 +208,7 @@ def test_a_mapping_that_was_edited_is_a_new_revision(project):
     assert [revision.revision for revision in studio.revisions()] == [2, 1]
 
 
-def test_files_beyond_one_request_are_imported_and_sent_but_once(project, tmp_path):
+def test_files_beyond_one_request_are_imported_and_sent_but_once(project: ProjectHandle, tmp_path: Path) -> None:
     count = FILES_PER_IMPORT + 20
     for number in range(count):
         (tmp_path / f"take-{number:03d}.bvh").write_bytes(write_bvh(generate_gait(1.0 + number / 100, 0.0, 0.1)))
@@ -210,7 +221,7 @@ def test_files_beyond_one_request_are_imported_and_sent_but_once(project, tmp_pa
     assert not [stage for stage, *_ in told if stage == "sending"]
 
 
-def test_a_job_imports_what_a_request_would(project, marey, takes):
+def test_a_job_imports_what_a_request_would(project: ProjectHandle, marey: Marey, takes: Path) -> None:
     files = find_files([takes]).files
     blobs = [{"name": file.name, "blob": marey.blobs.put_file(file.path)} for file in files]
     params = ImportParams.model_validate({"files": blobs, "collection": "raw", "subject": "ada"})
@@ -229,7 +240,9 @@ def test_a_job_imports_what_a_request_would(project, marey, takes):
 
 
 @pytest.mark.parametrize("file_format", ["bvh", "original", "npz", "json"])
-def test_an_archive_holds_every_clip_and_is_the_same_each_time(project, marey, takes, tmp_path, file_format):
+def test_an_archive_holds_every_clip_and_is_the_same_each_time(
+    project: ProjectHandle, marey: Marey, takes: Path, tmp_path: Path, file_format: str
+) -> None:
     project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
     digests = []
     for _ in range(2):
@@ -250,7 +263,9 @@ def test_an_archive_holds_every_clip_and_is_the_same_each_time(project, marey, t
             assert held.read(names["raw/walk"]) == (takes / "walk.bvh").read_bytes()
 
 
-def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(project, marey, takes, tmp_path):
+def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(
+    project: ProjectHandle, marey: Marey, takes: Path, tmp_path: Path
+) -> None:
     project.imports.upload(find_files([takes]).files, ImportOptions(collection="raw"))
     studio = target_skeleton(project)
     lonely = project.skeletons.create(
@@ -272,7 +287,9 @@ def test_a_clip_that_cannot_be_retargeted_is_a_refusal_and_the_others_are_made(p
     assert sorted(clip.path for clip in project.clips.list(collection="out")) == ["out/raw/turns/left", "out/raw/walk"]
 
 
-def test_retargeting_to_a_skeleton_without_a_body_fails_once_and_says_why(project, marey, takes):
+def test_retargeting_to_a_skeleton_without_a_body_fails_once_and_says_why(
+    project: ProjectHandle, marey: Marey, takes: Path
+) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
     box = project.skeletons.create(
         "box",
@@ -287,7 +304,7 @@ def test_retargeting_to_a_skeleton_without_a_body_fails_once_and_says_why(projec
     assert len(list(marey.jobs.attempts(caught.value.job.id))) == 1
 
 
-def test_results_keep_the_licence_and_say_what_was_done(project, marey, takes):
+def test_results_keep_the_licence_and_say_what_was_done(project: ProjectHandle, marey: Marey, takes: Path) -> None:
     options = ImportOptions(collection="raw", licence="CC BY-NC 4.0", subject="ada")
     project.imports.upload(find_files([takes / "walk.bvh"]).files, options)
     inputs = {"clips": CollectionInput(collection="raw"), "skeleton": ItemInput(item=target_skeleton(project).id)}
@@ -298,7 +315,7 @@ def test_results_keep_the_licence_and_say_what_was_done(project, marey, takes):
     assert info.source.details["scale"] > 0
 
 
-def test_a_large_file_arrives_whole(marey, tmp_path):
+def test_a_large_file_arrives_whole(marey: Marey, tmp_path: Path) -> None:
     data = np.random.default_rng(1).bytes(70 << 20)
     (tmp_path / "large.bin").write_bytes(data)
     digest = marey.blobs.put_file(tmp_path / "large.bin")
@@ -307,7 +324,9 @@ def test_a_large_file_arrives_whole(marey, tmp_path):
     assert marey.blobs.fetch_to(digest, tmp_path / "back.bin").read_bytes() == data
 
 
-def test_an_import_that_becomes_a_job_answers_like_one_that_does_not(project, marey, tmp_path):
+def test_an_import_that_becomes_a_job_answers_like_one_that_does_not(
+    project: ProjectHandle, marey: Marey, tmp_path: Path
+) -> None:
     content = write_bvh(generate_gait(1.0, 0.0, 0.1))
     (tmp_path / "take.bvh").write_bytes(content)
     blob = marey.blobs.put_file(tmp_path / "take.bvh")
@@ -321,7 +340,9 @@ def test_an_import_that_becomes_a_job_answers_like_one_that_does_not(project, ma
     assert project.clips.get(first[0].item).path == "000/take"
 
 
-def test_the_log_of_a_job_can_be_read_and_followed(project, marey, takes, run):
+def test_the_log_of_a_job_can_be_read_and_followed(
+    project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
+) -> None:
     (takes_file,) = find_files([takes / "broken.bvh"]).files
     blob = marey.blobs.put_file(takes_file.path)
     job = project.submit(JobCreate(kind="import", params={"files": [{"name": "broken.bvh", "blob": blob}]}))
@@ -330,12 +351,12 @@ def test_the_log_of_a_job_can_be_read_and_followed(project, marey, takes, run):
     assert run("job", "log", job.id).stdout.encode() == followed
 
 
-def test_logging_in_stores_a_token_for_its_owner_alone(marey, server, tmp_path):
+def test_logging_in_stores_a_token_for_its_owner_alone(marey: Marey, server: ServerProcess, tmp_path: Path) -> None:
     marey.users.create(UserCreate(name="grace", password="correct horse battery"))
     surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
     environment = {**surroundings, "XDG_CONFIG_HOME": str(tmp_path), "HOME": str(tmp_path)}
 
-    def command(*arguments, stdin=None):
+    def command(*arguments: str, stdin: str | None = None) -> subprocess.CompletedProcess[str]:
         whole = [sys.executable, "-m", "marey_client.cli", *arguments]
         return subprocess.run(
             whole, env=environment, input=stdin, capture_output=True, text=True, cwd=tmp_path, timeout=60
@@ -353,11 +374,13 @@ def test_logging_in_stores_a_token_for_its_owner_alone(marey, server, tmp_path):
     assert command("user", "show", "--server", server.url).returncode == 1
 
 
-def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(project, marey, takes):
+def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(
+    project: ProjectHandle, marey: Marey, takes: Path
+) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
     studio = target_skeleton(project)
 
-    def retargeted(into):
+    def retargeted(into: str) -> ClipHandle:
         job = project.retarget([CollectionInput(collection="raw")], studio.id, into=into)
         marey.jobs.wait(job.id, timeout_s=60)
         (clip,) = project.clips.list(collection=into)
@@ -375,7 +398,9 @@ def test_an_edited_mapping_of_the_clips_own_skeleton_is_gone_by(project, marey, 
     assert ("rigs", 2) in used
 
 
-def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it(project, marey, takes, run):
+def test_a_body_that_was_hardly_recognised_is_refused_until_somebody_confirms_it(
+    project: ProjectHandle, marey: Marey, takes: Path, run: CommandLine
+) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
     studio = target_skeleton(project)
     (source,) = [skeleton for skeleton in project.skeletons.list() if skeleton.id != studio.id]

@@ -1,6 +1,8 @@
 """In-process server: a function from request to response."""
 
 import json
+from collections.abc import Callable
+from typing import Any
 
 import httpx
 import pytest
@@ -9,7 +11,9 @@ from marey_client.marey import Marey
 from marey_client.retries import Retries
 
 
-def problem(status, code, *, retry_after=None, detail="the reason", **members):
+def problem(
+    status: int, code: str, *, retry_after: int | None = None, detail: str = "the reason", **members: Any
+) -> httpx.Response:
     told = {"type": "about:blank", "title": "t", "status": status, "detail": detail, "instance": "req-1", "code": code}
     headers = {"Content-Type": "application/problem+json"}
     if retry_after is not None:
@@ -20,12 +24,12 @@ def problem(status, code, *, retry_after=None, detail="the reason", **members):
 class Scripted:
     """Answers one after another; an exception is raised instead of answered. Remembers every request."""
 
-    def __init__(self):
-        self.answers = []
-        self.requests = []
-        self.waited = []
+    def __init__(self) -> None:
+        self.answers: list[Any] = []
+        self.requests: list[httpx.Request] = []
+        self.waited: list[float] = []
 
-    def __call__(self, request):
+    def __call__(self, request: httpx.Request) -> httpx.Response:
         request.read()
         self.requests.append(request)
         answer = self.answers.pop(0)
@@ -33,7 +37,7 @@ class Scripted:
             raise answer
         return answer(request) if callable(answer) else answer
 
-    def marey(self, **options):
+    def marey(self, **options: Any) -> Marey:
         retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
         return Marey(
             "http://server.test/", "marey_secret", http=httpx.MockTransport(self), **{"retries": retries, **options}
@@ -41,10 +45,10 @@ class Scripted:
 
 
 @pytest.fixture
-def script():
+def script() -> Scripted:
     return Scripted()
 
 
 @pytest.fixture
-def make_problem():
+def make_problem() -> Callable[..., httpx.Response]:
     return problem

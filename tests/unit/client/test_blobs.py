@@ -1,6 +1,9 @@
 """Blobs: upload and download by digest."""
 
 import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -15,15 +18,15 @@ DATA = bytes(range(256)) * 4096
 class Torn(httpx.SyncByteStream):
     """An answer whose connection breaks after some bytes."""
 
-    def __init__(self, data):
+    def __init__(self, data: bytes) -> None:
         self.data = data
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[bytes]:
         yield self.data
         raise httpx.ReadError("connection reset")
 
 
-def test_a_file_is_streamed_with_its_length(script, tmp_path):
+def test_a_file_is_streamed_with_its_length(script: Any, tmp_path: Path) -> None:
     path = tmp_path / "walk.bvh"
     path.write_bytes(DATA)
     script.answers = [httpx.ReadError("lost"), httpx.Response(204)]
@@ -35,11 +38,13 @@ def test_a_file_is_streamed_with_its_length(script, tmp_path):
 
 
 @pytest.mark.parametrize(("became", "told"), [(DATA[:1000], "shorter"), (DATA * 3, "longer")])
-def test_a_file_whose_length_changes_while_it_is_sent_is_told(script, tmp_path, became, told):
+def test_a_file_whose_length_changes_while_it_is_sent_is_told(
+    script: Any, tmp_path: Path, became: bytes, told: str
+) -> None:
     path = tmp_path / "walk.bvh"
     path.write_bytes(DATA)
 
-    def change_and_lose(_request):
+    def change_and_lose(_request: httpx.Request) -> None:
         path.write_bytes(became)
         raise httpx.ReadError("lost")
 
@@ -48,8 +53,8 @@ def test_a_file_whose_length_changes_while_it_is_sent_is_told(script, tmp_path, 
         script.marey().blobs.put_file(path)
 
 
-def test_a_download_goes_on_where_the_connection_broke(script, tmp_path):
-    def rest(request):
+def test_a_download_goes_on_where_the_connection_broke(script: Any, tmp_path: Path) -> None:
+    def rest(request: httpx.Request) -> httpx.Response:
         start = int(request.headers["Range"].removeprefix("bytes=").rstrip("-"))
         return httpx.Response(206, content=DATA[start:])
 
@@ -59,12 +64,12 @@ def test_a_download_goes_on_where_the_connection_broke(script, tmp_path):
     assert script.requests[1].headers["Range"] == "bytes=1000-"
 
 
-def test_a_download_starts_again_where_ranges_are_not_known(script, tmp_path):
+def test_a_download_starts_again_where_ranges_are_not_known(script: Any, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, stream=Torn(DATA[:1000])), httpx.Response(200, content=DATA)]
     assert script.marey().blobs.fetch_to(digest_of(DATA), tmp_path / "walk").read_bytes() == DATA
 
 
-def test_other_bytes_than_those_asked_for_are_never_kept(script, tmp_path):
+def test_other_bytes_than_those_asked_for_are_never_kept(script: Any, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, content=b"other"), httpx.Response(200, content=b"other")]
     blobs = script.marey().blobs
     with pytest.raises(errors.DigestMismatch):
@@ -74,10 +79,10 @@ def test_other_bytes_than_those_asked_for_are_never_kept(script, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_thousands_of_digests_are_asked_for_in_few_questions(script):
+def test_thousands_of_digests_are_asked_for_in_few_questions(script: Any) -> None:
     digests = [f"sha256:{number:064x}" for number in range(12_000)]
 
-    def answer(request):
+    def answer(request: httpx.Request) -> httpx.Response:
         asked = BlobsQuery.model_validate_json(request.content).digests
         return httpx.Response(200, json={"missing": asked[:1]})
 

@@ -5,7 +5,10 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import httpx
@@ -29,7 +32,9 @@ from marey_schemas.jobs import Job, JobState
 from marey_schemas.kinds import Kind
 
 
-def marey(*arguments, env=None, stdin="", cwd=None):
+def marey(
+    *arguments: Any, env: dict[str, str] | None = None, stdin: str = "", cwd: Path | None = None
+) -> CompletedProcess[str]:
     command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
     return subprocess.run(
         command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})}, cwd=cwd
@@ -44,7 +49,7 @@ PROJECT = {
 
 
 @pytest.fixture
-def nowhere(tmp_path):
+def nowhere(tmp_path: Path) -> dict[str, str]:
     """A user without stored logins, and a server that is not there."""
     return {
         "XDG_CONFIG_HOME": str(tmp_path), "MAREY_DATA": str(tmp_path), "MAREY_URL": "http://127.0.0.1:9",
@@ -57,7 +62,7 @@ def a_job(**fields: Any) -> Job:
     return Job.model_construct(**fields)
 
 
-def test_help_loads_nothing_heavy():
+def test_help_loads_nothing_heavy() -> None:
     probe = (
         "import sys; from marey_client.cli.app import app\n"
         "try: app(['--help'])\n"
@@ -84,12 +89,12 @@ def test_help_loads_nothing_heavy():
         assert command in done.stdout
 
 
-def test_every_command_explains_itself():
+def test_every_command_explains_itself() -> None:
     from typer.main import get_command
 
     from marey_client.cli.app import app
 
-    def walk(command, path):
+    def walk(command: Any, path: list[str]) -> None:
         assert command.help, path
         for name, child in getattr(command, "commands", {}).items():
             walk(child, [*path, name])
@@ -97,7 +102,7 @@ def test_every_command_explains_itself():
     walk(get_command(app), ["marey"])
 
 
-def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130():
+def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130() -> None:
     probe = (
         "import sys\n"
         "class Impatience:\n"
@@ -111,7 +116,7 @@ def test_who_interrupts_while_modules_load_sees_nothing_and_gets_130():
 
 
 @pytest.mark.parametrize("arguments", [["edit", "commands"], ["--help"]])
-def test_a_reader_who_goes_away_is_no_news(arguments, nowhere):
+def test_a_reader_who_goes_away_is_no_news(arguments: list[str], nowhere: dict[str, str]) -> None:
     command = [sys.executable, "-c", "from marey_client.cli import main; main()", *arguments]
     reading, writing = os.pipe()
     os.close(reading)
@@ -123,7 +128,7 @@ def test_a_reader_who_goes_away_is_no_news(arguments, nowhere):
 
 
 @pytest.mark.parametrize("arguments", [["nonsense"], ["ls", "--nonsense"], ["upload"], ["ls", "/"], ["job", "ls"]])
-def test_wrong_usage_exits_with_2(arguments, nowhere):
+def test_wrong_usage_exits_with_2(arguments: list[str], nowhere: dict[str, str]) -> None:
     done = marey(*arguments, env=nowhere)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -157,7 +162,9 @@ BUILD = ("build-model", "lab/walks", "--name", "w")
         (["job", "show", os.fsdecode(b"\xff")], "is not text in UTF-8"),
     ],
 )
-def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(arguments, told, nowhere, tmp_path):
+def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(
+    arguments: list[str], told: str, nowhere: dict[str, str], tmp_path: Path
+) -> None:
     for name, data in GIVEN.items():
         (tmp_path / name).write_bytes(data)
     done = marey(*arguments, env=nowhere, cwd=tmp_path)
@@ -166,18 +173,18 @@ def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(arguments, t
     assert told in done.stderr
 
 
-def test_text_that_an_output_cannot_hold_is_escaped(nowhere):
+def test_text_that_an_output_cannot_hold_is_escaped(nowhere: dict[str, str]) -> None:
     done = marey("edit", "commands", "é", env={**nowhere, "PYTHONIOENCODING": "ascii"})
     assert (done.returncode, done.stderr.startswith(r"marey: there is no command '\xe9'")) == (2, True)
 
 
-def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere):
+def test_a_name_the_server_would_refuse_is_refused_before_it_is_sent(nowhere: dict[str, str]) -> None:
     done = marey("project", "create", "Not A Name", env=nowhere)
     assert done.returncode == 2
     assert done.stderr.startswith("marey: name: ")
 
 
-def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere):
+def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere: dict[str, str]) -> None:
     done = marey("project", "ls", env=nowhere)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
@@ -185,7 +192,7 @@ def test_a_server_that_is_not_there_is_one_line_and_exit_status_1(nowhere):
     assert "marey_very_secret" not in done.stderr
 
 
-def test_with_v_the_whole_story_is_told_without_the_token(nowhere):
+def test_with_v_the_whole_story_is_told_without_the_token(nowhere: dict[str, str]) -> None:
     done = marey("project", "ls", "-v", env=nowhere)
     assert done.returncode == 1
     assert "Traceback" in done.stderr
@@ -202,11 +209,11 @@ def test_with_v_the_whole_story_is_told_without_the_token(nowhere):
         (["ls", "--server"], ["--server", "ls"]),
     ],
 )
-def test_options_of_marey_itself_may_stand_anywhere(given, expected):
+def test_options_of_marey_itself_may_stand_anywhere(given: list[str], expected: list[str]) -> None:
     assert with_global_options_first(given) == expected
 
 
-def test_addresses_have_a_project_a_path_and_perhaps_an_id():
+def test_addresses_have_a_project_a_path_and_perhaps_an_id() -> None:
     address = Address.parse("lab/raw/walk")
     assert (address.project, address.path, address.has_id) == ("lab", "raw/walk", False)
     assert Address.parse("lab/clip_01m7ysc032mjg6sbhcx9q58xq7").has_id
@@ -215,14 +222,14 @@ def test_addresses_have_a_project_a_path_and_perhaps_an_id():
         Address.parse("/")
 
 
-def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere):
+def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(nowhere: dict[str, str]) -> None:
     done = marey("download", "lab/raw", "--format", "gltf", env=nowhere)
     assert done.returncode == 2
     assert "the formats are original, bvh, npz" in done.stderr
 
 
-def test_a_folder_is_shown_without_reading_those_below_it(script):
-    def empty(request):
+def test_a_folder_is_shown_without_reading_those_below_it(script: Any) -> None:
+    def empty(request: httpx.Request) -> httpx.Response:
         return httpx.Response(200, content=b'{"items": [], "next_cursor": null}')
 
     script.answers = [empty] * len(Kind)
@@ -232,7 +239,9 @@ def test_a_folder_is_shown_without_reading_those_below_it(script):
 
 
 @pytest.mark.parametrize(("token", "hinted"), [(None, True), ("marey_secret", False)])
-def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(script, make_problem, token, hinted):
+def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(
+    script: Any, make_problem: Callable[..., Any], token: str | None, hinted: bool
+) -> None:
     script.answers = [make_problem(404, "no-project")]
     with (
         Marey("http://server.test", token, http=httpx.MockTransport(script)) as anyone,
@@ -242,13 +251,13 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(script, mak
     assert ("marey login" in sentence(raised.value)) is hinted
 
 
-def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_path):
+def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_path: Path) -> None:
     with pytest.raises(OSError) as failed:
         (tmp_path / "nowhere" / "walk.bvh").write_bytes(b"")
     assert sentence(failed.value) == f"{tmp_path}/nowhere/walk.bvh: No such file or directory"
 
 
-def test_what_is_wrong_with_a_field_is_told_once(script, make_problem):
+def test_what_is_wrong_with_a_field_is_told_once(script: Any, make_problem: Callable[..., Any]) -> None:
     errors = [{"pointer": "/a", "code": "bad", "detail": "no"}, {"pointer": "/b", "code": "bad", "detail": "neither"}]
     script.answers = [make_problem(422, "invalid", detail="/a: no", errors=errors)]
     with pytest.raises(Invalid) as raised:
@@ -256,7 +265,9 @@ def test_what_is_wrong_with_a_field_is_told_once(script, make_problem):
     assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1)"
 
 
-def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(script, make_problem, monkeypatch):
+def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(
+    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     answers = [make_problem(401, "bad-token", detail="The token is unknown, expired or revoked.")] * 2
     monkeypatch.setattr("marey_client.marey.Marey", lambda url, token: answering(script, token))
     monkeypatch.setenv("MAREY_TOKEN", "marey_old")
@@ -268,11 +279,13 @@ def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(script, mak
         assert ("MAREY_TOKEN" in sentence(refused.value)) is not anonymous
 
 
-def answering(script, token):
+def answering(script: Any, token: str | None) -> Marey:
     return Marey("http://server.test", token, http=httpx.MockTransport(script))
 
 
-def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(script, make_problem, monkeypatch, tmp_path):
+def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(
+    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     monkeypatch.setattr(files, "connect", lambda context: script.marey())
     script.answers = [make_problem(404, "no-project")]
@@ -281,8 +294,10 @@ def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(script, mak
     assert [request.method for request in script.requests] == ["GET"]
 
 
-def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(script, capsys):
-    def interrupt(_request):
+def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(
+    script: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(_request: httpx.Request) -> None:
         raise KeyboardInterrupt
 
     script.answers = [interrupt]
@@ -294,14 +309,14 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(script, capsy
     assert "marey job cancel job_1" in told
 
 
-def test_a_job_that_is_not_waited_for_is_named(script, capsys):
+def test_a_job_that_is_not_waited_for_is_named(script: Any, capsys: pytest.CaptureFixture[str]) -> None:
     submitted = a_job(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
     assert follow(script.marey(), submitted, wait=False) is None
     assert capsys.readouterr().out == "job_1\n"
     assert script.requests == []
 
 
-def test_results_are_counted_as_people_count(capsys):
+def test_results_are_counted_as_people_count(capsys: pytest.CaptureFixture[str]) -> None:
     aligned = {
         "name": "walk", "frames": 1, "cost": 0.0, "least_slope": 1.0, "greatest_slope": 1.0,
     }  # fmt: skip
@@ -314,17 +329,21 @@ def test_results_are_counted_as_people_count(capsys):
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(as_json, capsys):
+def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(
+    as_json: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     result = {"clips": 0, "labels": {}, "refused": [{"name": "walk", "code": "no-feet", "detail": "it has no feet"}]}
     with pytest.raises(Refused):
         print_ended(a_job(id="job_1", result=result), as_json, print_labelled)
     assert "it has no feet" in "".join(capsys.readouterr())
 
 
-def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_path, capsys):
+def test_who_interrupts_an_upload_is_told_how_to_go_on(
+    script: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "walk.bvh").write_text("x")
 
-    def interrupt(_request):
+    def interrupt(_request: httpx.Request) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(files, "connect", lambda context: script.marey())
@@ -334,7 +353,9 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(script, monkeypatch, tmp_
     assert "the same command again sends only what is missing" in capsys.readouterr().err
 
 
-def test_a_token_whose_file_cannot_be_written_is_never_made(script, make_problem, monkeypatch, tmp_path):
+def test_a_token_whose_file_cannot_be_written_is_never_made(
+    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "there").write_text("precious")
     monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
     with pytest.raises(FileExistsError):
@@ -355,33 +376,35 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(script, make_problem
         (("user", "create", "ada"), "standard"),
     ],
 )
-def test_without_a_terminal_nobody_is_asked_and_one_line_says_what_to_do(arguments, told, nowhere):
+def test_without_a_terminal_nobody_is_asked_and_one_line_says_what_to_do(
+    arguments: tuple[Any, ...], told: str, nowhere: dict[str, str]
+) -> None:
     done = marey(*arguments, env=nowhere)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert told in done.stderr
 
 
-def test_a_password_may_be_piped(nowhere):
+def test_a_password_may_be_piped(nowhere: dict[str, str]) -> None:
     done = marey("login", "--name", "ada", env=nowhere, stdin="correct horse battery\n")
     assert done.returncode == 1
     assert done.stderr.startswith("marey: http://127.0.0.1:9 does not answer")
 
 
 @pytest.mark.parametrize("command", ["download", "sample", "search", "report", "evaluate", "compare"])
-def test_where_files_go_is_called_the_same_by_every_command(command):
+def test_where_files_go_is_called_the_same_by_every_command(command: str) -> None:
     told = marey(command, "--help").stdout
     assert all(name in told for name in ("--out", "--output", "-o"))
 
 
-def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys):
+def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys: pytest.CaptureFixture[str]) -> None:
     for empty, told in ((["raw/walk"], "in raw/walk"), (["raw/a", "raw/b"], "in 2 clips, such as raw/a")):
         job = a_job(result={"empty": empty})
         _tell_shortfalls(PipelineRun(None, {"annotate": job}))
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 
 
-def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere):
+def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere: dict[str, str]) -> None:
     script = f"{shlex.quote(sys.executable)} -m marey_client.cli --show-completion; exit $?"
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, env={**os.environ, **nowhere})
     assert done.returncode == 0, done.stderr
@@ -389,12 +412,14 @@ def test_completion_is_offered_for_the_shell_that_starts_the_command(nowhere):
     assert "marey" in done.stdout
 
 
-def test_version_is_told():
+def test_version_is_told() -> None:
     done = marey("--version")
     assert done.stdout.startswith("marey ")
 
 
-def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_second(monkeypatch, capsys):
+def test_at_a_narrow_terminal_ids_stay_in_one_piece_and_moments_are_told_to_the_second(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     an_id = "token_01m80ke8tqf73e4b2grvtajq5j"

@@ -1,12 +1,15 @@
 """Performances as the SDK sends them: where the last answer left them, each frame once."""
 
+from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
 from marey_client.errors import Conflict, RequestFailed
+from marey_client.handles.coverage_streams import CoverageStreamHandle, CoverageStreams
 from marey_schemas.encoding.codecs import decode_tree
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
@@ -18,11 +21,11 @@ STREAM = {
 URL = "/api/v1/projects/lab/coverage-streams"
 
 
-def said(request):
+def said(request: httpx.Request) -> dict[str, Any]:
     return decode_tree(request.content, request.headers["Content-Type"])
 
 
-def counted(request):
+def counted(request: httpx.Request) -> httpx.Response:
     """Answers as a server that has taken what is said."""
     frames = said(request)
     count = sum(len(frames[name]) for name in ("poses", "roots") if name in frames)
@@ -34,17 +37,19 @@ def counted(request):
 
 
 @pytest.fixture
-def streams(script):
+def streams(script: Any) -> CoverageStreams:
     return script.marey().project("lab").coverage_streams
 
 
 @pytest.fixture
-def stream(script, streams):
+def stream(script: Any, streams: CoverageStreams) -> CoverageStreamHandle:
     script.answers = [httpx.Response(201, json=STREAM)]
     return streams.begin(60.0, skeleton="skeleton_1", turn_rates_deg_s=(-90, 0, 90))
 
 
-def test_what_is_asked_for_is_sent_and_checked_before(script, streams, stream):
+def test_what_is_asked_for_is_sent_and_checked_before(
+    script: Any, streams: CoverageStreams, stream: CoverageStreamHandle
+) -> None:
     (request,) = script.requests
     assert (request.method, request.url.path) == ("POST", URL)
     assert decode_tree(request.content, "application/json") == {
@@ -55,7 +60,7 @@ def test_what_is_asked_for_is_sent_and_checked_before(script, streams, stream):
     assert len(script.requests) == 1
 
 
-def test_frames_go_on_where_the_last_answer_left_them(script, stream):
+def test_frames_go_on_where_the_last_answer_left_them(script: Any, stream: CoverageStreamHandle) -> None:
     script.answers = [counted] * 4
     poses = np.zeros((10, 107), np.float32)
     stream.send(poses)
@@ -71,7 +76,7 @@ def test_frames_go_on_where_the_last_answer_left_them(script, stream):
     assert stream.offset == 20
 
 
-def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(script, stream):
+def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(script: Any, stream: CoverageStreamHandle) -> None:
     script.answers = [httpx.ReadError("connection reset"), counted]
     stream.send(np.zeros((10, 3)))
     first, again = script.requests[1:]
@@ -79,7 +84,9 @@ def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(script, stream
     assert stream.offset == 10
 
 
-def test_frames_that_are_refused_leave_the_offset_where_it_was(script, stream, make_problem):
+def test_frames_that_are_refused_leave_the_offset_where_it_was(
+    script: Any, stream: CoverageStreamHandle, make_problem: Callable[..., Any]
+) -> None:
     script.answers = [make_problem(409, "coverage-offset", context={"offset": 30}), make_problem(422, "invalid")]
     with pytest.raises(Conflict) as refused:
         stream.send(np.zeros((10, 3)))
@@ -89,14 +96,16 @@ def test_frames_that_are_refused_leave_the_offset_where_it_was(script, stream, m
     assert stream.offset == 0
 
 
-def test_another_process_goes_on_with_a_stream(script, streams):
+def test_another_process_goes_on_with_a_stream(script: Any, streams: CoverageStreams) -> None:
     script.answers = [httpx.Response(200, json={**STREAM, "offset": 700}), counted]
     stream = streams.get("coverage_1")
     stream.send(np.zeros((10, 3)))
     assert said(script.requests[-1])["offset"] == 700
 
 
-def test_streams_are_listed_read_and_dropped(script, streams, stream):
+def test_streams_are_listed_read_and_dropped(
+    script: Any, streams: CoverageStreams, stream: CoverageStreamHandle
+) -> None:
     state = {
         **STREAM, "index": 0.0, "missing_s": 1.0, "targets": [], "performer": None, "seconds": [[0.0]],
         "deficit_s": [[1.0]], "delay_s": 0.5,

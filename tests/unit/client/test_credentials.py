@@ -2,6 +2,7 @@
 
 import json
 import resource
+from pathlib import Path
 
 import httpx
 import pytest
@@ -13,18 +14,20 @@ SERVER = "https://marey.example.org"
 
 
 @pytest.fixture
-def environment(tmp_path):
+def environment(tmp_path: Path) -> dict[str, str]:
     return {"XDG_CONFIG_HOME": str(tmp_path / "config"), "MAREY_DATA": str(tmp_path / "data")}
 
 
-def write_secret(path, text, mode=0o600):
+def write_secret(path: Path, text: str, mode: int = 0o600) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     path.chmod(mode)
     return path
 
 
-def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login(environment, tmp_path):
+def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
     credentials.store_login(credentials.logins_path(environment), SERVER, "stored")
     assert credentials.resolve(SERVER, None, environment).token == "stored"
     environment["MAREY_TOKEN"] = "variable"
@@ -33,12 +36,14 @@ def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login
     assert credentials.resolve(SERVER, file, environment).token == "from-file"
 
 
-def test_a_session_without_an_address_goes_where_the_command_line_goes(environment, monkeypatch):
+def test_a_session_without_an_address_goes_where_the_command_line_goes(
+    environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in {**environment, "MAREY_URL": SERVER, "MAREY_TOKEN": "variable"}.items():
         monkeypatch.setenv(name, value)
     sent = []
 
-    def answer(request):
+    def answer(request: httpx.Request) -> httpx.Response:
         sent.append(request)
         return httpx.Response(401, json={})
 
@@ -48,7 +53,7 @@ def test_a_session_without_an_address_goes_where_the_command_line_goes(environme
     assert sent[0].headers["Authorization"] == "Bearer variable"
 
 
-def test_the_server_is_the_one_named_or_the_one_logged_in_to_last(environment):
+def test_the_server_is_the_one_named_or_the_one_logged_in_to_last(environment: dict[str, str]) -> None:
     path = credentials.logins_path(environment)
     assert credentials.resolve(None, None, environment).url == credentials.DEFAULT_URL
     credentials.store_login(path, SERVER, "a")
@@ -56,7 +61,9 @@ def test_the_server_is_the_one_named_or_the_one_logged_in_to_last(environment):
     assert credentials.resolve("http://other.test/", None, environment).url == "http://other.test"
 
 
-def test_the_administrators_token_serves_only_for_a_server_on_this_machine(environment, tmp_path):
+def test_the_administrators_token_serves_only_for_a_server_on_this_machine(
+    environment: dict[str, str], tmp_path: Path
+) -> None:
     write_secret(tmp_path / "data" / "admin.token", "local")
     assert credentials.resolve("http://127.0.0.1:8460", None, environment).token == "local"
     assert credentials.resolve(SERVER, None, environment).token is None
@@ -65,7 +72,9 @@ def test_the_administrators_token_serves_only_for_a_server_on_this_machine(envir
 @pytest.mark.parametrize(
     ("settings", "found"), [("data = 'kept'", "marey_local"), ("data = [", None), ("data = 3", None)]
 )
-def test_the_data_folder_that_settings_name_is_known_here_too(environment, tmp_path, monkeypatch, settings, found):
+def test_the_data_folder_that_settings_name_is_known_here_too(
+    environment: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: str, found: str | None
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "admin.token").write_text("marey_local\n")
@@ -75,7 +84,7 @@ def test_the_data_folder_that_settings_name_is_known_here_too(environment, tmp_p
     assert credentials.resolve("http://localhost:8460", None, without_data).token == found
 
 
-def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environment):
+def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environment: dict[str, str]) -> None:
     path = credentials.logins_path(environment)
     credentials.store_login(path, SERVER, "secret")
     assert path.stat().st_mode & 0o777 == 0o600
@@ -94,18 +103,20 @@ def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environme
         ("tökén", 0o600, "no token"),
     ],
 )
-def test_files_that_hold_no_token_or_that_others_can_read_are_refused(tmp_path, text, mode, reason):
+def test_files_that_hold_no_token_or_that_others_can_read_are_refused(
+    tmp_path: Path, text: str, mode: int, reason: str
+) -> None:
     with pytest.raises(errors.BadCredentialFile, match=reason):
         credentials.read_secret(write_secret(tmp_path / "token", text, mode))
 
 
-def test_a_damaged_file_of_logins_is_an_error_that_says_what_to_do(environment):
+def test_a_damaged_file_of_logins_is_an_error_that_says_what_to_do(environment: dict[str, str]) -> None:
     path = write_secret(credentials.logins_path(environment), json.dumps({"tokens": 3}))
     with pytest.raises(errors.BadCredentialFile, match="log in again"):
         credentials.read_logins(path)
 
 
-def test_tokens_do_not_show_in_representations(environment):
+def test_tokens_do_not_show_in_representations(environment: dict[str, str]) -> None:
     environment["MAREY_TOKEN"] = "secret-token"
     credentials.store_login(credentials.logins_path(environment), SERVER, "secret-token")
     found = credentials.resolve(SERVER, None, environment)
@@ -113,7 +124,7 @@ def test_tokens_do_not_show_in_representations(environment):
     assert "secret-token" not in repr(credentials.read_logins(credentials.logins_path(environment)))
 
 
-def test_a_login_that_there_is_no_room_for_leaves_no_token_behind(tmp_path):
+def test_a_login_that_there_is_no_room_for_leaves_no_token_behind(tmp_path: Path) -> None:
     path = tmp_path / "credentials.json"
     credentials.store_login(path, SERVER, "kept")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

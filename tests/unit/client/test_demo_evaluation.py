@@ -1,24 +1,27 @@
 """Recognition of locomotion clips in the demonstration."""
 
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from marey_client.cli.demo.evaluation import DemoEvaluation, travels
+from marey_client.handles.clips import ClipHandle
+from marey_motion.arrays import Floats
 
 RATE_HZ = 30.0
 
 
-def clip(path_m):
+def clip(path_m: Floats) -> ClipHandle:
     """A clip whose root goes along `path_m`, (frames, 3)."""
     translations = np.asarray(path_m, dtype=np.float32)
     summary = {"frames": len(translations), "frame_rate_hz": RATE_HZ}
     motion = SimpleNamespace(root_translations=translations)
-    return SimpleNamespace(item=SimpleNamespace(summary=summary), motion=lambda joints: motion)
+    return cast(ClipHandle, SimpleNamespace(item=SimpleNamespace(summary=summary), motion=lambda joints: motion))
 
 
-def walk(speed_m_s, seconds):
+def walk(speed_m_s: float, seconds: float) -> Floats:
     path = np.zeros((round(seconds * RATE_HZ), 3))
     path[:, 2] = speed_m_s * np.arange(len(path)) / RATE_HZ
     return path
@@ -37,10 +40,10 @@ def walk(speed_m_s, seconds):
     ],
     ids=["walk", "shuffle", "too short", "walk and stop", "mostly standing", "jitter", "rising"],
 )
-def test_locomotion_is_what_covers_ground_most_of_the_time(path, expected):
+def test_locomotion_is_what_covers_ground_most_of_the_time(path: Floats, expected: bool) -> None:
     assert travels(clip(path), "hips") is expected
 
 
-def test_it_is_said_where_there_was_nothing_to_evaluate():
+def test_it_is_said_where_there_was_nothing_to_evaluate() -> None:
     nothing = DemoEvaluation(clips=7, chosen=0)
     assert "None of 7 retargeted clips is locomotion" in nothing.sentence

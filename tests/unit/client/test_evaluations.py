@@ -3,6 +3,7 @@
 import json
 import math
 from datetime import UTC, datetime
+from typing import Any
 
 import httpx
 import numpy as np
@@ -17,19 +18,19 @@ from marey_schemas.jobs import CollectionInput, Job, Progress
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
 
 
-def clip(name, *, skeleton="skeleton_1", tags=()):
+def clip(name: str, *, skeleton: str = "skeleton_1", tags: Any = ()) -> dict[str, Any]:
     return {
         "id": f"clip_{name}", "kind": "clip", "name": name, "collection": "walks", "tags": list(tags), "revision": 1,
         "summary": {"skeleton": skeleton}, "created_at": NOW, "updated_at": NOW, "rev": 1,
     }  # fmt: skip
 
 
-def skeleton(revision):
+def skeleton(revision: int) -> dict[str, Any]:
     made = clip("s")
     return {**made, "id": "skeleton_1", "kind": "skeleton", "revision": revision, "summary": {}}
 
 
-def job(**fields):
+def job(**fields: Any) -> dict[str, Any]:
     return {
         "id": "job_1", "project": "lab", "kind": "evaluate", "state": "queued", "params": {}, "inputs": {}, "into": "",
         "priority": 0, "seed": 0, "attempt": 0, "fence": 0, "max_attempts": 3, "author": "ann", "created_at": NOW,
@@ -37,7 +38,7 @@ def job(**fields):
     }  # fmt: skip
 
 
-def answer(request):
+def answer(request: httpx.Request) -> httpx.Response:
     """A project with three clips, one tagged as a loop, of a skeleton whose mapping was edited."""
     path, query = request.url.path, dict(request.url.params)
     if path.endswith("/jobs"):
@@ -50,11 +51,11 @@ def answer(request):
     return httpx.Response(200, json={"items": found})
 
 
-def submitted(script):
+def submitted(script: Any) -> dict[str, Any]:
     return json.loads(script.requests[-1].content)
 
 
-def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(script):
+def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(script: Any) -> None:
     script.answers = [answer] * 9
     script.marey().project("lab").evaluate("walks", into="results", name="walks-eval", duration_s=10)
     sent = submitted(script)
@@ -66,7 +67,7 @@ def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(scri
     assert sent["params"] == {"name": "walks-eval", "duration_s": 10.0, "loops": ["clip_b"]}
 
 
-def test_loops_that_are_named_and_a_normaliser_are_handed_in(script):
+def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: Any) -> None:
     script.answers = [answer] * 9
     places = [CollectionInput(collection="walks")]
     script.marey().project("lab").evaluate(places, normaliser="evaluation_7", loops=["clip_a"], cache="refresh")
@@ -76,7 +77,7 @@ def test_loops_that_are_named_and_a_normaliser_are_handed_in(script):
     assert sent["cache"] == "refresh"
 
 
-def test_a_misspelt_option_is_refused_before_anything_is_sent(script):
+def test_a_misspelt_option_is_refused_before_anything_is_sent(script: Any) -> None:
     with pytest.raises(ValueError, match="durations_s"):
         script.marey().project("lab").evaluate("walks", durations_s=10)
     assert script.requests == []
@@ -98,7 +99,7 @@ DOCUMENT = {
 }
 
 
-def test_trials_and_clips_come_as_flat_rows():
+def test_trials_and_clips_come_as_flat_rows() -> None:
     (trial,) = trial_rows(DOCUMENT)
     assert trial["trial"] == "circle v=1.25 w=-50"
     assert (trial["turn_rate_deg_s"], trial["offset_mean"], trial["response_s"]) == (pytest.approx(-50), 0.5, None)
@@ -107,7 +108,7 @@ def test_trials_and_clips_come_as_flat_rows():
     assert (unused["ticks"], unused["mirrored"]) == (0, True)
 
 
-def test_records_come_per_trial_with_gaps_where_a_cost_is_not_defined():
+def test_records_come_per_trial_with_gaps_where_a_cost_is_not_defined() -> None:
     cost = {"ticks": np.array([1, 3], dtype=np.int32), "values": np.array([0.25, 0.75])}
     document = {
         "trials": ["one", "two"],
@@ -137,17 +138,17 @@ def test_records_come_per_trial_with_gaps_where_a_cost_is_not_defined():
         ("1,2.5,2", (1, 2.5, 2)),
     ],
 )
-def test_ranges_hold_their_last_value_where_the_steps_meet_it(text, values):
+def test_ranges_hold_their_last_value_where_the_steps_meet_it(text: str, values: tuple[Any, ...]) -> None:
     assert read_numbers(text) == pytest.approx(values)
 
 
 @pytest.mark.parametrize("text", ["1:3", "3:1:1", "1:3:0", "fast", "1:3:0.25:2", "1:2,3:1", "0:1:0.0001", ""])
-def test_ranges_that_make_no_sense_are_refused_with_what_to_write(text):
+def test_ranges_that_make_no_sense_are_refused_with_what_to_write(text: str) -> None:
     with pytest.raises(WrongUsage, match=r"write|range|values"):
         read_numbers(text)
 
 
-def test_progress_of_tasks_is_shown_in_trials():
+def test_progress_of_tasks_is_shown_in_trials() -> None:
     told = []
     running = Job.model_validate(
         job(state="running", size=4, children={"succeeded": 1}, progress=Progress(done=1.5, total=4).model_dump())

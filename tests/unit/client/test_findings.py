@@ -1,6 +1,7 @@
 """Findings of jobs on evaluations in the SDK and on the command line."""
 
 import json
+from typing import Any
 
 import httpx
 import pytest
@@ -15,7 +16,7 @@ NOW = "2026-01-01T00:00:00Z"
 DOCUMENT = json.dumps({"schema": "marey/suggestions@1"}).encode()
 
 
-def evaluation(script, name):
+def evaluation(script: Any, name: str) -> EvaluationHandle:
     item = Item(
         id=f"evaluation_{name}",
         kind="evaluation",
@@ -29,7 +30,7 @@ def evaluation(script, name):
     return EvaluationHandle(script.marey().transport, "lab", item)
 
 
-def answer(request):
+def answer(request: httpx.Request) -> httpx.Response:
     if "/blobs/" in request.url.path:
         return httpx.Response(200, content=DOCUMENT)
     job = {
@@ -41,7 +42,7 @@ def answer(request):
     return httpx.Response(200, json=job)
 
 
-def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(script):
+def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(script: Any) -> None:
     script.answers = [answer] * 3
     found = evaluation(script, "first").suggest("others", removals=3)
     assert json.loads(script.requests[0].content) == {
@@ -58,13 +59,13 @@ def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_w
         found.report()
 
 
-def test_a_comparison_in_which_nothing_changed_says_so(capsys):
+def test_a_comparison_in_which_nothing_changed_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     lists: dict[str, list[str]] = {name: [] for name in ("changed", "metrics", "removed", "added", "newly_unused")}
     _print_comparison({**lists, "trials": 162})
     assert "No trial changed: all 162 are the same to the last bit." in capsys.readouterr().out
 
 
-def test_weights_of_the_objective_are_read_by_name():
+def test_weights_of_the_objective_are_read_by_name() -> None:
     weight = next(one for one in OPTIMISE.options if one.path == ("objective",))
     assert weight.spellings == ("--objective", "--weight")
     assert weight.read(["seconds=0.001", "offset=2"]) == {"seconds": 0.001, "offset": 2.0}

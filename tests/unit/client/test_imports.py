@@ -2,6 +2,10 @@
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -11,15 +15,15 @@ from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_file
 from marey_schemas.options.imports import ImportOptions
 
 
-def named(names, size=100):
+def named(names: list[str], size: int = 100) -> list[LocalFile]:
     return [LocalFile(name, None, size) for name in names]
 
 
-def names_of(portions):
+def names_of(portions: Iterator[Any]) -> list[list[str]]:
     return [[file.name for file in portion] for portion in portions]
 
 
-def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path):
+def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path: Path) -> None:
     for name in ("b/walk.bvh", "a/01.asf", "a/01_01.AMC", "notes.txt", ".hidden/x.bvh", "b/.y.bvh"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x")
@@ -28,13 +32,13 @@ def test_folders_are_searched_and_other_files_are_named_as_left_out(tmp_path):
     assert [path.name for path in found.left_out] == ["notes.txt"]
 
 
-def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path):
+def test_a_file_named_itself_is_taken_whatever_it_is(tmp_path: Path) -> None:
     path = tmp_path / "odd.ending"
     path.write_text("x")
     assert [file.name for file in find_files([path]).files] == ["odd.ending"]
 
 
-def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently(tmp_path):
+def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently(tmp_path: Path) -> None:
     for name in ("monday/walk.bvh", "tuesday/walk.bvh"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text("x")
@@ -45,18 +49,18 @@ def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently
 
 
 @pytest.mark.parametrize("name", ["clip.bson", "clip.BSON.bz2", "clip.npz", "clip.json"])
-def test_every_format_with_a_reader_is_found_in_a_folder(tmp_path, name):
+def test_every_format_with_a_reader_is_found_in_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("x")
     assert [file.name for file in find_files([tmp_path]).files] == [name]
 
 
 @pytest.mark.parametrize("place", ["absent", "."])
-def test_places_without_motion_are_an_error_that_says_so(tmp_path, place):
+def test_places_without_motion_are_an_error_that_says_so(tmp_path: Path, place: str) -> None:
     with pytest.raises(errors.NothingToUpload, match=r"does not exist|no motion files"):
         find_files([tmp_path / place])
 
 
-def test_every_amc_travels_with_the_asf_of_its_folder():
+def test_every_amc_travels_with_the_asf_of_its_folder() -> None:
     takes = [f"16/16_{number:03d}.amc" for number in range(2 * FILES_PER_IMPORT)]
     portions = names_of(batches(named(["16/16.asf", *takes])))
     assert len(portions) > 2
@@ -64,7 +68,7 @@ def test_every_amc_travels_with_the_asf_of_its_folder():
     assert sorted(name for portion in portions for name in portion if name != "16/16.asf") == takes
 
 
-def test_files_that_differ_in_their_ending_alone_stay_together():
+def test_files_that_differ_in_their_ending_alone_stay_together() -> None:
     names = [f"t/{number:03d}.{ending}" for number in range(FILES_PER_IMPORT) for ending in ("bvh", "npz")]
     for portion in names_of(batches(named(names))):
         stems = [name.partition(".")[0] for name in portion]
@@ -72,17 +76,17 @@ def test_files_that_differ_in_their_ending_alone_stay_together():
         assert len(portion) <= FILES_PER_IMPORT
 
 
-def test_large_files_make_small_portions():
+def test_large_files_make_small_portions() -> None:
     portions = names_of(batches(named([f"{number}.bvh" for number in range(6)], size=40 << 20)))
     assert [len(portion) for portion in portions] == [1] * 6
 
 
-def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(script, tmp_path):
+def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(script: Any, tmp_path: Path) -> None:
     for name in ("a.bvh", "b.bvh", "copy-of-b.bvh", "c.bvh"):
         (tmp_path / name).write_text(name.removeprefix("copy-of-"))
     sent, imported = [], []
 
-    def answer(request):
+    def answer(request: httpx.Request) -> httpx.Response:
         if request.method == "PUT":
             sent.append(request.content)
             return httpx.Response(204)
@@ -119,11 +123,13 @@ def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(scrip
 
 
 @pytest.mark.parametrize(("name", "shown"), [(b"caf\xe9.bvh", r"caf\udce9.bvh"), (b"new\nline.bvh", r"new\nline.bvh")])
-def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(script, tmp_path, name, shown):
+def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(
+    script: Any, tmp_path: Path, name: bytes, shown: str
+) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     (tmp_path / os.fsdecode(name)).write_text("y")
 
-    def answer(request):
+    def answer(request: httpx.Request) -> httpx.Response:
         body = json.loads(request.content)
         if request.url.path.endswith("/blobs/missing"):
             return httpx.Response(200, json={"missing": []})
@@ -142,12 +148,14 @@ def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(scri
         lab.imports.send(files)
 
 
-def test_a_folder_that_cannot_be_read_is_never_passed_over_in_silence(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_read_is_never_passed_over_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     (tmp_path / "locked").mkdir()
     scan = os.scandir
 
-    def scan_all_but_one(folder):
+    def scan_all_but_one(folder: str) -> AbstractContextManager[Iterator[os.DirEntry[str]]]:
         if os.fspath(folder).endswith("locked"):
             raise PermissionError(13, "Permission denied", folder)
         return scan(folder)
@@ -157,7 +165,7 @@ def test_a_folder_that_cannot_be_read_is_never_passed_over_in_silence(tmp_path, 
         find_files([tmp_path])
 
 
-def test_places_may_be_texts_and_are_named_where_they_hold_no_motion(tmp_path):
+def test_places_may_be_texts_and_are_named_where_they_hold_no_motion(tmp_path: Path) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     assert [file.name for file in find_files([str(tmp_path)]).files] == ["walk.bvh"]
     (tmp_path / "empty").mkdir()
@@ -165,7 +173,7 @@ def test_places_may_be_texts_and_are_named_where_they_hold_no_motion(tmp_path):
         find_files(iter([str(tmp_path / "empty")]))
 
 
-def test_an_asf_never_travels_without_the_amc_files_that_need_it():
+def test_an_asf_never_travels_without_the_amc_files_that_need_it() -> None:
     others = [f"a/{number:03d}.bvh" for number in range(FILES_PER_IMPORT - 1)]
     names = [*others, "b/b.asf", "b/b_01.amc", "b/b_02.amc", "c/c.asf"]
     portions = names_of(batches(named(names)))

@@ -1,6 +1,7 @@
 """Waiting for jobs, and explanations of their states."""
 
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import httpx
 import pytest
@@ -12,7 +13,7 @@ from marey_schemas.jobs import Attempt, Job
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-def job(**members):
+def job(**members: Any) -> Job:
     given = {
         "id": "job_1", "project": "lab", "kind": "retarget", "state": "queued", "params": {}, "inputs": {}, "into": "",
         "priority": 0, "seed": 0, "attempt": 0, "fence": 0, "max_attempts": 3, "author": "ada", "created_at": NOW,
@@ -21,11 +22,11 @@ def job(**members):
     return Job.model_validate({**given, **members})
 
 
-def answer(**members):
+def answer(**members: Any) -> httpx.Response:
     return httpx.Response(200, content=job(**members).model_dump_json())
 
 
-def test_waiting_ends_with_the_job_and_tells_its_progress(script):
+def test_waiting_ends_with_the_job_and_tells_its_progress(script: Any) -> None:
     script.answers = [answer(), answer(state="running", progress={"done": 1, "total": 2}), answer(state="succeeded")]
     seen = []
     ended = script.marey().jobs.wait("job_1", on_progress=lambda now: seen.append(now.state))
@@ -33,7 +34,7 @@ def test_waiting_ends_with_the_job_and_tells_its_progress(script):
     assert seen == ["queued", "running", "succeeded"]
 
 
-def test_a_job_that_failed_raises_with_its_reason(script):
+def test_a_job_that_failed_raises_with_its_reason(script: Any) -> None:
     failure = {"reason": "error", "code": "no-mapping", "detail": "nothing maps"}
     script.answers = [answer(state="failed", failure=failure)] * 2
     jobs = script.marey().jobs
@@ -43,7 +44,7 @@ def test_a_job_that_failed_raises_with_its_reason(script):
     assert jobs.wait("job_1", require_success=False).state == "failed"
 
 
-def test_waiting_gives_up_when_told_to(script):
+def test_waiting_gives_up_when_told_to(script: Any) -> None:
     script.answers = [answer(state="running")] * 100
     with pytest.raises(errors.WaitedTooLong, match="still running"):
         script.marey().jobs.wait("job_1", timeout_s=0.01)
@@ -62,10 +63,10 @@ def test_waiting_gives_up_when_told_to(script):
         ({"state": "succeeded", "cached_from": "job_0"}, [], "job_0"),
     ],
 )
-def test_every_state_has_its_reason(members, running, expected):
+def test_every_state_has_its_reason(members: dict[str, Any], running: list[Job], expected: str) -> None:
     assert expected in explain(job(**members), [], running, NOW)[0]
 
 
-def test_earlier_attempts_are_told(script):
+def test_earlier_attempts_are_told(script: Any) -> None:
     lost = Attempt(job="job_1", fence=1, worker="w1", started_at=NOW, ended_at=NOW, outcome="lost", detail=None)
     assert "attempt 1 on w1 was lost" in explain(job(), [lost], [], NOW)

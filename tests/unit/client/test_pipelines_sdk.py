@@ -1,7 +1,9 @@
 """Pipelines as their submitters follow them."""
 
 import json
+from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import Any
 
 import httpx
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from marey_client import errors
 from marey_client.cli.pipelines import follow_run
 from marey_client.explanations import explain
+from marey_client.handles.pipelines import PipelineRun
 from marey_schemas.jobs import Job
 from marey_schemas.pipelines import PipelineCreate
 
@@ -18,7 +21,7 @@ TWO = PipelineCreate.model_validate(
 )
 
 
-def job(name, **members):
+def job(name: str, **members: Any) -> dict[str, Any]:
     given = {
         "id": f"job_{name}", "project": "lab", "kind": "retarget", "state": "queued", "params": {}, "inputs": {},
         "into": "", "priority": 0, "seed": 0, "attempt": 0, "fence": 0, "max_attempts": 3, "author": "ada",
@@ -27,21 +30,21 @@ def job(name, **members):
     return Job.model_validate({**given, **members}).model_dump(mode="json")
 
 
-def answer(tree):
+def answer(tree: dict[str, Any]) -> httpx.Response:
     return httpx.Response(200, content=json.dumps(tree))
 
 
-def submitted(script, **states):
+def submitted(script: Any, **states: Any) -> PipelineRun:
     made = {"jobs": {name: job(name, state=state) for name, state in states.items()}}
     script.answers = [httpx.Response(202, content=json.dumps(made))]
     return script.marey().project("lab").pipeline(TWO)
 
 
-def failed(reason="error", detail="crooked"):
+def failed(reason: str = "error", detail: str = "crooked") -> dict[str, Any]:
     return {"state": "failed", "failure": {"reason": reason, "code": "bad", "detail": detail}}
 
 
-def test_a_pipeline_is_handed_in_once_and_known_by_its_steps(script):
+def test_a_pipeline_is_handed_in_once_and_known_by_its_steps(script: Any) -> None:
     run = submitted(script, a="queued", b="waiting")
     (request,) = script.requests
     assert (request.method, request.url.path) == ("POST", "/api/v1/projects/lab/pipelines")
@@ -53,7 +56,7 @@ def test_a_pipeline_is_handed_in_once_and_known_by_its_steps(script):
     assert not run.ended
 
 
-def test_waiting_ends_with_the_last_job_and_asks_no_more_for_those_that_have_ended(script):
+def test_waiting_ends_with_the_last_job_and_asks_no_more_for_those_that_have_ended(script: Any) -> None:
     run = submitted(script, a="running", b="waiting")
     script.answers = [
         answer(job("a", state="succeeded")),
@@ -66,13 +69,13 @@ def test_waiting_ends_with_the_last_job_and_asks_no_more_for_those_that_have_end
     assert {one.state for one in ended.values()} == {"succeeded"}
 
 
-def test_a_pipeline_that_was_computed_before_needs_no_waiting(script):
+def test_a_pipeline_that_was_computed_before_needs_no_waiting(script: Any) -> None:
     run = submitted(script, a="succeeded", b="succeeded")
     assert run.wait().keys() == {"a", "b"}
     assert len(script.requests) == 1
 
 
-def test_the_step_that_failed_by_itself_is_named_not_those_that_followed(script):
+def test_the_step_that_failed_by_itself_is_named_not_those_that_followed(script: Any) -> None:
     run = submitted(script, a="running", b="waiting")
     script.answers = [answer(job("a", **failed())), answer(job("b", **failed("dependency_failed", "needs job_a")))]
     with pytest.raises(errors.JobUnsuccessful, match=r"step a \(job_a\) failed \(bad\): crooked") as caught:
@@ -80,14 +83,14 @@ def test_the_step_that_failed_by_itself_is_named_not_those_that_followed(script)
     assert caught.value.job.id == "job_a"
 
 
-def test_waiting_gives_up_when_told_to_and_says_what_goes_on(script):
+def test_waiting_gives_up_when_told_to_and_says_what_goes_on(script: Any) -> None:
     run = submitted(script, a="running", b="waiting")
     script.answers = [answer(job("a", state="running")), answer(job("b", state="waiting"))] * 100
     with pytest.raises(errors.WaitedTooLong, match="have not ended: a, b"):
         run.wait(timeout_s=0.01)
 
 
-def test_cancelling_asks_every_job_that_has_not_ended(script):
+def test_cancelling_asks_every_job_that_has_not_ended(script: Any) -> None:
     run = submitted(script, a="succeeded", b="running")
     stopping = answer(job("b", state="cancelled"))
     script.answers = [answer(job("b", state="running")), stopping, stopping]
@@ -97,7 +100,9 @@ def test_cancelling_asks_every_job_that_has_not_ended(script):
     ]
 
 
-def test_the_last_jobs_are_cancelled_first_and_one_that_ended_meanwhile_is_no_error(script, make_problem):
+def test_the_last_jobs_are_cancelled_first_and_one_that_ended_meanwhile_is_no_error(
+    script: Any, make_problem: Callable[..., Any]
+) -> None:
     run = submitted(script, a="running", b="waiting")
     gone = make_problem(409, "job-ended")
     script.answers = [answer(job("a", state="running")), answer(job("b", state="waiting")), gone]
@@ -107,7 +112,7 @@ def test_the_last_jobs_are_cancelled_first_and_one_that_ended_meanwhile_is_no_er
     assert stopped == ["/api/v1/jobs/job_b/cancel", "/api/v1/jobs/job_a/cancel"]
 
 
-def test_why_a_job_waits_is_told_with_those_it_waits_for(script):
+def test_why_a_job_waits_is_told_with_those_it_waits_for(script: Any) -> None:
     waiting = Job.model_validate(
         job("b", state="waiting", after=["job_a", "job_c"], inputs={"clips": [{"job": "job_a"}]})
     )
@@ -115,7 +120,7 @@ def test_why_a_job_waits_is_told_with_those_it_waits_for(script):
     assert "job_a, which makes its inputs and job_c" in told
 
 
-def test_a_failed_step_is_told_in_one_line(script, capsys):
+def test_a_failed_step_is_told_in_one_line(script: Any, capsys: pytest.CaptureFixture[str]) -> None:
     run = submitted(script, a="queued", b="waiting")
     several = failed(detail="ValueError: crooked\n  in two places; the job's log tells where")
     script.answers = [answer(job("a", **several)), answer(job("b", **failed("dependency_failed", "a is failed")))]

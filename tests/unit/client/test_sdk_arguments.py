@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -29,7 +31,7 @@ JOB = {
 }  # fmt: skip
 
 
-def test_folders_and_files_may_be_named_by_texts(script, tmp_path):
+def test_folders_and_files_may_be_named_by_texts(script: Any, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, json=CLIP), httpx.Response(200, content=b"motion")]
     clip = script.marey().project("lab").clips.get("clip_1")
     written = clip.export(f"{tmp_path}/out", format="bvh")
@@ -37,7 +39,7 @@ def test_folders_and_files_may_be_named_by_texts(script, tmp_path):
     assert written.read_bytes() == b"motion"
 
 
-def test_poses_that_were_read_are_put_back_as_the_next_revision(script):
+def test_poses_that_were_read_are_put_back_as_the_next_revision(script: Any) -> None:
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
         "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
@@ -60,7 +62,7 @@ def test_poses_that_were_read_are_put_back_as_the_next_revision(script):
     assert script.requests[-1].headers["If-Match"] == '"4.json"'
 
 
-def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script):
+def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script: Any) -> None:
     page = {"items": [CLIP], "next_cursor": None}
     answers = [httpx.Response(200, json=answer) for answer in (page, SKELETON)]
     script.answers = [*answers, httpx.Response(202, json=JOB)]
@@ -69,7 +71,7 @@ def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script
     assert asked["inputs"] == {"clips": [{"collection": "raw"}], "skeleton": {"item": "skeleton_2"}}
 
 
-def test_a_disk_that_is_full_is_told_with_the_file_that_did_not_fit(tmp_path):
+def test_a_disk_that_is_full_is_told_with_the_file_that_did_not_fit(tmp_path: Path) -> None:
     with (
         pytest.raises(OSError, match=r"No space left on device: '.*walk\.bvh'"),
         saved_atomically(tmp_path / "walk.bvh"),
@@ -79,8 +81,8 @@ def test_a_disk_that_is_full_is_told_with_the_file_that_did_not_fit(tmp_path):
 
 
 def test_a_file_that_arrives_has_the_mode_that_the_process_gives_without_the_mask_being_changed_meanwhile(
-    tmp_path, monkeypatch
-):
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mask = os.umask(0o027)
     monkeypatch.setattr(os, "umask", None)  # it is the whole process's: other threads would get it
     try:
@@ -92,18 +94,18 @@ def test_a_file_that_arrives_has_the_mode_that_the_process_gives_without_the_mas
     assert (tmp_path / "walk.bvh").stat().st_mode & 0o777 == 0o640
 
 
-def test_a_folder_in_the_place_of_a_file_that_arrives_is_told_and_nothing_is_left_beside_it(tmp_path):
+def test_a_folder_in_the_place_of_a_file_that_arrives_is_told_and_nothing_is_left_beside_it(tmp_path: Path) -> None:
     (tmp_path / "walk.bvh").mkdir()
     with pytest.raises(OSError, match=r"walk\.bvh"), saved_atomically(tmp_path / "walk.bvh"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["walk.bvh"]
 
 
-def query_of(request):
+def query_of(request: httpx.Request) -> dict[str, str]:
     return dict(request.url.params)
 
 
-def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script):
+def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script: Any) -> None:
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
         "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
@@ -123,7 +125,7 @@ def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_let
         assert list(sent["tags"]) == ["walk"]
 
 
-def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(script, tmp_path):
+def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(script: Any, tmp_path: Path) -> None:
     digest = "sha256:" + "0" * 64
     script.answers = [httpx.Response(200, json={"missing": [digest]})]
     assert script.marey().blobs.missing(digest) == {digest}

@@ -3,6 +3,8 @@
 import logging
 import pickle
 import ssl
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -53,25 +55,25 @@ VEru/ol8c8Mat9GZhtw5uz64dC0mkMJ4V3Gvp8l9h3WN8Nlgd3pVcpF2FwWPH2cI
 """
 
 
-def ok(document, status=200):
+def ok(document: dict[str, Any], status: int = 200) -> httpx.Response:
     return httpx.Response(status, json=document)
 
 
-def test_a_read_is_sent_again_when_the_connection_is_lost(script):
+def test_a_read_is_sent_again_when_the_connection_is_lost(script: Any) -> None:
     script.answers = [LOST, NEVER_CONNECTED, ok(PROJECT)]
     assert script.marey().project("lab").read().name == "lab"
     assert len(script.waited) == 2
 
 
 @pytest.mark.parametrize("name", ["a\n", "a?b=c", "a#b", "a%00", "é", "a b"])
-def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script, name):
+def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script: Any, name: str) -> None:
     script.answers = [ok(PROJECT)]
     script.marey().project(name).read()
     assert script.requests[0].url.path == f"/api/v1/projects/{name}"
     assert not script.requests[0].url.query
 
 
-def test_a_post_is_sent_again_under_the_same_idempotency_key(script):
+def test_a_post_is_sent_again_under_the_same_idempotency_key(script: Any) -> None:
     script.answers = [LOST, ok(PROJECT, 201), ok(PROJECT)]
     script.marey().create_project(ProjectCreate(name="lab"))
     keys = {request.headers["Idempotency-Key"] for request in script.requests}
@@ -79,7 +81,7 @@ def test_a_post_is_sent_again_under_the_same_idempotency_key(script):
     assert len(keys) == 1
 
 
-def test_two_posts_have_two_keys(script):
+def test_two_posts_have_two_keys(script: Any) -> None:
     script.answers = [ok(PROJECT, 201), ok(PROJECT, 201)]
     marey = script.marey()
     for _ in range(2):
@@ -87,7 +89,7 @@ def test_two_posts_have_two_keys(script):
     assert len({request.headers["Idempotency-Key"] for request in script.requests}) == 2
 
 
-def test_a_change_whose_answer_was_lost_is_not_sent_twice(script):
+def test_a_change_whose_answer_was_lost_is_not_sent_twice(script: Any) -> None:
     script.answers = [ok(ITEM), LOST]
     clip = script.marey().project("lab").clips.get("clip_1")
     with pytest.raises(errors.Unreachable):
@@ -95,20 +97,20 @@ def test_a_change_whose_answer_was_lost_is_not_sent_twice(script):
     assert len(script.requests) == 2
 
 
-def test_a_change_that_never_arrived_is_sent_again(script):
+def test_a_change_that_never_arrived_is_sent_again(script: Any) -> None:
     script.answers = [ok(ITEM), NEVER_CONNECTED, ok({**ITEM, "name": "run", "rev": 5})]
     clip = script.marey().project("lab").clips.get("clip_1")
     assert clip.change(ItemChange(name="run")).name == "run"
     assert script.requests[-1].headers["If-Match"] == '"4.json"'
 
 
-def test_a_token_is_not_made_twice(script):
+def test_a_token_is_not_made_twice(script: Any) -> None:
     script.answers = [LOST]
     with pytest.raises(errors.Unreachable):
         script.marey().tokens.create(TokenCreate(name="ci"))
 
 
-def test_a_busy_server_is_waited_for_as_long_as_it_asks(script, make_problem):
+def test_a_busy_server_is_waited_for_as_long_as_it_asks(script: Any, make_problem: Callable[..., Any]) -> None:
     script.answers = [
         make_problem(503, "unavailable", retry_after=7),
         make_problem(429, "too-many-requests"),
@@ -119,7 +121,7 @@ def test_a_busy_server_is_waited_for_as_long_as_it_asks(script, make_problem):
     assert script.waited[1] < 7
 
 
-def test_trying_again_ends(script):
+def test_trying_again_ends(script: Any) -> None:
     script.answers = [ok(PROJECT), *[LOST] * 10]
     project = script.marey(retries=Retries(tries=5, sleep=script.waited.append)).project("lab")
     project.read()
@@ -128,7 +130,7 @@ def test_trying_again_ends(script):
     assert len(script.requests) == 1 + 5
 
 
-def test_a_server_that_was_never_there_is_given_up_sooner(script):
+def test_a_server_that_was_never_there_is_given_up_sooner(script: Any) -> None:
     script.answers = [NEVER_CONNECTED] * 10
     with pytest.raises(errors.Unreachable):
         script.marey().project("lab").read()
@@ -150,7 +152,9 @@ def test_a_server_that_was_never_there_is_given_up_sooner(script):
         (507, "storage-full", errors.StorageFull),
     ],
 )
-def test_problems_become_errors_by_code_and_status(script, make_problem, status, code, expected):
+def test_problems_become_errors_by_code_and_status(
+    script: Any, make_problem: Callable[..., Any], status: int, code: str, expected: type[errors.RequestFailed]
+) -> None:
     field = {"pointer": "/name", "code": "taken", "detail": "is taken"}
     script.answers = [make_problem(status, code, errors=[field], context={"revision": 3})]
     with pytest.raises(expected) as caught:
@@ -161,20 +165,20 @@ def test_problems_become_errors_by_code_and_status(script, make_problem, status,
     assert caught.value.context == {"revision": 3}
 
 
-def test_an_error_of_something_in_between_is_told_too(script):
+def test_an_error_of_something_in_between_is_told_too(script: Any) -> None:
     script.answers = [httpx.Response(413, text="<html>too large</html>")]
     with pytest.raises(errors.TooLarge, match="413"):
         script.marey().project("lab").read()
 
 
 @pytest.mark.parametrize("media_type", ["text/html", "application/problem+json"])
-def test_an_error_of_another_server_names_the_address_and_asks_about_it(script, media_type):
+def test_an_error_of_another_server_names_the_address_and_asks_about_it(script: Any, media_type: str) -> None:
     script.answers = [httpx.Response(404, content=b'{"title": "?"}', headers={"Content-Type": media_type})]
     with pytest.raises(errors.NotFound, match=r"http://server\.test/ answered 404 .*is it the right address"):
         script.marey().project("lab").read()
 
 
-def test_errors_survive_the_way_from_one_process_to_another(script, make_problem):
+def test_errors_survive_the_way_from_one_process_to_another(script: Any, make_problem: Callable[..., Any]) -> None:
     wrong = [{"pointer": "/name", "code": "bad", "detail": "too long"}]
     script.answers = [make_problem(422, "invalid", detail="No.", errors=wrong)]
     with pytest.raises(errors.Invalid) as refused:
@@ -185,18 +189,18 @@ def test_errors_survive_the_way_from_one_process_to_another(script, make_problem
     assert (str(ended), ended.job) == ("it failed", {"id": "job_1"})
 
 
-def test_an_answer_of_something_else_is_no_traceback(script):
+def test_an_answer_of_something_else_is_no_traceback(script: Any) -> None:
     script.answers = [httpx.Response(200, text="<html>hello</html>")]
     with pytest.raises(errors.UnexpectedAnswer, match="not a Project"):
         script.marey().project("lab").read()
 
 
-def test_fields_that_a_newer_server_adds_are_ignored(script):
+def test_fields_that_a_newer_server_adds_are_ignored(script: Any) -> None:
     script.answers = [ok({**PROJECT, "colour": "green"})]
     assert script.marey().project("lab").read().name == "lab"
 
 
-def test_lists_are_read_page_by_page(script):
+def test_lists_are_read_page_by_page(script: Any) -> None:
     script.answers = [ok({"items": [ITEM], "next_cursor": "c1"}), ok({"items": [{**ITEM, "id": "clip_2"}]})]
     clips = script.marey().project("lab").clips.list(collection="raw", filters={"frames.gte": 10, "tag.in": None})
     assert [clip.id for clip in clips] == ["clip_1", "clip_2"]
@@ -205,7 +209,7 @@ def test_lists_are_read_page_by_page(script):
     assert "tag.in" not in script.requests[1].url.params
 
 
-def test_poses_come_as_arrays_in_blocks(script):
+def test_poses_come_as_arrays_in_blocks(script: Any) -> None:
     poses = np.arange(22, dtype="<f4").reshape(2, 11)
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
@@ -222,13 +226,13 @@ def test_poses_come_as_arrays_in_blocks(script):
 
 
 @pytest.mark.parametrize("frames", [slice(0, 10, 2), slice(-5, None)])
-def test_frames_that_a_query_cannot_say_are_refused(script, frames):
+def test_frames_that_a_query_cannot_say_are_refused(script: Any, frames: slice) -> None:
     script.answers = [ok(ITEM)]
     with pytest.raises(ValueError, match=r"frames|negative"):
         script.marey().project("lab").clips.get("clip_1").motion(frames=frames)
 
 
-def test_the_token_is_sent_and_shown_nowhere(script, caplog):
+def test_the_token_is_sent_and_shown_nowhere(script: Any, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     script.answers = [NEVER_CONNECTED, ok(PROJECT)]
     marey = script.marey()
@@ -241,14 +245,14 @@ def test_the_token_is_sent_and_shown_nowhere(script, caplog):
 
 
 @pytest.mark.parametrize("token", ["marey_secret\n", " marey_secret\r\n"])
-def test_a_token_is_sent_without_the_end_of_its_line(script, token):
+def test_a_token_is_sent_without_the_end_of_its_line(script: Any, token: str) -> None:
     script.answers = [ok({"items": [], "next_cursor": None})]
     list(Marey("http://server.test", token, http=httpx.MockTransport(script)).projects())
     assert script.requests[0].headers["Authorization"] == "Bearer marey_secret"
 
 
 @pytest.mark.parametrize("token", ["marey_secret and more", "marey_secret\nmore", "m\u00e4rey_secret", "\x1b", "  "])
-def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script, token):
+def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script: Any, token: str) -> None:
     with pytest.raises(errors.BadToken) as refused:
         Marey("http://server.test", token, http=httpx.MockTransport(script))
     assert "secret" not in str(refused.value)
@@ -256,12 +260,14 @@ def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script,
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8460", "marey.example.org", "ftp://marey.example.org", "http://"])
-def test_what_is_no_address_is_refused_before_anything_is_sent(url):
+def test_what_is_no_address_is_refused_before_anything_is_sent(url: str) -> None:
     with pytest.raises(errors.BadAddress, match="not the address of a server"):
         Marey(url, "marey_secret")
 
 
-def test_authorities_of_the_house_are_trusted_beside_the_public_ones(monkeypatch, tmp_path):
+def test_authorities_of_the_house_are_trusted_beside_the_public_ones(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delenv("SSL_CERT_FILE", raising=False)
     public = len(trusted_authorities().get_ca_certs())
     (tmp_path / "root.pem").write_text(ROOT)
@@ -276,7 +282,7 @@ def test_authorities_of_the_house_are_trusted_beside_the_public_ones(monkeypatch
     assert trusted.check_hostname
 
 
-def test_a_password_is_sent_though_it_hides_itself(script):
+def test_a_password_is_sent_though_it_hides_itself(script: Any) -> None:
     token = {"id": "token_1", "name": "x", "prefix": "p", "scopes": ["read"], "created_at": "2026-01-01T00:00:00Z"}
     script.answers = [ok({**token, "expires_at": None, "secret": "s"})]
     login = Login(name="ada", password="correct horse")
@@ -285,7 +291,7 @@ def test_a_password_is_sent_though_it_hides_itself(script):
     assert "correct horse" not in repr(login)
 
 
-def test_a_server_that_starts_again_is_waited_for():
+def test_a_server_that_starts_again_is_waited_for() -> None:
     restart_s = 15.0
     patient = Retries(random_unit=lambda: 1.0)  # even where every wait is as short as can be
     assert sum(patient.delay_s(tried, None) for tried in range(1, patient.tries)) > restart_s

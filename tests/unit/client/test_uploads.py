@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -14,15 +17,15 @@ DATA = bytes(range(251)) * 100
 class UploadServer:
     """Keeps the bytes of one upload; `faults` are raised instead of answers, after keeping so many bytes of a piece."""
 
-    def __init__(self, make_problem):
+    def __init__(self, make_problem: Callable[..., httpx.Response]) -> None:
         self.kept = bytearray()
-        self.faults = []
+        self.faults: list[int] = []
         self.sent = 0
-        self.announced = None
+        self.announced: dict[str, Any] | None = None
         self.finished = False
         self.make_problem = make_problem
 
-    def __call__(self, request):
+    def __call__(self, request: httpx.Request) -> httpx.Response:
         request.read()
         if request.method == "POST":
             self.announced = json.loads(request.content)
@@ -41,52 +44,58 @@ class UploadServer:
 
 
 @pytest.fixture
-def upload_server(make_problem, monkeypatch):
+def upload_server(make_problem: Callable[..., httpx.Response], monkeypatch: pytest.MonkeyPatch) -> UploadServer:
     monkeypatch.setattr(blobs, "PIECE_BYTES", 4096)
     monkeypatch.setattr(blobs, "RESUMABLE_FROM_BYTES", 1000)
     return UploadServer(make_problem)
 
 
 @pytest.fixture
-def send(script, upload_server, tmp_path):
+def send(script: Any, upload_server: UploadServer, tmp_path: Path) -> Callable[[], str]:
     path = tmp_path / "large.bvh"
     path.write_bytes(DATA)
     script.answers = [upload_server] * 100
     return lambda: script.marey().blobs.put_file(path)
 
 
-def test_a_large_file_goes_in_pieces_under_its_digest(send, upload_server):
+def test_a_large_file_goes_in_pieces_under_its_digest(send: Callable[[], str], upload_server: UploadServer) -> None:
     assert send() == f"sha256:{hashlib.sha256(DATA).hexdigest()}"
     assert bytes(upload_server.kept) == DATA
     assert upload_server.announced["length"] == len(DATA)
 
 
 @pytest.mark.parametrize("kept", [0, 1000, 4096])
-def test_after_a_lost_connection_it_goes_on_where_the_server_is(send, upload_server, kept):
+def test_after_a_lost_connection_it_goes_on_where_the_server_is(
+    send: Callable[[], str], upload_server: UploadServer, kept: int
+) -> None:
     upload_server.faults = [4096, kept]
     send()
     assert bytes(upload_server.kept) == DATA
     assert upload_server.sent <= len(DATA) + 4096
 
 
-def test_a_last_piece_whose_answer_was_lost_still_becomes_a_blob(send, upload_server):
+def test_a_last_piece_whose_answer_was_lost_still_becomes_a_blob(
+    send: Callable[[], str], upload_server: UploadServer
+) -> None:
     upload_server.faults = [4096] * 6 + [len(DATA)]
     assert send().startswith("sha256:")
     assert upload_server.finished
 
 
-def test_a_connection_that_never_lets_a_piece_through_is_given_up(send, upload_server):
+def test_a_connection_that_never_lets_a_piece_through_is_given_up(
+    send: Callable[[], str], upload_server: UploadServer
+) -> None:
     upload_server.faults = [0] * 100
     with pytest.raises(errors.Unreachable):
         send()
     assert upload_server.sent == blobs.TRIES_PER_PIECE * 4096
 
 
-def test_a_file_that_shrinks_is_noticed(script, upload_server, tmp_path):
+def test_a_file_that_shrinks_is_noticed(script: Any, upload_server: UploadServer, tmp_path: Path) -> None:
     path = tmp_path / "large.bvh"
     path.write_bytes(DATA)
 
-    def shrink(request):
+    def shrink(request: httpx.Request) -> httpx.Response:
         path.write_bytes(b"")
         return upload_server(request)
 

@@ -1,6 +1,8 @@
 """Each rule of the house fails on a planted offence, and says where it is."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lint import circles, class_names, constants, docstrings, folders, lengths, lists, small_modules, unused, wording
@@ -19,7 +21,7 @@ def house(modules: dict[str, str], pages: dict[str, str] | None = None) -> House
     return House(found, {ROOT / name: text for name, text in (pages or {}).items()})
 
 
-def messages(offences) -> list[str]:
+def messages(offences: Iterator[Any]) -> list[str]:
     return [offence.message for offence in offences]
 
 
@@ -32,17 +34,17 @@ def messages(offences) -> list[str]:
     ],
     ids=["at the top", "for types only", "in a function"],
 )
-def test_modules_that_import_each_other_are_found(back):
+def test_modules_that_import_each_other_are_found(back: str) -> None:
     circle = house({"marey_x.a": "from marey_x import b\n", "marey_x.b": "import marey_x.c\n", "marey_x.c": back})
     (offence,) = circles.find(circle)
     assert offence.message.endswith("marey_x.a -> marey_x.b -> marey_x.c -> marey_x.a")
 
 
-def test_modules_that_import_downwards_are_no_circle():
+def test_modules_that_import_downwards_are_no_circle() -> None:
     assert not list(circles.find(house({"marey_x.a": "from marey_x import b\n", "marey_x.b": ""})))
 
 
-def test_a_folder_of_26_modules_is_full():
+def test_a_folder_of_26_modules_is_full() -> None:
     full = {f"marey_x.m{number}": "" for number in range(26)}
     assert messages(folders.find(house(full))) == ["26 modules, more than 25; make rooms of them"]
     del full["marey_x.m0"]
@@ -63,13 +65,13 @@ WITHOUT_RESULT = NUMPYDOC.format("angle : float    radians").partition("    Retu
         (WITHOUT_RESULT, "turned does not document what it returns under Returns"),
     ],
 )
-def test_a_function_of_the_library_documents_what_it_takes_and_returns(docstring, fault):
+def test_a_function_of_the_library_documents_what_it_takes_and_returns(docstring: str, fault: str) -> None:
     text = f"def turned(angle: float) -> float:\n    {docstring}\n    return angle\n"
     assert messages(docstrings.find(house({"marey_motion.turns": text}))) == [fault]
     assert not list(docstrings.find(house({"marey_motion.turn_kernels": text, "marey_server.turns": text})))
 
 
-def test_a_documented_function_of_the_library_is_fine():
+def test_a_documented_function_of_the_library_is_fine() -> None:
     text = f"def turned(angle: float) -> float:\n    {NUMPYDOC.format('angle : float    radians')}\n    return angle\n"
     assert not list(docstrings.find(house({"marey_motion.turns": text})))
 
@@ -79,26 +81,26 @@ def test_overloads_of_a_documented_function_need_no_docstring() -> None:
     assert not list(docstrings.find(house({"marey_motion.turns": text})))
 
 
-def test_a_small_module_with_one_importer_belongs_into_it():
+def test_a_small_module_with_one_importer_belongs_into_it() -> None:
     modules = {"marey_x.small": "", "marey_x.one": f"import marey_x.small\n{LONG}", "marey_x.other": LONG}
     assert messages(small_modules.find(house(modules))) == ["0 lines, imported only by marey_x.one; merge it"]
     modules["marey_x.other"] = f"from marey_x.small import x\n{LONG}"
     assert not list(small_modules.find(house(modules)))
 
 
-def test_two_classes_of_one_name_are_found_with_both_places():
+def test_two_classes_of_one_name_are_found_with_both_places() -> None:
     (offence,) = class_names.find(house({"marey_x.a": "class Take: ...\n", "marey_y.b": "\nclass Take: ...\n"}))
     assert (offence.subject, offence.line) == ("Take", 2)
     assert "marey_x.a, line 1" in offence.message
 
 
-def test_a_function_that_only_its_definition_names_is_unused():
+def test_a_function_that_only_its_definition_names_is_unused() -> None:
     text = "def used(): ...\n\ndef dead(): ...\n\nclass A:\n    def dead_too(self): used()\n\nA()\n"
     found = [offence.subject for offence in unused.find(house({"marey_x.a": text}))]
     assert found == ["marey_x.a.dead", "marey_x.a.A.dead_too"]
 
 
-def test_a_local_function_is_used_only_where_its_own_function_names_it():
+def test_a_local_function_is_used_only_where_its_own_function_names_it() -> None:
     text = """
 def f():
     def body(): ...
@@ -113,12 +115,12 @@ def g(body):
     assert found == ["marey_x.a.f.body"]
 
 
-def test_names_in_the_docs_are_used():
+def test_names_in_the_docs_are_used() -> None:
     modules = {"marey_x.a": "def of_the_sdk(): ...\n"}
     assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))
 
 
-def test_long_functions_and_modules_are_found_and_docstrings_do_not_count():
+def test_long_functions_and_modules_are_found_and_docstrings_do_not_count() -> None:
     body = "".join(f"    x = {number}\n" for number in range(41))
     docstring = '    """Do it.\n' + "\n" * 50 + '    """\n'
     assert messages(lengths.find(house({"marey_x.a": f"def f():\n{docstring}{body}"}))) == [
@@ -128,7 +130,7 @@ def test_long_functions_and_modules_are_found_and_docstrings_do_not_count():
     assert messages(lengths.find(house({"marey_x.a": "x = 1\n" * 401}))) == ["401 lines, more than 400; split it"]
 
 
-def test_a_list_that_repeats_words_of_a_vocabulary_is_found():
+def test_a_list_that_repeats_words_of_a_vocabulary_is_found() -> None:
     home = "class State(StrEnum):\n    A = 'waiting'\n    B = 'queued'\n    C = 'running'\n    D = 'failed'\n"
     copy = "OPEN = ('waiting', 'queued', 'running')\n"
     (offence,) = lists.find(house({"marey_schemas.jobs": home, "marey_x.a": copy}))
@@ -137,14 +139,14 @@ def test_a_list_that_repeats_words_of_a_vocabulary_is_found():
     assert not list(lists.find(house({"marey_schemas.jobs": home, "marey_x.a": other})))
 
 
-def test_a_constant_that_two_modules_declare_is_found():
+def test_a_constant_that_two_modules_declare_is_found() -> None:
     twice = house({"marey_x.a": "LONGEST_S = 20.0\n", "marey_y.b": "MOST, LONGEST_S = 3, 20.0\n"})
     (offence,) = constants.find(twice)
     assert offence.subject == "marey_y.b.LONGEST_S"
     assert offence.message.startswith("LONGEST_S = 20.0 is also in marey_x.a, line 1")
 
 
-def test_constants_of_other_names_values_or_made_by_calls_are_no_offence():
+def test_constants_of_other_names_values_or_made_by_calls_are_no_offence() -> None:
     fine = {"marey_x.a": "MOST = 3\nLOG = get_log()\nkind = 1\n", "marey_y.b": "MOST = 4\nLOG = get_log()\nkind = 1\n"}
     assert not list(constants.find(house(fine)))
 
@@ -168,35 +170,35 @@ def test_constants_of_other_names_values_or_made_by_calls_are_no_offence():
         "def earlier_answer(): ...\n",
     ],
 )
-def test_phrases_and_names_of_the_word_list_are_found(text):
+def test_phrases_and_names_of_the_word_list_are_found(text: str) -> None:
     assert len(list(wording.find(house({"marey_x.a": text})))) == 1
 
 
 @pytest.mark.parametrize(
     "text", ['"""Counts retries."""\n', 'x = "it is made up of parts"\n', 'x = "a foot that stands still"\n']
 )
-def test_plain_english_is_left_alone(text):
+def test_plain_english_is_left_alone(text: str) -> None:
     assert not list(wording.find(house({"marey_x.a": text})))
 
 
-def test_pages_are_read_but_not_their_code():
+def test_pages_are_read_but_not_their_code() -> None:
     page = "# Title\n\n```sh\ntell me\n```\n\nIt tells nobody.\n"
     (offence,) = wording.find(house({}, {"docs/page.md": page}))
     assert offence.line == 7
 
 
-def test_a_module_of_an_old_name_is_found():
+def test_a_module_of_an_old_name_is_found() -> None:
     assert messages(wording.find(house({"marey_x.settling": ""}))) == ["module settling is called propagation now"]
 
 
-def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it():
+def test_an_exception_with_a_reason_lets_one_offence_pass_and_is_reported_when_nothing_needs_it() -> None:
     offences = [Offence(ROOT / "a.py", 1, "marey_x.a", "too long"), Offence(ROOT / "b.py", 1, "marey_y.b", "too long")]
     assert [one.subject for one in apply_exceptions("lengths", offences, {"marey_x.*": "a table"})] == ["marey_y.b"]
     (left,) = apply_exceptions("lengths", [], {"marey_x.a": "a table"})
     assert "not needed any more" in left.message
 
 
-def test_the_baseline_of_the_wording_only_shrinks(tmp_path):
+def test_the_baseline_of_the_wording_only_shrinks(tmp_path: Path) -> None:
     path = tmp_path / "wording.toml"
     path.write_text('"a.py" = 2\n"b.py" = 1\n', "utf-8")
     offences = [Offence(ROOT / "a.py", line, "told", "'told'") for line in (1, 2, 3)]
@@ -222,16 +224,16 @@ def test_the_baseline_of_the_wording_only_shrinks(tmp_path):
         ("store: " + "x" * 66, "72"),
     ],
 )
-def test_a_commit_subject_that_is_not_in_form_is_refused(subject, fault):
+def test_a_commit_subject_that_is_not_in_form_is_refused(subject: str, fault: str) -> None:
     assert any(fault in one for one in faults_of(subject))
 
 
 @pytest.mark.parametrize("subject", ["store: omit the password from Database.shown", 'Revert "store: omit it"'])
-def test_a_commit_subject_in_form_passes(subject):
+def test_a_commit_subject_in_form_passes(subject: str) -> None:
     assert faults_of(subject) == []
 
 
-def test_a_sample_of_texts_is_the_same_for_the_same_seed():
+def test_a_sample_of_texts_is_the_same_for_the_same_seed() -> None:
     text = (
         '"""Module."""\ndef f(n):\n    """Turn."""\n    raise ValueError(f"{n} is not a number")\n'
         'opt(help="Number of turns.")\n'

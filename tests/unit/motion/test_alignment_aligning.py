@@ -1,13 +1,16 @@
 """Examples of an action, aligned as a whole."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.alignment_examples import body_of, moved, played, sine_warp, walk, warped_walks
 
 from marey_motion.alignment import aligning
+from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligning import (
     MIRRORED,
     SourceExample,
@@ -27,13 +30,13 @@ BODY = body_of(walk())
 TO_FIRST = AlignOptions(reference="clip_a@1")
 
 
-def raised(examples, options=None):
+def raised(examples: list[SourceExample], options: AlignOptions | None = None) -> MotionError:
     with pytest.raises(MotionError) as error:
         align_clips(examples, BODY, options)
     return error.value
 
 
-def as_bytes(aligned):
+def as_bytes(aligned: AlignedSet) -> tuple[bytes, str, Mapping[str, int]]:
     arrays = [
         array.tobytes()
         for clip in aligned.clips
@@ -42,7 +45,7 @@ def as_bytes(aligned):
     return b"".join(arrays), aligned.reference, aligned.keyframes
 
 
-def test_a_known_warp_is_recovered_within_a_frame():
+def test_a_known_warp_is_recovered_within_a_frame() -> None:
     examples, warps = warped_walks()
     aligned = align_clips(examples, BODY, TO_FIRST)
     assert aligned.frame_count == 60
@@ -52,7 +55,7 @@ def test_a_known_warp_is_recovered_within_a_frame():
         assert np.abs(found - warps[clip.uid]).max() <= 1.0
 
 
-def test_aligned_examples_of_one_walk_are_nearly_the_same_motion():
+def test_aligned_examples_of_one_walk_are_nearly_the_same_motion() -> None:
     examples, _ = warped_walks()
     aligned = align_clips(examples, BODY, TO_FIRST)
     reference = aligned.clips[0].motion.positions(BODY.skeleton)
@@ -61,7 +64,7 @@ def test_aligned_examples_of_one_walk_are_nearly_the_same_motion():
         assert clip.cost < 1e-4
 
 
-def test_the_reference_keeps_every_frame_and_its_own_time():
+def test_the_reference_keeps_every_frame_and_its_own_time() -> None:
     examples, _ = warped_walks()
     aligned = align_clips(examples, BODY, TO_FIRST)
     own = aligned.clips[0]
@@ -72,7 +75,7 @@ def test_the_reference_keeps_every_frame_and_its_own_time():
     )
 
 
-def test_every_quaternion_is_continuous_in_time_and_on_the_side_of_the_reference():
+def test_every_quaternion_is_continuous_in_time_and_on_the_side_of_the_reference() -> None:
     examples, _ = warped_walks()
     flipped = examples[2].clip.poses.copy()
     flipped[:, 3:7] *= -1.0
@@ -86,7 +89,7 @@ def test_every_quaternion_is_continuous_in_time_and_on_the_side_of_the_reference
         assert np.einsum("fjc,fjc->j", rotations, reference).min() > 0.0
 
 
-def test_more_than_half_a_turn_does_not_break_the_signs():
+def test_more_than_half_a_turn_does_not_break_the_signs() -> None:
     """A predecessor compared every frame with the first one, and tore rotations beyond half a turn apart."""
     spin = generate_gait(1.0, 2.6, 2.0)
     faster = played(spin, sine_warp(120, 101))
@@ -98,7 +101,7 @@ def test_more_than_half_a_turn_does_not_break_the_signs():
 
 
 @pytest.mark.parametrize("reference", ["medoid", "nearest_mean_length", "clip_c@1"])
-def test_the_same_bytes_come_out_for_any_threads_and_any_order(reference):
+def test_the_same_bytes_come_out_for_any_threads_and_any_order(reference: str) -> None:
     examples, _ = warped_walks(5)
     options = AlignOptions(reference=reference)
     expected = as_bytes(align_clips(examples, BODY, options, threads=1))
@@ -107,17 +110,17 @@ def test_the_same_bytes_come_out_for_any_threads_and_any_order(reference):
         assert as_bytes(align_clips(order, BODY, options, threads=2)) == expected
 
 
-def test_the_medoid_is_nearer_to_the_others_than_an_outlier():
+def test_the_medoid_is_nearer_to_the_others_than_an_outlier() -> None:
     examples, _ = warped_walks(4)
     strange = generate_gait(2.4, -1.0, 1.0)
     aligned = align_clips([SourceExample("a@1", "a", strange), *examples], BODY)
     assert aligned.reference != "a@1"
 
 
-def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch):
+def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     examples, _ = warped_walks(4)
 
-    def compare(*_arguments, **_options):
+    def compare(*_arguments: Any, **_options: Any) -> None:
         raise AssertionError("pairs were compared")
 
     monkeypatch.setattr(aligning, "pairwise_totals", compare)
@@ -127,7 +130,7 @@ def test_a_reference_that_is_named_is_found_without_comparing_pairs(monkeypatch)
         assert align_clips(examples, BODY, AlignOptions(reference=one.uid)).reference == one.uid
 
 
-def test_cuts_are_matched_exactly_and_become_keyframes():
+def test_cuts_are_matched_exactly_and_become_keyframes() -> None:
     examples, warps = warped_walks(4)
     with_cuts = []
     for one in examples:
@@ -141,7 +144,7 @@ def test_cuts_are_matched_exactly_and_become_keyframes():
         assert np.diff(clip.time_function).min() > 0.0
 
 
-def test_an_example_with_other_labels_is_refused_by_name():
+def test_an_example_with_other_labels_is_refused_by_name() -> None:
     examples, _ = warped_walks(4)
     labelled = [replace(one, cuts=(Cut(("contact",), 20),)) for one in examples]
     labelled[2] = replace(labelled[2], cuts=(Cut(("release",), 20),))
@@ -154,7 +157,7 @@ def test_an_example_with_other_labels_is_refused_by_name():
     assert [clip.name for clip in aligned.clips] == ["walk a", "walk b", "walk d"]
 
 
-def test_labels_follow_a_reference_that_is_named():
+def test_labels_follow_a_reference_that_is_named() -> None:
     examples, _ = warped_walks(3)
     labelled = [replace(one, cuts=(Cut(("contact",), 20),)) for one in examples]
     labelled[0] = replace(labelled[0], cuts=(Cut(("start",), 20),))
@@ -163,7 +166,7 @@ def test_labels_follow_a_reference_that_is_named():
     assert "it has the cuts contact, the others have start" in str(error)
 
 
-def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_reference_or_the_one_asked_for():
+def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_reference_or_the_one_asked_for() -> None:
     examples, warps = warped_walks(3)
     half = Clip(BODY.skeleton, 30.0, walk().poses[::2])
     mixed = [*examples, SourceExample("clip_z@1", "slow", half, (Cut(("down",), 15),))]
@@ -180,7 +183,7 @@ def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_referen
     assert asked.keyframes == {"down": 60}
 
 
-def test_a_restored_example_is_the_source_again():
+def test_a_restored_example_is_the_source_again() -> None:
     examples, _ = warped_walks()
     aligned = align_clips(examples, BODY, TO_FIRST)
     for clip, one in zip(aligned.clips, examples, strict=True):
@@ -191,7 +194,7 @@ def test_a_restored_example_is_the_source_again():
         assert gaps.max() < limit_m
 
 
-def test_where_a_clip_stood_does_not_matter():
+def test_where_a_clip_stood_does_not_matter() -> None:
     examples, _ = warped_walks(3)
     away = [replace(one, clip=moved(one.clip, 2.0, 30.0, -20.0)) for one in examples]
     here, there = (align_clips(some, BODY, TO_FIRST) for some in (examples, away))
@@ -199,7 +202,7 @@ def test_where_a_clip_stood_does_not_matter():
     assert there.clips[1].placement.x != pytest.approx(here.clips[1].placement.x)
 
 
-def test_mirrored_examples_stand_beside_the_others():
+def test_mirrored_examples_stand_beside_the_others() -> None:
     examples, _ = warped_walks(3)
     aligned = align_clips(with_mirrored(examples, BODY), BODY)
     uids = [clip.uid for clip in aligned.clips]
@@ -209,7 +212,7 @@ def test_mirrored_examples_stand_beside_the_others():
     assert twin.root_translations[:, 1] == pytest.approx(own.root_translations[:, 1], abs=0.05)
 
 
-def test_weights_fall_on_what_the_body_carries():
+def test_weights_fall_on_what_the_body_carries() -> None:
     names = BODY.skeleton.joint_names
     assert joint_weights(BODY, {}).tolist() == [1.0] * len(names)
     examples, _ = warped_walks(3)
@@ -219,14 +222,14 @@ def test_weights_fall_on_what_the_body_carries():
     assert feet.clips[1].cost != whole.clips[1].cost
 
 
-def test_progress_counts_the_pairs_that_were_compared():
+def test_progress_counts_the_pairs_that_were_compared() -> None:
     examples, _ = warped_walks(5)
     told = []
     align_clips(examples, BODY, progress=lambda *step: told.append(step))
     assert told[-1] == (10, 10, "comparing 5 clips")
 
 
-def short(frames):
+def short(frames: int) -> SourceExample:
     return SourceExample("short@1", "short", walk().sliced(0, frames))
 
 
@@ -258,14 +261,16 @@ def short(frames):
         (SourceExample("clip_a@1", "twin", walk()), None, "motion-invalid", "clip_a@1: two examples have this uid"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_refused_by_name(odd, options, code, said):
+def test_what_does_not_fit_is_refused_by_name(
+    odd: SourceExample, options: AlignOptions | None, code: str, said: str
+) -> None:
     examples, _ = warped_walks(3)
     with pytest.raises(MotionError, match=said) as error:
         align_clips([*examples, odd], BODY, options)
     assert error.value.code == code
 
 
-def test_fewer_than_two_examples_cannot_be_aligned():
+def test_fewer_than_two_examples_cannot_be_aligned() -> None:
     examples, _ = warped_walks(2)
     assert raised(examples[:1]).code == "too-few-clips"
     assert raised([]).code == "too-few-clips"
@@ -275,13 +280,13 @@ def test_fewer_than_two_examples_cannot_be_aligned():
     assert len(refused) == 1
 
 
-def test_a_reference_that_does_not_fit_is_not_left_out_silently():
+def test_a_reference_that_does_not_fit_is_not_left_out_silently() -> None:
     examples, _ = warped_walks(3)
     with pytest.raises(MotionError, match="short: it has 3 frames"):
         align_clips([*examples, short(3)], BODY, AlignOptions(reference="short@1"), on_refusal=lambda *_: None)
 
 
-def test_more_than_fits_into_memory_is_refused_before_anything_is_computed():
+def test_more_than_fits_into_memory_is_refused_before_anything_is_computed() -> None:
     long = generate_gait(1.3, 0.2, 66.0)
     examples = [SourceExample(f"long@{index}", "long", long) for index in range(30)]
     error = raised(examples, AlignOptions(rate_hz=1000.0))

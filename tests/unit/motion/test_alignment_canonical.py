@@ -9,19 +9,21 @@ from tests.support.edited_takes import under_static_root
 
 from marey_motion import quaternions
 from marey_motion.alignment.canonical import placed, to_canonical
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions
+from marey_motion.matching.body import MatchingBody
 from marey_motion.motion import Motion
 
 BODY = body_of(walk())
 
 
-def facing(motion, body):
+def facing(motion: Motion, body: MatchingBody) -> Floats:
     return forward_directions(motion.positions(body.skeleton), body.lefts, body.rights)
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-9, 9), st.floats(-9, 9))
-def test_wherever_a_clip_was_it_begins_where_the_axes_cross_and_faces_z(heading_rad, x, z):
+def test_wherever_a_clip_was_it_begins_where_the_axes_cross_and_faces_z(heading_rad: float, x: float, z: float) -> None:
     clip = moved(walk(), heading_rad, x, z)
     motion, placement = to_canonical(Motion.of(clip), BODY)
     assert motion.root_translations[0, ::2] == pytest.approx((0.0, 0.0), abs=1e-12)
@@ -32,7 +34,7 @@ def test_wherever_a_clip_was_it_begins_where_the_axes_cross_and_faces_z(heading_
     assert (placement.x, placement.z) == pytest.approx((first[0], first[2]))
 
 
-def test_heights_are_kept_unless_they_are_not_wanted():
+def test_heights_are_kept_unless_they_are_not_wanted() -> None:
     motion = Motion.of(walk())
     kept, placement = to_canonical(motion, BODY)
     assert kept.root_translations[:, 1] == pytest.approx(motion.root_translations[:, 1])
@@ -43,14 +45,14 @@ def test_heights_are_kept_unless_they_are_not_wanted():
 
 
 @pytest.mark.parametrize("keep_height", [True, False])
-def test_placing_a_canonical_motion_brings_it_back(keep_height):
+def test_placing_a_canonical_motion_brings_it_back(keep_height: bool) -> None:
     motion = Motion.of(moved(walk(), 2.3, 4.0, -1.5))
     canonical, placement = to_canonical(motion, BODY, keep_height=keep_height)
     back = placed(canonical, placement, BODY.skeleton)
     assert back.poses == pytest.approx(motion.poses, abs=1e-12)
 
 
-def test_a_static_root_is_moved_along_while_the_body_is_turned_at_its_hips():
+def test_a_static_root_is_moved_along_while_the_body_is_turned_at_its_hips() -> None:
     clip = under_static_root(moved(walk(), 1.1, 2.0, 3.0), (0.3, 0.9, -4.0))
     body = body_of(clip)
     assert body.carrier == 1
@@ -64,7 +66,7 @@ def test_a_static_root_is_moved_along_while_the_body_is_turned_at_its_hips():
     assert back == pytest.approx(Motion.of(clip).positions(clip.skeleton)[:, 1:], abs=1e-9)
 
 
-def test_a_body_that_never_faces_anywhere_is_refused():
+def test_a_body_that_never_faces_anywhere_is_refused() -> None:
     motion = Motion.of(walk())
     lying = motion.rotations.copy()
     lying[:] = quaternions.identity(*lying.shape[:2])

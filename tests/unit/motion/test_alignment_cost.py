@@ -1,5 +1,7 @@
 """The closed-form cost against minimisation, against plain loops, and against what was wrong before."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,13 +11,14 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from marey_motion.alignment.cost import frame_costs
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_schemas.options.alignment import AlignOptions, CostOptions
 
 POINTS = 9
 
 
-def cloud(frames, seed, points=POINTS):
+def cloud(frames: int, seed: int, points: int = POINTS) -> Floats:
     """(frames, points, 3) of a body that wanders over the ground."""
     random = np.random.default_rng(seed)
     return (
@@ -23,16 +26,16 @@ def cloud(frames, seed, points=POINTS):
     )
 
 
-def on_the_ground(points, turn_rad, x, z):
+def on_the_ground(points: Floats, turn_rad: float, x: float, z: float) -> Floats:
     turned = Rotation.from_euler("y", turn_rad).apply(points.reshape(-1, 3)).reshape(points.shape)
     return turned + np.array((x, 0.0, z))
 
 
-def minimised(a, b, weights):
+def minimised(a: Floats, b: Floats, weights: Floats) -> float:
     """The least weighted mean of squared distances of points a, b (P, 3) over turns and shifts, found by search."""
     shares = weights / weights.sum()
 
-    def cost(parameters):
+    def cost(parameters: Floats) -> float:
         return float(shares @ ((a - on_the_ground(b, *parameters)) ** 2).sum(axis=1))
 
     starts = [(turn, *(shares @ (a - on_the_ground(b, turn, 0.0, 0.0)))[[0, 2]]) for turn in np.arange(8) * np.pi / 4]
@@ -40,7 +43,7 @@ def minimised(a, b, weights):
     return min(found)
 
 
-def test_the_closed_form_is_what_minimising_over_turns_and_shifts_finds():
+def test_the_closed_form_is_what_minimising_over_turns_and_shifts_finds() -> None:
     weights = np.random.default_rng(1).uniform(0.2, 3.0, POINTS)
     a, b = cloud(2, 2), cloud(3, 3)
     costs = frame_costs(a, b, weights=weights)
@@ -49,24 +52,24 @@ def test_the_closed_form_is_what_minimising_over_turns_and_shifts_finds():
 
 
 @pytest.mark.parametrize("angle_deg", [10, 45, 90, 180])
-def test_a_pose_costs_nothing_against_itself_turned_and_moved_on_the_ground(angle_deg):
+def test_a_pose_costs_nothing_against_itself_turned_and_moved_on_the_ground(angle_deg: int) -> None:
     a = cloud(3, 4)
     b = on_the_ground(a, np.radians(angle_deg), 3.0, -7.0)
     assert np.diagonal(frame_costs(a, b)) == pytest.approx(np.zeros(3), abs=1e-12)
 
 
 @given(st.floats(-10, 10), st.floats(-20, 20), st.floats(-20, 20), st.integers(0, 1000))
-def test_no_turn_and_no_shift_on_the_ground_changes_a_cost(turn_rad, x, z, seed):
+def test_no_turn_and_no_shift_on_the_ground_changes_a_cost(turn_rad: float, x: float, z: float, seed: int) -> None:
     a, b = cloud(3, seed), cloud(2, seed + 1)
     assert frame_costs(a, on_the_ground(b, turn_rad, x, z)) == pytest.approx(frame_costs(a, b), abs=1e-9)
 
 
-def test_heights_count_as_they_are():
+def test_heights_count_as_they_are() -> None:
     a = cloud(1, 5)
     assert frame_costs(a, a + np.array((0.0, 0.3, 0.0)))[0, 0] == pytest.approx(0.09, abs=1e-12)
 
 
-def test_costs_are_means_over_points_in_square_metres():
+def test_costs_are_means_over_points_in_square_metres() -> None:
     a = np.zeros((1, 4, 3))
     b = a.copy()
     b[0, 0] = (0.0, 0.2, 0.0)
@@ -75,7 +78,7 @@ def test_costs_are_means_over_points_in_square_metres():
     assert frame_costs(a, b, weights=(300, 0, 0, 100))[0, 0] == pytest.approx(0.04 * 3 / 4)
 
 
-def test_plain_costs_keep_turns_and_shifts():
+def test_plain_costs_keep_turns_and_shifts() -> None:
     a, b = cloud(3, 6), cloud(4, 7)
     expected = ((a[:, None] - b[None]) ** 2).sum(axis=-1).mean(axis=-1)
     assert frame_costs(a, b, CostOptions(cost="plain")) == pytest.approx(expected, rel=1e-12)
@@ -83,11 +86,11 @@ def test_plain_costs_keep_turns_and_shifts():
 
 @pytest.mark.parametrize("method", ["turned", "plain"])
 @pytest.mark.parametrize("window", [3, 5])
-def test_a_window_compares_the_frames_around_as_one_cloud(method, window):
+def test_a_window_compares_the_frames_around_as_one_cloud(method: str, window: int) -> None:
     a, b = cloud(7, 8), cloud(6, 9)
     around = window // 2
 
-    def clouds(points):
+    def clouds(points: Floats) -> Floats:
         frames = np.arange(len(points))[:, None] + np.arange(-around, around + 1)
         return points[np.clip(frames, 0, len(points) - 1)].reshape(len(points), -1, 3)
 
@@ -97,13 +100,13 @@ def test_a_window_compares_the_frames_around_as_one_cloud(method, window):
     assert costs == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-def test_no_cost_is_negative_where_rounding_could_make_it_so():
+def test_no_cost_is_negative_where_rounding_could_make_it_so() -> None:
     a = cloud(1, 11) + np.array((1e4, 0.0, 1e4))
     for window in (1, 5):
         assert frame_costs(a, a, CostOptions(window=window))[0, 0] >= 0.0
 
 
-def test_both_directions_cost_the_same():
+def test_both_directions_cost_the_same() -> None:
     a, b = cloud(6, 12), cloud(4, 13)
     assert frame_costs(a, b) == pytest.approx(frame_costs(b, a).T, rel=1e-12)
 
@@ -119,7 +122,7 @@ def test_both_directions_cost_the_same():
         ({"weights": (0, 0, 0, 0)}, "not all zero"),
     ],
 )
-def test_what_makes_no_cost_is_refused(arguments, said):
+def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> None:
     given = {"a": np.zeros((3, 4, 3)), "b": np.zeros((3, 4, 3)), **arguments}
     with pytest.raises(MotionError, match=said):
         frame_costs(**given)
@@ -129,6 +132,6 @@ def test_what_makes_no_cost_is_refused(arguments, said):
     ("option", "value"),
     [("window", 4), ("window", 63), ("cost", "best"), ("rate_hz", float("nan")), ("rate_hz", 0.0), ("slope_limit", -1)],
 )
-def test_options_out_of_range_are_refused_by_name(option, value):
+def test_options_out_of_range_are_refused_by_name(option: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=option):
         AlignOptions(**{option: value})

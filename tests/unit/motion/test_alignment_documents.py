@@ -1,11 +1,13 @@
 """Aligned sets to documents and back."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.alignment_examples import body_of, walk, warped_walks
 
+from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligned_documents import StoredExample, example_to_tree, set_from_examples, uid_of
 from marey_motion.alignment.aligning import align_clips, restore, with_mirrored
 from marey_motion.alignment.segments import Cut
@@ -19,13 +21,13 @@ DIGEST = f"sha256:{64 * 'a'}"
 
 
 @pytest.fixture(scope="module")
-def aligned():
+def aligned() -> AlignedSet:
     examples, warps = warped_walks(3)
     cut = [replace(one, cuts=(Cut(("down",), int(np.argmin(np.abs(warps[one.uid] - 30)))),)) for one in examples]
     return align_clips(with_mirrored(cut, BODY), BODY, AlignOptions(reference="clip_a@1"))
 
 
-def stored(aligned, media_type=JSON):
+def stored(aligned: AlignedSet, media_type: str = JSON) -> list[StoredExample]:
     """As a store would keep them, and in another order."""
     examples = []
     for number, one in enumerate(aligned.clips):
@@ -37,7 +39,7 @@ def stored(aligned, media_type=JSON):
 
 
 @pytest.mark.parametrize("media_type", MEDIA_TYPES)
-def test_a_set_comes_back_from_its_documents(aligned, media_type):
+def test_a_set_comes_back_from_its_documents(aligned: AlignedSet, media_type: str) -> None:
     back = set_from_examples(stored(aligned, media_type))
     assert [clip.uid for clip in back.clips] == [clip.uid for clip in aligned.clips]
     assert [clip.name for clip in back.clips] == [clip.name for clip in aligned.clips]
@@ -50,31 +52,31 @@ def test_a_set_comes_back_from_its_documents(aligned, media_type):
         assert (one.cost, one.source_frames) == (other.cost, other.source_frames)
 
 
-def test_an_example_is_restored_from_its_documents_as_from_the_set(aligned):
+def test_an_example_is_restored_from_its_documents_as_from_the_set(aligned: AlignedSet) -> None:
     back = set_from_examples(stored(aligned))
     for one, other in zip(back.clips, aligned.clips, strict=True):
         assert restore(one, back.skeleton).poses == pytest.approx(restore(other, BODY.skeleton).poses, abs=1e-5)
 
 
-def test_mirrored_examples_tell_the_clip_they_mirror(aligned):
+def test_mirrored_examples_tell_the_clip_they_mirror(aligned: AlignedSet) -> None:
     tree = example_to_tree(aligned, aligned.clips[1])
     assert tree["clip"] == {"item": "clip_a", "revision": 1, "mirrored": True}
     assert tree["reference"] == {"item": "clip_a", "revision": 1, "mirrored": False}
     assert uid_of("clip_a", 1, mirrored=True) == aligned.clips[1].uid
 
 
-def test_some_examples_of_a_set_make_a_set(aligned):
+def test_some_examples_of_a_set_make_a_set(aligned: AlignedSet) -> None:
     assert len(set_from_examples(stored(aligned)[:2]).clips) == 2
 
 
-def test_examples_of_unknown_origin_go_by_the_names_they_are_given(aligned):
+def test_examples_of_unknown_origin_go_by_the_names_they_are_given(aligned: AlignedSet) -> None:
     plain = [one._replace(info={**one.info, "clip": None, "reference": None, "set": None}) for one in stored(aligned)]
     back = set_from_examples(plain)
     assert [clip.uid for clip in back.clips] == sorted(one.uid for one in plain)
     assert back.reference == ""
 
 
-def changed(aligned, **info):
+def changed(aligned: AlignedSet, **info: Any) -> list[StoredExample]:
     examples = stored(aligned)
     return [examples[0], examples[1]._replace(info={**examples[1].info, **info})]
 
@@ -89,17 +91,19 @@ def changed(aligned, **info):
         ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "among the aligned clips twice"),
     ],
 )
-def test_examples_that_were_not_aligned_together_are_told_apart(aligned, info, said):
+def test_examples_that_were_not_aligned_together_are_told_apart(
+    aligned: AlignedSet, info: dict[str, Any], said: str
+) -> None:
     with pytest.raises(MotionError, match=said):
         set_from_examples(changed(aligned, **info))
 
 
-def test_no_examples_make_no_set():
+def test_no_examples_make_no_set() -> None:
     with pytest.raises(MotionError, match="no aligned clips"):
         set_from_examples([])
 
 
-def valid_tree(aligned):
+def valid_tree(aligned: AlignedSet) -> dict[str, Any]:
     return example_to_tree(aligned, aligned.clips[0], digest=DIGEST)
 
 
@@ -114,6 +118,6 @@ def valid_tree(aligned):
         ({"stray": 1}, "stray"),
     ],
 )
-def test_a_document_that_contradicts_itself_is_refused(aligned, change, said):
+def test_a_document_that_contradicts_itself_is_refused(aligned: AlignedSet, change: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         AlignmentInfo.model_validate({**valid_tree(aligned), **change})

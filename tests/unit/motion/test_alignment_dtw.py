@@ -1,5 +1,6 @@
 """Dynamic time warping against a plain dynamic program and against all ways there are."""
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -8,25 +9,26 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from marey_motion.alignment.dtw import RangeBounds, align, distance_bound, distances, least_total, warped_distance
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
 
 STEPS = ((1, 1), (1, 0), (0, 1))
 
 
-def plain_total(costs):
+def plain_total(costs: Floats) -> float:
     """The textbook recursion, cell by cell."""
     n, m = costs.shape
     totals = np.full((n + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
     for i, j in product(range(1, n + 1), range(1, m + 1)):
         totals[i, j] = costs[i - 1, j - 1] + min(totals[i - 1, j - 1], totals[i - 1, j], totals[i, j - 1])
-    return totals[n, m]
+    return float(totals[n, m])
 
 
-def all_ways(n, m, max_run=None):
+def all_ways(n: int, m: int, max_run: int | None = None) -> Iterator[list[tuple[int, int]]]:
     """Every way from the first cell to the last, as lists of cells."""
 
-    def go(cells, run_step, run):
+    def go(cells: list[tuple[int, int]], run_step: tuple[int, int] | None, run: int) -> Iterator[list[tuple[int, int]]]:
         i, j = cells[-1]
         if (i, j) == (n - 1, m - 1):
             yield cells
@@ -40,12 +42,12 @@ def all_ways(n, m, max_run=None):
     yield from go([(0, 0)], None, 0)
 
 
-def cheapest_way(costs, max_run=None):
+def cheapest_way(costs: Floats, max_run: int | None = None) -> float | None:
     rows, columns = costs.shape
     return min((sum(costs[cell] for cell in way) for way in all_ways(rows, columns, max_run)), default=None)
 
 
-def links_between_layers(max_run):
+def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int], int]]:
     """(layer, step, layer that the step leads to); a cell stands once in each layer.
 
     Layers are what a way has done last: 0 a step in both motions, then 1 to `max_run` steps in a row in the first
@@ -63,7 +65,7 @@ def links_between_layers(max_run):
     return links
 
 
-def step_graph(n, m, max_run):
+def step_graph(n: int, m: int, max_run: int | None) -> Ints:
     """Nodes (e,) that each edge leads from and to; the node of a cell in a layer is its place in (layers, n, m)."""
     cells = np.arange(n * m).reshape(n, m)
     edges = [
@@ -75,14 +77,14 @@ def step_graph(n, m, max_run):
     return np.concatenate(edges).T
 
 
-def shortest_way(costs, edges):
+def shortest_way(costs: Floats, edges: Ints) -> float:
     """From the first cell to the last in any layer, by Dijkstra's algorithm; an edge costs the cell it leads to."""
     nodes = edges.max() + 1
     graph = coo_array((costs.ravel()[edges[1] % costs.size], tuple(edges)), shape=(nodes, nodes)).tocsr()
     return costs[0, 0] + dijkstra(graph, indices=0)[costs.size - 1 :: costs.size].min()
 
 
-def walking_points(frames, speed=1.0, phase=0.0, points=5, seed=0):
+def walking_points(frames: int, speed: float = 1.0, phase: float = 0.0, points: int = 5, seed: int = 0) -> Floats:
     """(frames, points, 3) that swing like limbs."""
     random = np.random.default_rng(seed)
     centres, swings, delays = (random.normal(size=(points, 3)) for _ in range(3))
@@ -91,14 +93,14 @@ def walking_points(frames, speed=1.0, phase=0.0, points=5, seed=0):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (2, 2), (23, 31), (40, 17)])
-def test_the_total_is_that_of_a_plain_dynamic_program(shape):
+def test_the_total_is_that_of_a_plain_dynamic_program(shape: tuple[int, int]) -> None:
     for seed in range(20):
         costs = np.random.default_rng(seed).random(shape)
         assert align(costs).total == pytest.approx(plain_total(costs), rel=1e-14)
 
 
 @pytest.mark.parametrize("max_run", [None, 1, 3])
-def test_totals_are_those_of_an_independent_library(max_run):
+def test_totals_are_those_of_an_independent_library(max_run: int | None) -> None:
     edges = step_graph(23, 31, max_run)
     for seed in range(100):
         costs = np.random.default_rng(seed).random((23, 31))
@@ -109,7 +111,7 @@ def test_totals_are_those_of_an_independent_library(max_run):
 
 @pytest.mark.parametrize("max_run", [None, 0, 1, 2, 3])
 @pytest.mark.parametrize("shape", [(1, 1), (3, 3), (4, 5), (5, 3), (5, 5)])
-def test_no_way_that_keeps_the_limit_is_cheaper(shape, max_run):
+def test_no_way_that_keeps_the_limit_is_cheaper(shape: tuple[int, int], max_run: int | None) -> None:
     for seed in range(10):
         costs = np.random.default_rng(seed).random(shape)
         least = cheapest_way(costs, max_run)
@@ -121,7 +123,7 @@ def test_no_way_that_keeps_the_limit_is_cheaper(shape, max_run):
 
 
 @pytest.mark.parametrize("max_run", [None, 1, 2, 4])
-def test_the_path_is_a_way_of_allowed_steps_that_costs_the_total(max_run):
+def test_the_path_is_a_way_of_allowed_steps_that_costs_the_total(max_run: int | None) -> None:
     for seed in range(20):
         costs = np.random.default_rng(seed).random((25, 33))
         found = align(costs, max_run=max_run)
@@ -134,7 +136,7 @@ def test_the_path_is_a_way_of_allowed_steps_that_costs_the_total(max_run):
         assert longest_run(steps) <= (max_run or 60)
 
 
-def longest_run(steps):
+def longest_run(steps: list[tuple[int, int]]) -> int:
     longest = run = 0
     for before, step in zip([None, *steps], steps, strict=False):
         run = 0 if step == (1, 1) else run + 1 if step == before else 1
@@ -142,22 +144,22 @@ def longest_run(steps):
     return longest
 
 
-def test_a_wide_limit_changes_nothing():
+def test_a_wide_limit_changes_nothing() -> None:
     costs = np.random.default_rng(5).random((30, 34))
     assert align(costs, max_run=40).total == align(costs).total
 
 
-def test_no_steps_in_one_motion_alone_leave_the_diagonal():
+def test_no_steps_in_one_motion_alone_leave_the_diagonal() -> None:
     costs = np.random.default_rng(6).random((12, 12))
     assert align(costs, max_run=0).path.tolist() == [[frame, frame] for frame in range(12)]
 
 
-def test_of_equally_cheap_ways_the_one_with_steps_in_both_motions_is_taken():
+def test_of_equally_cheap_ways_the_one_with_steps_in_both_motions_is_taken() -> None:
     assert align(np.zeros((4, 4))).path.tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
     assert align(np.zeros((4, 4)), max_run=2).path.tolist() == [[0, 0], [1, 1], [2, 2], [3, 3]]
 
 
-def test_a_motion_played_slower_is_aligned_frame_by_frame_with_itself():
+def test_a_motion_played_slower_is_aligned_frame_by_frame_with_itself() -> None:
     motion = walking_points(40)
     slower = motion[np.repeat(np.arange(40), 2)]
     found = align(distances(motion, slower))
@@ -165,27 +167,29 @@ def test_a_motion_played_slower_is_aligned_frame_by_frame_with_itself():
     assert np.array_equal(found.path[:, 0], found.path[:, 1] // 2)
 
 
-def test_distances_are_mean_distances_of_points():
+def test_distances_are_mean_distances_of_points() -> None:
     a, b = walking_points(7, seed=1), walking_points(9, seed=2)
     expected = np.linalg.norm(a[:, None] - b[None], axis=-1).mean(axis=-1)
     assert np.allclose(distances(a, b), expected, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("frames", [(1, 1), (1, 20), (35, 20), (20, 64)])
-def test_the_distance_of_motions_is_the_total_of_their_alignment_per_frame_of_the_longer(frames):
+def test_the_distance_of_motions_is_the_total_of_their_alignment_per_frame_of_the_longer(
+    frames: tuple[int, int],
+) -> None:
     a, b = walking_points(frames[0], seed=3), walking_points(frames[1], 1.3, 0.4, seed=3)
     assert warped_distance(a, b) == pytest.approx(align(distances(a, b)).total / max(frames), rel=1e-13)
     assert warped_distance(a, b) == pytest.approx(warped_distance(b, a), rel=1e-13)
 
 
-def test_a_limit_gives_up_exactly_what_is_above_it():
+def test_a_limit_gives_up_exactly_what_is_above_it() -> None:
     a, b = walking_points(50, seed=4), walking_points(60, 1.2, seed=4)
     distance = warped_distance(a, b)
     assert warped_distance(a, b, limit=distance * 1.000001) == distance
     assert warped_distance(a, b, limit=distance * 0.999999) == np.inf
 
 
-def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart():
+def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart() -> None:
     for seed in range(30):
         a = walking_points(20 + seed, 1.0 + 0.05 * seed, seed=seed)
         b = walking_points(45 - seed, 1.4, 0.1 * seed, seed=seed + seed % 2)
@@ -195,7 +199,7 @@ def test_the_bound_is_never_above_the_distance_and_tells_distant_motions_apart()
     assert distance_bound(walking_points(30), apart, frames_per_box=1000) > 5.0
 
 
-def test_bounds_of_many_motions_at_once_are_those_of_one_box_about_each():
+def test_bounds_of_many_motions_at_once_are_those_of_one_box_about_each() -> None:
     motions = [walking_points(10 + 7 * seed, 1.0 + 0.1 * seed, 0.2 * seed, seed=seed) for seed in range(8)]
     stops = np.cumsum([len(motion) for motion in motions])
     ranges = RangeBounds(np.concatenate(motions), stops - [len(motion) for motion in motions], stops)
@@ -213,7 +217,7 @@ def test_bounds_of_many_motions_at_once_are_those_of_one_box_about_each():
         np.testing.assert_array_equal(limited[limited <= limit], bounds[bounds <= limit])
 
 
-def test_what_cannot_be_aligned_is_refused():
+def test_what_cannot_be_aligned_is_refused() -> None:
     with pytest.raises(MotionError, match="matrix"):
         align(np.zeros((0, 3)))
     with pytest.raises(MotionError, match="finite"):

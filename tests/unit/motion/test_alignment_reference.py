@@ -7,47 +7,48 @@ from marey_motion.alignment.cost import cost_points, frame_costs
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.reference import medoid, nearest_mean_length, pairwise_totals
 from marey_motion.alignment.segments import align_sections
+from marey_motion.arrays import Floats
 from marey_schemas.options.alignment import CostOptions
 
 
-def test_the_medoid_has_the_least_sum_of_costs():
+def test_the_medoid_has_the_least_sum_of_costs() -> None:
     places = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
     assert medoid(np.abs(places[:, None] - places[None])) == 2
 
 
-def test_the_best_candidate_is_kept_and_not_the_last_one():
+def test_the_best_candidate_is_kept_and_not_the_last_one() -> None:
     """A predecessor never updated the best cost that it compared with, so that the last candidate won."""
     totals = np.array([[0.0, 1.0, 9.0], [1.0, 0.0, 8.0], [9.0, 8.0, 0.0]])
     assert medoid(totals) == 1
     assert medoid(totals[::-1, ::-1]) == 1
 
 
-def test_of_examples_that_do_equally_well_the_first_is_taken_in_spite_of_rounding():
+def test_of_examples_that_do_equally_well_the_first_is_taken_in_spite_of_rounding() -> None:
     totals = np.array([[0.0, 0.3, 0.6], [0.3, 0.0, 0.3], [0.6, 0.3, 0.0]])
     twins = np.block([[totals, totals], [totals, totals]])
     assert medoid(twins) == 1
     assert medoid(twins + np.diag([0, 1e-13, 0, 0, -1e-13, 0])) == 1
 
 
-def test_an_example_that_cannot_be_aligned_with_others_is_no_medoid_if_there_is_a_better_one():
+def test_an_example_that_cannot_be_aligned_with_others_is_no_medoid_if_there_is_a_better_one() -> None:
     far = np.inf
     totals = np.array([[0.0, 1.0, far], [1.0, 0.0, 5.0], [far, 5.0, 0.0]])
     assert medoid(totals) == 1
 
 
-def test_the_nearest_to_the_mean_length_is_found_with_ties_to_the_first():
+def test_the_nearest_to_the_mean_length_is_found_with_ties_to_the_first() -> None:
     assert nearest_mean_length([40, 53, 47, 60]) == 1
     assert nearest_mean_length([49, 51]) == 0
 
 
-def clouds(seed=0):
+def clouds(seed: int = 0) -> list[Floats]:
     random = np.random.default_rng(seed)
     return [random.normal(size=(frames, 6, 3)).cumsum(axis=0) * 0.1 for frames in (12, 15, 9, 30, 13)]
 
 
 @pytest.mark.parametrize("max_run", [None, 3, 1])
 @pytest.mark.parametrize("threads", [1, 2])
-def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run, threads):
+def test_costs_of_pairs_are_those_of_aligning_each_section_of_each_two(max_run: int | None, threads: int) -> None:
     points, options = clouds(), CostOptions()
     bounds = [(0, len(cloud) // 3, len(cloud) - 1) for cloud in points]
     ready = [cost_points(cloud, options) for cloud in points]

@@ -1,7 +1,9 @@
 """Cuts, the sections between them, and alignments that keep them."""
 
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +19,12 @@ from marey_motion.alignment.segments import (
     require_labels,
     sections_of,
 )
+from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import AnnotationError
 
 
-def test_segments_cut_where_they_begin_and_where_a_gap_follows_them():
+def test_segments_cut_where_they_begin_and_where_a_gap_follows_them() -> None:
     layer = Layer(
         50,
         (Segment("reach", 5, 20), Segment("hold", 20, 30), Segment("retract", 35, 50)),
@@ -36,12 +39,12 @@ def test_segments_cut_where_they_begin_and_where_a_gap_follows_them():
     )
 
 
-def test_labels_on_one_frame_are_one_cut():
+def test_labels_on_one_frame_are_one_cut() -> None:
     layer = Layer(50, (Segment("reach", 0, 20), Segment("hold", 20, 50)), (Keyframe("contact", 20),))
     assert cuts_of(layer) == (Cut(("reach",), 0), Cut(("contact", "hold"), 20))
 
 
-def test_labels_that_repeat_are_numbered_in_the_order_of_time():
+def test_labels_that_repeat_are_numbered_in_the_order_of_time() -> None:
     layer = Layer(60, (Segment("left", 0, 20), Segment("right", 20, 40), Segment("left", 40, 60)))
     assert [cut.labels for cut in cuts_of(layer)] == [("left",), ("right",), ("left 2",)]
     clash = Layer(60, (Segment("left", 0, 20), Segment("left", 20, 40), Segment("left 2", 40, 60)))
@@ -49,25 +52,25 @@ def test_labels_that_repeat_are_numbered_in_the_order_of_time():
         cuts_of(clash)
 
 
-def test_sections_lie_between_the_ends_and_the_cuts_at_the_rate_of_the_set():
+def test_sections_lie_between_the_ends_and_the_cuts_at_the_rate_of_the_set() -> None:
     found = sections_of((Cut(("contact",), 20),), 51, rate_ratio=0.5)
     assert found.bounds == (0, 10, 50)
     assert found.labels == ((), ("contact",), ())
     assert found.keyframes == {"contact": 10}
 
 
-def test_a_cut_on_the_first_or_last_frame_labels_that_end():
+def test_a_cut_on_the_first_or_last_frame_labels_that_end() -> None:
     found = sections_of((Cut(("reach",), 0), Cut(("grasp",), 29)), 30)
     assert found.bounds == (0, 29)
     assert found.keyframes == {"reach": 0, "grasp": 29}
 
 
-def test_cuts_that_fall_on_one_frame_leave_no_section_and_are_refused():
+def test_cuts_that_fall_on_one_frame_leave_no_section_and_are_refused() -> None:
     with pytest.raises(AnnotationError, match=r"hold: it falls on the same frame as contact"):
         sections_of((Cut(("contact",), 20), Cut(("hold",), 21)), 30, rate_ratio=0.4)
 
 
-def test_the_labels_that_most_examples_have_are_the_common_ones():
+def test_the_labels_that_most_examples_have_are_the_common_ones() -> None:
     odd, usual, other = ((), ("a",), ()), ((), ("a",), ("b",), ()), ((), ("b",), ("a",), ())
     assert common_labels({"2": usual, "1": odd, "3": usual}) == usual
     assert common_labels({"2": usual, "1": other}) == usual
@@ -81,7 +84,7 @@ def test_the_labels_that_most_examples_have_are_the_common_ones():
 
 
 @st.composite
-def sectioned(draw):
+def sectioned(draw: Callable[..., Any]) -> tuple[Floats, list[int], list[int]]:
     """Costs of two motions with the same number of sections."""
     count = draw(st.integers(1, 4))
     lengths = st.integers(1, 12)
@@ -92,7 +95,9 @@ def sectioned(draw):
 
 
 @given(sectioned())
-def test_the_ends_of_every_section_are_matched_exactly_and_time_never_runs_back(example):
+def test_the_ends_of_every_section_are_matched_exactly_and_time_never_runs_back(
+    example: tuple[Floats, list[int], list[int]],
+) -> None:
     costs, reference, source = example
     found = align_sections(costs, reference, source, align)
     assert found.times[reference].tolist() == [float(bound) for bound in source]
@@ -104,7 +109,7 @@ def test_the_ends_of_every_section_are_matched_exactly_and_time_never_runs_back(
 
 
 @given(sectioned())
-def test_the_path_of_all_sections_is_one_way_that_costs_the_total(example):
+def test_the_path_of_all_sections_is_one_way_that_costs_the_total(example: tuple[Floats, list[int], list[int]]) -> None:
     costs, reference, source = example
     found = align_sections(costs, reference, source, align)
     steps = {tuple(step) for step in np.diff(found.path, axis=0).tolist()}
@@ -113,7 +118,7 @@ def test_the_path_of_all_sections_is_one_way_that_costs_the_total(example):
     assert found.mean_cost == pytest.approx(found.total / len(found.path))
 
 
-def test_sections_are_put_behind_each_other_instead_of_each_beginning_at_frame_0():
+def test_sections_are_put_behind_each_other_instead_of_each_beginning_at_frame_0() -> None:
     """A predecessor wrote 0, 1, ..., 22, 23, 0, 0, 1, ... here."""
     costs = np.abs(np.arange(48)[:, None] - np.arange(48)[None]).astype(float)
     found = align_sections(costs, (0, 23, 47), (0, 23, 47), partial(align, max_run=3))
@@ -122,7 +127,7 @@ def test_sections_are_put_behind_each_other_instead_of_each_beginning_at_frame_0
     assert other == one + 1
 
 
-def test_one_section_is_the_plain_alignment():
+def test_one_section_is_the_plain_alignment() -> None:
     costs = np.random.default_rng(4).random((20, 23))
     found = align_sections(costs, (0, 19), (0, 22), partial(align, max_run=3))
     plain = align(costs, max_run=3)

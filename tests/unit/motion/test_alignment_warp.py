@@ -1,5 +1,8 @@
 """Time functions: from paths, back and forth, and applied to motions."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,12 +12,13 @@ from tests.support.alignment_examples import played, sine_warp, walk
 
 from marey_motion.alignment.dtw import align
 from marey_motion.alignment.warp import LEAST_SLOPE, inverse, time_function, warped
+from marey_motion.arrays import Floats, Ints32
 from marey_motion.errors import MotionError
 from marey_motion.motion import Motion
 
 
 @st.composite
-def paths(draw):
+def paths(draw: Callable[..., Any]) -> Ints32:
     """Ways of allowed steps through at least two frames of each motion, mostly with no more than three in a row."""
     steps = draw(st.lists(st.sampled_from(["11", "11", "10", "01", "110", "1000", "0001", "01111"]), min_size=1))
     moves = {"11": [(1, 1)], "10": [(1, 0), (1, 1)], "01": [(0, 1), (1, 1)]}
@@ -27,7 +31,7 @@ def paths(draw):
 
 
 @given(paths())
-def test_a_time_function_rises_strictly_from_the_first_to_the_last_frame_of_the_source(path):
+def test_a_time_function_rises_strictly_from_the_first_to_the_last_frame_of_the_source(path: Ints32) -> None:
     times = time_function(path)
     assert len(times) == path[-1, 0] + 1
     assert times[0] == 0.0
@@ -36,7 +40,7 @@ def test_a_time_function_rises_strictly_from_the_first_to_the_last_frame_of_the_
 
 
 @given(paths())
-def test_a_time_function_stays_within_half_a_run_of_the_path(path):
+def test_a_time_function_stays_within_half_a_run_of_the_path(path: Ints32) -> None:
     times = time_function(path)
     for frame, time in enumerate(times):
         matched = path[path[:, 0] == frame, 1]
@@ -45,17 +49,17 @@ def test_a_time_function_stays_within_half_a_run_of_the_path(path):
         assert abs(time - matched.mean()) <= reach
 
 
-def test_frames_matched_one_to_one_are_the_identity():
+def test_frames_matched_one_to_one_are_the_identity() -> None:
     path = np.stack([np.arange(9)] * 2, axis=1)
     assert time_function(path).tolist() == list(range(9))
 
 
-def test_a_frame_matched_with_several_belongs_to_their_mean():
+def test_a_frame_matched_with_several_belongs_to_their_mean() -> None:
     path = np.array([(0, 0), (1, 1), (1, 2), (1, 3), (2, 4), (3, 5)])
     assert time_function(path).tolist() == [0.0, 2.0, 4.0, 5.0]
 
 
-def test_frames_that_share_one_source_frame_lie_evenly_around_it():
+def test_frames_that_share_one_source_frame_lie_evenly_around_it() -> None:
     path = np.array([(0, 0), (1, 1), (2, 1), (3, 1), (4, 2), (5, 3)])
     times = time_function(path)
     assert times[2] == 1.0
@@ -63,12 +67,12 @@ def test_frames_that_share_one_source_frame_lie_evenly_around_it():
     assert (times[1], times[3]) == pytest.approx((0.5, 1.5))
 
 
-def test_a_section_that_begins_elsewhere_keeps_its_frames():
+def test_a_section_that_begins_elsewhere_keeps_its_frames() -> None:
     path = np.array([(4, 7), (5, 8), (6, 9)])
     assert time_function(path).tolist() == [7.0, 8.0, 9.0]
 
 
-def test_slopes_that_are_too_small_are_raised_and_the_others_give_way_alike():
+def test_slopes_that_are_too_small_are_raised_and_the_others_give_way_alike() -> None:
     long_run = [(frame, 1) for frame in range(1, 60)]
     path = np.array([(0, 0), *long_run, (60, 2), (61, 3), (62, 4)])
     steps = np.diff(time_function(path))
@@ -76,7 +80,7 @@ def test_slopes_that_are_too_small_are_raised_and_the_others_give_way_alike():
     assert steps.sum() == pytest.approx(4.0)
 
 
-def test_a_source_without_the_time_for_the_least_slopes_is_refused():
+def test_a_source_without_the_time_for_the_least_slopes_is_refused() -> None:
     path = np.array([*((frame, 0) for frame in range(300)), (300, 1)])
     with pytest.raises(MotionError, match="cannot pass in 1 frames"):
         time_function(path)
@@ -87,7 +91,7 @@ def test_a_source_without_the_time_for_the_least_slopes_is_refused():
 @given(
     arrays(np.float64, st.integers(3, 60), elements=st.floats(0.02, 4.0)),
 )
-def test_inverting_and_applying_a_time_function_is_the_identity(slopes):
+def test_inverting_and_applying_a_time_function_is_the_identity(slopes: Floats) -> None:
     times = np.concatenate(([0.0], np.cumsum(slopes)))
     times *= max(1, round(times[-1])) / times[-1]
     back = inverse(times)
@@ -95,13 +99,13 @@ def test_inverting_and_applying_a_time_function_is_the_identity(slopes):
     assert np.interp(back, np.arange(len(times)), times) == pytest.approx(np.arange(len(back)), abs=1e-9)
 
 
-def test_the_identity_gives_every_bit_of_the_motion_back():
+def test_the_identity_gives_every_bit_of_the_motion_back() -> None:
     motion = Motion.of(walk())
     same = warped(motion, np.arange(motion.frame_count, dtype=float))
     assert same.poses.tobytes() == motion.poses.tobytes()
 
 
-def test_a_motion_is_played_by_its_time_function_with_slerp_between_frames():
+def test_a_motion_is_played_by_its_time_function_with_slerp_between_frames() -> None:
     clip, times = walk(), sine_warp(60, 47)
     expected = played(clip, times)
     found = warped(Motion.of(clip), times)
@@ -111,7 +115,7 @@ def test_a_motion_is_played_by_its_time_function_with_slerp_between_frames():
     assert np.linalg.norm(found.rotations, axis=-1) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_translations_of_joints_are_played_along():
+def test_translations_of_joints_are_played_along() -> None:
     motion = Motion.of(walk())
     moving = np.linspace(0.0, 1.0, 60)[:, None, None] * np.array([0.0, 0.1, 0.0])
     found = warped(motion._replace(translations=moving, translated_joints=(3,)), [0.0, 29.5, 59.0])
@@ -119,12 +123,12 @@ def test_translations_of_joints_are_played_along():
     assert found.translated_joints == (3,)
 
 
-def test_times_that_the_motion_does_not_have_are_refused():
+def test_times_that_the_motion_does_not_have_are_refused() -> None:
     with pytest.raises(MotionError, match="the frames 0 to 59"):
         warped(Motion.of(walk()), [0.0, 59.5])
 
 
-def test_a_way_through_costs_becomes_a_function_of_the_warp_within_a_frame():
+def test_a_way_through_costs_becomes_a_function_of_the_warp_within_a_frame() -> None:
     truth = sine_warp(60, 75, 0.08)
     places = np.linspace(0.0, 6.0, 60)
     costs = (np.interp(truth, np.arange(60), places)[None] - places[:, None]) ** 2

@@ -49,7 +49,7 @@ def walk_and_run(rate_hz: float) -> MatchingDatabase:
 
 
 @pytest.fixture(scope="module")
-def record(database) -> TrialRecord:
+def record(database: MatchingDatabase) -> TrialRecord:
     trial = Trial("switching", 1.5, np.radians(40), duration_s=12.0, switch_speed_m_s=3.0, switch_every_s=2.0)
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     made = run_trial(database, index, reference(trial), OPTIONS)
@@ -79,7 +79,7 @@ def jump(database: MatchingDatabase, before: int, after: int, ticks: int = 60) -
     return replace(undisturbed(database, 0, ticks), rows=rows, positions=np.zeros((ticks, 2)), headings=np.zeros(ticks))
 
 
-def test_rows_played_as_they_were_recorded_are_the_clip_itself(database):
+def test_rows_played_as_they_were_recorded_are_the_clip_itself(database: MatchingDatabase) -> None:
     original = generate_along(arc(1.0, -60.0, 6.0))
 
     shown = displayed_clip(database, undisturbed(database, 0, 360), OPTIONS)
@@ -89,7 +89,7 @@ def test_rows_played_as_they_were_recorded_are_the_clip_itself(database):
     np.testing.assert_allclose(global_positions(shown), global_positions(original), atol=2e-5)
 
 
-def test_the_root_is_where_the_record_has_it(database):
+def test_the_root_is_where_the_record_has_it(database: MatchingDatabase) -> None:
     turned = replace(
         undisturbed(database, 0, 100), positions=np.tile((3.0, -2.0), (100, 1)), headings=np.full(100, np.pi / 2)
     )
@@ -103,7 +103,7 @@ def test_the_root_is_where_the_record_has_it(database):
     np.testing.assert_allclose(shown[:, joints], expected, atol=2e-5)
 
 
-def test_poses_do_not_jump_where_rows_do(database, record):
+def test_poses_do_not_jump_where_rows_do(database: MatchingDatabase, record: TrialRecord) -> None:
     """Joint angles change from tick to tick hardly more than they do in the data, switch or not."""
     shown = displayed_clip(database, record, OPTIONS)
 
@@ -117,7 +117,7 @@ def test_poses_do_not_jump_where_rows_do(database, record):
 
 
 @pytest.mark.parametrize("rate_hz", [60.0, 240.0])
-def test_position_and_velocity_are_continuous_at_a_switch(rate_hz):
+def test_position_and_velocity_are_continuous_at_a_switch(rate_hz: float) -> None:
     """What the velocity changes in the tick of a switch shrinks with the tick: there is no jump, only acceleration."""
     fine = walk_and_run(rate_hz)
     before, after = round(0.9 * rate_hz), int(fine.starts[1]) + round(1.2 * rate_hz)
@@ -144,7 +144,7 @@ def largest(vectors: np.ndarray) -> float:
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
-def test_what_is_left_of_a_switch_follows_the_closed_form(database):
+def test_what_is_left_of_a_switch_follows_the_closed_form(database: MatchingDatabase) -> None:
     """The hips' height is a plain number: its offset can be followed by hand."""
     before, after = 30, int(database.starts[4]) + 47
     record = jump(database, before, after)
@@ -159,7 +159,7 @@ def test_what_is_left_of_a_switch_follows_the_closed_form(database):
         np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
 
 
-def test_rotations_are_blended_the_short_way_whatever_the_signs_of_their_quaternions():
+def test_rotations_are_blended_the_short_way_whatever_the_signs_of_their_quaternions() -> None:
     clip = generate_along(arc(1.5, 0.0, 3.0))
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     negated = clip.poses * np.where(np.arange(clip.poses.shape[1]) < 3, 1, -1).astype(np.float32)
@@ -172,7 +172,7 @@ def test_rotations_are_blended_the_short_way_whatever_the_signs_of_their_quatern
     np.testing.assert_allclose(global_positions(across), global_positions(within), atol=1e-6)
 
 
-def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity():
+def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity() -> None:
     clip = generate_along(arc(1.5, 0.0, 3.0))
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     joint = body.standard_joints["left_wrist"]
@@ -192,7 +192,7 @@ def test_a_joint_that_moves_against_its_parent_is_blended_in_place_and_velocity(
         np.testing.assert_allclose(shown[29 + ticks], place[cut + ticks] + left, atol=1e-6)
 
 
-def test_a_clip_that_ends_is_left_with_the_velocity_that_it_ended_with(database):
+def test_a_clip_that_ends_is_left_with_the_velocity_that_it_ended_with(database: MatchingDatabase) -> None:
     last, after = int(database.starts[1]) - 1, int(database.starts[4]) + 47
     shown = displayed_clip(database, jump(database, last - 29, after), OPTIONS)
 
@@ -205,7 +205,7 @@ def test_a_clip_that_ends_is_left_with_the_velocity_that_it_ended_with(database)
         np.testing.assert_allclose(shown.root_translations[29 + ticks, 1], height[cut + ticks] + left, atol=1e-6)
 
 
-def test_a_second_switch_takes_along_what_is_left_of_the_first(database):
+def test_a_second_switch_takes_along_what_is_left_of_the_first(database: MatchingDatabase) -> None:
     rows = np.concatenate((30 + np.arange(10), 780 + np.arange(4), 2000 + np.arange(20))).astype(np.int32)
     record = replace(undisturbed(database, 0, 34), rows=rows, positions=np.zeros((34, 2)), headings=np.zeros(34))
 
@@ -215,7 +215,7 @@ def test_a_second_switch_takes_along_what_is_left_of_the_first(database):
     assert speeds[13] < 2 * speeds[:9].max()
 
 
-def test_a_switch_is_where_another_row_than_the_next_follows(database, record):
+def test_a_switch_is_where_another_row_than_the_next_follows(database: MatchingDatabase, record: TrialRecord) -> None:
     cuts = switched_rows(database, record.rows)
 
     jumps = record.status[1:] == Status.REPLACING
@@ -229,7 +229,9 @@ def test_a_switch_is_where_another_row_than_the_next_follows(database, record):
 # The cost of poses
 
 
-def test_pose_cost_is_the_distance_from_the_displayed_pose_to_the_next_row(database, record):
+def test_pose_cost_is_the_distance_from_the_displayed_pose_to_the_next_row(
+    database: MatchingDatabase, record: TrialRecord
+) -> None:
     standing = replace(record, positions=np.zeros_like(record.positions), headings=np.zeros_like(record.headings))
     shown = global_positions(displayed_clip(database, standing, OPTIONS))[:, list(database.body.pose_joints)]
 
@@ -239,7 +241,7 @@ def test_pose_cost_is_the_distance_from_the_displayed_pose_to_the_next_row(datab
     assert np.array_equal(pose_costs(database, record.rows, OPTIONS), record.pose_cost)
 
 
-def test_pose_cost_is_highest_at_a_switch_and_dies_away_with_the_blend(database):
+def test_pose_cost_is_highest_at_a_switch_and_dies_away_with_the_blend(database: MatchingDatabase) -> None:
     rows = jump(database, 30, int(database.starts[7]) + 47, 120).rows
 
     costs = pose_costs(database, rows, OPTIONS)
@@ -251,7 +253,7 @@ def test_pose_cost_is_highest_at_a_switch_and_dies_away_with_the_blend(database)
     np.testing.assert_allclose(costs[110:], steps[50:], atol=1e-3)
 
 
-def test_without_a_switch_pose_cost_is_one_step_of_the_clip(database):
+def test_without_a_switch_pose_cost_is_one_step_of_the_clip(database: MatchingDatabase) -> None:
     rows = np.arange(100, 200, dtype=np.int32)
 
     costs = pose_costs(database, rows, OPTIONS)
@@ -260,7 +262,7 @@ def test_without_a_switch_pose_cost_is_one_step_of_the_clip(database):
     np.testing.assert_allclose(costs, steps, atol=2e-6)
 
 
-def test_a_loops_seam_is_no_switch():
+def test_a_loops_seam_is_no_switch() -> None:
     seconds = 2.0
     clip = generate_along(arc(1.5, 0.0, seconds))
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
@@ -270,7 +272,7 @@ def test_a_loops_seam_is_no_switch():
     assert np.all(switched_rows(looping, rows) == -1)
 
 
-def test_a_switch_to_the_last_row_of_a_loop_shows_in_its_first_row():
+def test_a_switch_to_the_last_row_of_a_loop_shows_in_its_first_row() -> None:
     clip = generate_along(arc(1.5, 0.0, 2.0))
     body = MatchingBody.from_mapping(clip.skeleton, map_joints(clip.skeleton))
     loops = [SourceClip(uid, uid, clip, loop=True) for uid in ("a", "b")]

@@ -3,12 +3,14 @@
 import io
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
 from marey_motion import quaternions
+from marey_motion.arrays import Ints
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
@@ -30,38 +32,38 @@ BLUE, ORANGE = (0x1F, 0x6F, 0xB2), (0xE0, 0x7B, 0x1A)
 
 
 @pytest.fixture(scope="module")
-def walk():
+def walk() -> Clip:
     return generate_gait(1.3, 0.4, 2.0)
 
 
-def pixels_of(png):
+def pixels_of(png: bytes) -> Ints:
     return np.rint(imread(io.BytesIO(png))[..., :3] * 255).astype(int)
 
 
-def cell(pixels, row, column, columns):
+def cell(pixels: Ints, row: int, column: int, columns: int) -> Ints:
     """The pixels of one figure's ground; columns counts figures."""
     width = (PAGE_WIDTH - 2 * MARGIN) / columns
     left, top = MARGIN + column * width, HEADER + row * ROW + TITLE
     return pixels[round(top * DPI) : round((top + STAGE) * DPI), round(left * DPI) : round((left + width) * DPI)]
 
 
-def share_of(pixels, colour):
+def share_of(pixels: Ints, colour: tuple[int, int, int]) -> float:
     return np.mean(np.abs(pixels - colour).max(axis=-1) < 12)
 
 
-def chain(names, offsets, tips=()):
+def chain(names: tuple[Any, ...], offsets: list[tuple[float, float, float]], tips: tuple[Any, ...] = ()) -> Skeleton:
     count = len(names)
     return Skeleton(
         names, np.arange(-1, count - 1, dtype=np.int32), np.array(offsets), quaternions.identity(count), tips
     )
 
 
-def still(skeleton, frames=3):
+def still(skeleton: Skeleton, frames: int = 3) -> Clip:
     pose = np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))
     return Clip(skeleton, 30.0, np.tile(pose, (frames, 1)))
 
 
-def test_each_take_has_a_row_with_figures_of_both_sides_in_every_cell(walk):
+def test_each_take_has_a_row_with_figures_of_both_sides_in_every_cell(walk: Clip) -> None:
     png = contact_sheet([TakePair("one", walk, walk), TakePair("two", walk, walk)], moments=3)
 
     pixels = pixels_of(png)
@@ -74,22 +76,22 @@ def test_each_take_has_a_row_with_figures_of_both_sides_in_every_cell(walk):
             assert share_of(figure, ORANGE) > 0.003
 
 
-def test_source_and_result_are_drawn_at_one_scale(walk):
+def test_source_and_result_are_drawn_at_one_scale(walk: Clip) -> None:
     small = generate_gait(1.3, 0.4, 2.0, stature_m=0.9)
     pixels = pixels_of(contact_sheet([TakePair("", walk, small)], moments=2))
 
-    def height(column):
+    def height(column: int) -> np.int64:
         dark = np.abs(cell(pixels, 0, column, 4) - BLUE).max(axis=-1) < 12
         return np.ptp(np.flatnonzero(dark.any(axis=1)))
 
     assert height(1) == pytest.approx(0.9 / 1.78 * height(0), rel=0.1)
 
 
-def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk):
+def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk: Clip) -> None:
     contact_sheet([TakePair(r"cost $5 and \frac{1}{0} ^_ {", walk, walk), TakePair("x" * 5000, walk, walk)])
 
 
-def test_the_same_takes_give_the_same_picture_in_many_threads(walk):
+def test_the_same_takes_give_the_same_picture_in_many_threads(walk: Clip) -> None:
     takes = [TakePair("walk", walk, walk)]
 
     with ThreadPoolExecutor(4) as pool:
@@ -97,13 +99,13 @@ def test_the_same_takes_give_the_same_picture_in_many_threads(walk):
     assert len(set(sheets)) == 1
 
 
-def test_only_the_frames_shown_are_computed(walk, monkeypatch):
+def test_only_the_frames_shown_are_computed(walk: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     computed = []
     from marey_motion import kinematics
 
     original = kinematics.forward_kinematics
 
-    def counted(skeleton, poses, **options):
+    def counted(skeleton: Any, poses: Any, **options: Any) -> Any:
         computed.append(len(poses))
         return original(skeleton, poses, **options)
 
@@ -112,7 +114,7 @@ def test_only_the_frames_shown_are_computed(walk, monkeypatch):
     assert computed == [5, 5]
 
 
-def test_clips_of_one_frame_of_one_joint_and_of_no_extent_are_drawn():
+def test_clips_of_one_frame_of_one_joint_and_of_no_extent_are_drawn() -> None:
     point = chain(("point",), [(0.0, 0.0, 0.0)])
     stick = chain(("a", "b"), [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0)], (EndSite(1, np.array((0.0, 0.5, 0.0))),))
 
@@ -121,14 +123,14 @@ def test_clips_of_one_frame_of_one_joint_and_of_no_extent_are_drawn():
         assert contact_sheet([TakePair("tiny", clip, clip)]).startswith(b"\x89PNG")
 
 
-def test_a_clip_of_two_frames_is_shown_at_two_moments(walk):
+def test_a_clip_of_two_frames_is_shown_at_two_moments(walk: Clip) -> None:
     pixels = pixels_of(contact_sheet([TakePair("short", walk.sliced(0, 2), walk.sliced(0, 2))], moments=4))
 
     assert share_of(cell(pixels, 0, 3, 8), BLUE) > 0.003
     assert share_of(cell(pixels, 0, 4, 8), BLUE) == 0.0
 
 
-def test_figures_below_the_floor_stay_on_their_ground(walk):
+def test_figures_below_the_floor_stay_on_their_ground(walk: Clip) -> None:
     poses = walk.poses.copy()
     poses[:, 1] -= 1.5
     pixels = pixels_of(contact_sheet([TakePair("sunk", replace(walk, poses=poses), walk)], moments=2))
@@ -137,12 +139,12 @@ def test_figures_below_the_floor_stay_on_their_ground(walk):
 
 
 @pytest.mark.parametrize(("count", "moments"), [(0, 6), (101, 6), (1, 0), (1, 13)])
-def test_a_sheet_of_nothing_or_of_too_much_is_refused(walk, count, moments):
+def test_a_sheet_of_nothing_or_of_too_much_is_refused(walk: Clip, count: int, moments: int) -> None:
     with pytest.raises(MotionError, match="1 to 100 takes at 1 to 12 moments"):
         contact_sheet([TakePair("", walk, walk)] * count, moments=moments)
 
 
-def test_props_and_roots_on_the_floor_are_no_part_of_a_body():
+def test_props_and_roots_on_the_floor_are_no_part_of_a_body() -> None:
     skeleton = game_skeleton()
     body = body_of(skeleton)
 
@@ -151,7 +153,7 @@ def test_props_and_roots_on_the_floor_are_no_part_of_a_body():
     assert {"spine_02", "neck_02", "calf_l", "hand_r", "head"} <= drawn
 
 
-def test_bones_have_the_side_of_the_body_they_belong_to():
+def test_bones_have_the_side_of_the_body_they_belong_to() -> None:
     skeleton = game_skeleton()
     body = body_of(skeleton)
 
@@ -165,14 +167,14 @@ def test_bones_have_the_side_of_the_body_they_belong_to():
     assert sides["spine_02"] == sides["spine_04"] == sides["head"] == CENTRE
 
 
-def test_a_body_without_names_or_limbs_is_drawn_whole():
+def test_a_body_without_names_or_limbs_is_drawn_whole() -> None:
     skeleton = chain(("a", "b", "c"), [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
 
     assert body_of(skeleton).bones.tolist() == [[1, 0], [2, 1]]
     assert stances_at(still(skeleton), body_of(skeleton), np.array([0])).facing is None
 
 
-def test_figures_are_centred_on_the_pelvis_and_face_their_heading():
+def test_figures_are_centred_on_the_pelvis_and_face_their_heading() -> None:
     clip = generate_gait(2.0, np.pi / 4, 4.0)
     stances = stances_at(clip, body_of(clip.skeleton), np.array([0, 120]))
 
@@ -181,7 +183,7 @@ def test_figures_are_centred_on_the_pelvis_and_face_their_heading():
     assert stances.facing[1] == pytest.approx((1.0, 0.0), abs=0.05)
 
 
-def test_a_camera_in_front_sees_the_left_side_on_the_right_and_near_things_lower():
+def test_a_camera_in_front_sees_the_left_side_on_the_right_and_near_things_lower() -> None:
     camera = Camera(direction_rad=0.0, tilt_rad=np.radians(10))
 
     left, near, up = camera.seen(np.eye(3)[[0, 2, 1]])
@@ -190,7 +192,7 @@ def test_a_camera_in_front_sees_the_left_side_on_the_right_and_near_things_lower
     assert up[1] > 0.9
 
 
-def test_a_body_lying_on_its_side_is_drawn_without_an_arrow():
+def test_a_body_lying_on_its_side_is_drawn_without_an_arrow() -> None:
     clip = still(studio_skeleton())
     poses = clip.poses.copy()
     poses[:, 3:7] = quaternions.from_axis_angle((0.0, 0.0, 1.0), np.pi / 2)

@@ -2,23 +2,32 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle, PathPatch
 from tests.support.drawn_figures import cut_off
 
 from marey_motion import kinematics
+from marey_motion.arrays import Floats
 from marey_motion.gait import generate_gait
+from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE
 from marey_reports.drawing.stick_figures import body_of, runs_of
 from marey_reports.drawing.strips import StripMoments, StripRow, draw_strips
 
 
 @pytest.fixture(scope="module")
-def walk():
+def walk() -> tuple[Skeleton, Floats]:
     clip = generate_gait(1.2, 0.0, 1.0)
     return clip.skeleton, kinematics.global_positions(clip, end_sites=True).astype(np.float64)
 
 
-def strip(walk, *, shift=(0.0, 0.0, 0.0), ghost=False, copies=1):
+def strip(
+    walk: tuple[Skeleton, Floats],
+    *,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ghost: bool = False,
+    copies: int = 1,
+) -> Figure:
     skeleton, points = walk
     body = body_of(skeleton)
     shown = points[[0, 30, 59]]
@@ -31,17 +40,22 @@ def strip(walk, *, shift=(0.0, 0.0, 0.0), ghost=False, copies=1):
     )
 
 
-def coloured(figure, colour):
+def coloured(figure: Figure, colour: str) -> list[PathPatch]:
     return [patch for patch in figure.axes[0].get_children() if isinstance(patch, PathPatch) and same(patch, colour)]
 
 
-def same(patch, colour):
+def points_of(patch: PathPatch) -> Floats:
+    """The points of a drawn path, (n, 2), in inches."""
+    return np.asarray(patch.get_path().vertices)
+
+
+def same(patch: PathPatch, colour: str) -> bool:
     from matplotlib.colors import to_rgb
 
     return np.allclose(patch.get_edgecolor()[:3], to_rgb(colour))
 
 
-def test_each_cell_has_a_body_with_a_left_a_right_and_a_middle(walk):
+def test_each_cell_has_a_body_with_a_left_a_right_and_a_middle(walk: tuple[Skeleton, Floats]) -> None:
     figure = strip(walk)
     for colour in (COLOURS[0], COLOURS[1], INK):
         assert len(coloured(figure, colour)) == 3
@@ -49,36 +63,37 @@ def test_each_cell_has_a_body_with_a_left_a_right_and_a_middle(walk):
     assert not cut_off(figure)
 
 
-def test_seen_from_ahead_the_left_side_is_on_the_right(walk):
+def test_seen_from_ahead_the_left_side_is_on_the_right(walk: tuple[Skeleton, Floats]) -> None:
     figure = strip(walk)
-    left, right = (np.mean([patch.get_path().vertices[:, 0].mean() for patch in coloured(figure, colour)])
+    left, right = (np.mean([points_of(patch)[:, 0].mean() for patch in coloured(figure, colour)])
                    for colour in COLOURS[:2])  # fmt: skip
     assert left > right
 
 
-def test_a_motion_that_is_elsewhere_stands_beside_the_ghost_of_the_other(walk):
+def test_a_motion_that_is_elsewhere_stands_beside_the_ghost_of_the_other(walk: tuple[Skeleton, Floats]) -> None:
     moved = strip(walk, shift=(0.2, 0.0, 0.0), ghost=True)
     ghosts, lefts = coloured(moved, REFERENCE), coloured(moved, COLOURS[0])
     assert len(ghosts) == 9
     still = coloured(strip(walk, ghost=True), COLOURS[0])
-    away = lefts[0].get_path().vertices[:, 0].mean() - still[0].get_path().vertices[:, 0].mean()
+    away = points_of(lefts[0])[:, 0].mean() - points_of(still[0])[:, 0].mean()
     assert away > 0.05  # inches: to the viewer's right is the body's left
 
 
-def test_feet_stand_on_the_line_of_the_floor(walk):
+def test_feet_stand_on_the_line_of_the_floor(walk: tuple[Skeleton, Floats]) -> None:
     figure = strip(walk)
-    floors = [line.get_ydata()[0] for line in figure.axes[0].lines if len(set(line.get_ydata())) == 1]
-    lowest = min(patch.get_path().vertices[:, 1].min() for patch in coloured(figure, COLOURS[0]))
+    heights = [np.asarray(line.get_ydata()) for line in figure.axes[0].lines]
+    floors = [line[0] for line in heights if len(set(line)) == 1]
+    lowest = min(points_of(patch)[:, 1].min() for patch in coloured(figure, COLOURS[0]))
     assert lowest == pytest.approx(min(floors), abs=0.1)
 
 
-def test_many_bodies_on_top_of_each_other_are_pale(walk):
+def test_many_bodies_on_top_of_each_other_are_pale(walk: tuple[Skeleton, Floats]) -> None:
     one, many = coloured(strip(walk), COLOURS[0]), coloured(strip(walk, copies=9), COLOURS[0])
     assert len(many) == 9 * len(one)
     assert many[0].get_alpha() < one[0].get_alpha()
 
 
-def test_bones_are_joined_to_runs_that_hold_each_bone_once():
+def test_bones_are_joined_to_runs_that_hold_each_bone_once() -> None:
     bones = np.array([[3, 2], [2, 1], [1, 0], [5, 4], [4, 1]])
     runs = runs_of(bones)
     drawn = [tuple(pair) for run in runs for pair in zip(run[:-1].tolist(), run[1:].tolist(), strict=True)]

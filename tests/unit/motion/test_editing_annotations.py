@@ -1,5 +1,7 @@
 """Layers of annotation and the commands that change them."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,15 +19,15 @@ WALK = Layer(
 )
 
 
-def labelled(layer):
+def labelled(layer: Layer) -> list[str | None]:
     """The label of every frame, None where there is none."""
-    labels = [None] * layer.frame_count
+    labels: list[str | None] = [None] * layer.frame_count
     for segment in layer.segments:
         labels[segment.start : segment.end] = [segment.label] * (segment.end - segment.start)
     return labels
 
 
-def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too():
+def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too() -> None:
     split = annotations.split_segment(WALK, 14, None)
     assert labelled(split) == labelled(WALK)
     assert split.segments[1:3] == (Segment("right", 10, 14), Segment("right", 14, 18))
@@ -33,18 +35,18 @@ def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too():
     assert at_the_last.segments[1:3] == (Segment("right", 10, 17), Segment("end", 17, 18))
 
 
-def test_a_segment_is_not_split_before_its_first_frame():
+def test_a_segment_is_not_split_before_its_first_frame() -> None:
     with pytest.raises(AnnotationError, match=r"segment 'right' 10:18: it starts at frame 10") as refused:
         annotations.split_segment(WALK, 10, None)
     assert refused.value.code == "empty-segment"
 
 
-def test_a_new_segment_over_others_is_refused_by_the_name_of_the_first_in_the_way():
+def test_a_new_segment_over_others_is_refused_by_the_name_of_the_first_in_the_way() -> None:
     with pytest.raises(AnnotationError, match=r"'turn' 16:24: segment 'right' 10:18 overlaps it"):
         annotations.create_segment(WALK, "turn", 16, 24, overwrite=False)
 
 
-def test_a_new_segment_that_overwrites_cuts_what_is_there():
+def test_a_new_segment_that_overwrites_cuts_what_is_there() -> None:
     made = annotations.create_segment(WALK, "turn", 12, 14, overwrite=True)
     assert made.segments[1:4] == (Segment("right", 10, 12), Segment("turn", 12, 14), Segment("right", 14, 18))
     all_over = annotations.create_segment(WALK, "all", 0, FRAMES, overwrite=True)
@@ -53,13 +55,13 @@ def test_a_new_segment_that_overwrites_cuts_what_is_there():
 
 @pytest.mark.parametrize(("start", "end", "code"), [(4, 4, "empty-segment"), (28, 31, "outside-clip")])
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_what_is_no_segment_of_the_clip_is_refused(start, end, code, overwrite):
+def test_what_is_no_segment_of_the_clip_is_refused(start: int, end: int, code: str, overwrite: bool) -> None:
     with pytest.raises(AnnotationError) as refused:
         annotations.create_segment(Layer(FRAMES), "x", start, end, overwrite=overwrite)
     assert refused.value.code == code
 
 
-def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named():
+def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named() -> None:
     assert annotations.merge_segment(WALK, 12, "next").segments[-1] == Segment("right", 10, 30)
     assert annotations.merge_segment(WALK, 12, "previous").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 12, "nearest").segments[0] == Segment("right", 5, 18)
@@ -69,7 +71,7 @@ def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named():
     assert refused.value.code == "no-neighbour"
 
 
-def test_a_neighbour_that_touches_a_moved_boundary_follows_it_both_ways():
+def test_a_neighbour_that_touches_a_moved_boundary_follows_it_both_ways() -> None:
     assert annotations.move_boundary(WALK, 6, "end", 12).segments[:2] == (
         Segment("left", 5, 12),
         Segment("right", 12, 18),
@@ -81,7 +83,7 @@ def test_a_neighbour_that_touches_a_moved_boundary_follows_it_both_ways():
     )
 
 
-def test_a_neighbour_across_a_gap_gives_way_only_where_it_must():
+def test_a_neighbour_across_a_gap_gives_way_only_where_it_must() -> None:
     assert annotations.move_boundary(WALK, 15, "end", 20).segments[1:] == (
         Segment("right", 10, 20),
         Segment("stand", 22, 30),
@@ -94,12 +96,12 @@ def test_a_neighbour_across_a_gap_gives_way_only_where_it_must():
         annotations.move_boundary(WALK, 15, "end", 30)
 
 
-def test_a_boundary_does_not_pass_the_other_end_of_its_segment():
+def test_a_boundary_does_not_pass_the_other_end_of_its_segment() -> None:
     with pytest.raises(AnnotationError, match="with its start at 18 it would have no frames"):
         annotations.move_boundary(WALK, 15, "start", 18)
 
 
-def test_segments_are_relabelled_and_removed_by_any_of_their_frames():
+def test_segments_are_relabelled_and_removed_by_any_of_their_frames() -> None:
     assert annotations.relabel_segment(WALK, 9, "swing").segments[0] == Segment("swing", 5, 10)
     assert annotations.remove_segment(WALK, 29).segments == WALK.segments[:2]
     with pytest.raises(AnnotationError, match="frame 20: no segment contains this frame") as refused:
@@ -107,7 +109,7 @@ def test_segments_are_relabelled_and_removed_by_any_of_their_frames():
     assert refused.value.code == "no-segment"
 
 
-def test_keyframes_are_added_moved_and_removed():
+def test_keyframes_are_added_moved_and_removed() -> None:
     layer = annotations.add_keyframe(WALK, "passing", 3)
     assert layer.keyframes[0] == Keyframe("passing", 3)
     layer = annotations.move_keyframe(layer, "passing", 3, 15)
@@ -125,23 +127,23 @@ def test_keyframes_are_added_moved_and_removed():
         ("remove_keyframe", {"label": "strike", "frame": 7}, "no-keyframe"),
     ],
 )
-def test_keyframes_that_make_no_sense_are_refused(command, arguments, code):
+def test_keyframes_that_make_no_sense_are_refused(command: str, arguments: dict[str, Any], code: str) -> None:
     with pytest.raises(AnnotationError) as refused:
         COMMANDS[command](WALK, **arguments)
     assert refused.value.code == code
 
 
-def test_what_was_cleared_is_empty():
+def test_what_was_cleared_is_empty() -> None:
     assert annotations.clear(WALK) == Layer(FRAMES)
 
 
-def test_a_layer_cannot_hold_overlapping_segments():
+def test_a_layer_cannot_hold_overlapping_segments() -> None:
     with pytest.raises(AnnotationError, match=r"'b' 4:6: segment 'a' 0:5 overlaps it") as refused:
         Layer(FRAMES, (Segment("b", 4, 6), Segment("a", 0, 5)))
     assert refused.value.code == "segments-overlap"
 
 
-def test_a_piece_knows_its_own_segment_and_the_keyframes_within_it():
+def test_a_piece_knows_its_own_segment_and_the_keyframes_within_it() -> None:
     piece = piece_of(WALK, WALK.segments[1], 6, 20)
     assert piece == Layer(14, (Segment("right", 4, 12),), (Keyframe("lift", 7), Keyframe("strike", 7)))
     with pytest.raises(AnnotationError, match="the frames 11:20 of 30 do not contain it"):
@@ -175,12 +177,12 @@ commands = st.one_of(
 )
 
 
-def segment_at(layer, frame):
+def segment_at(layer: Layer, frame: int) -> Segment:
     """The segment that holds a frame."""
     return next(one for one in layer.segments if one.start <= frame < one.end)
 
 
-def expected(before, command, given_):
+def expected(before: Layer, command: str, given_: dict[str, Any]) -> list[str | None]:
     """The label of every frame after a command that was accepted, painted frame by frame."""
     labels_ = labelled(before)
     if command == "create_segment":
@@ -210,7 +212,7 @@ def expected(before, command, given_):
 
 
 @given(st.lists(commands, max_size=30))
-def test_any_commands_leave_ordered_segments_without_overlap_within_the_clip(given_commands):
+def test_any_commands_leave_ordered_segments_without_overlap_within_the_clip(given_commands: list[Any]) -> None:
     layer = Layer(FRAMES)
     for command, arguments in given_commands:
         before = layer
@@ -236,14 +238,14 @@ def test_any_commands_leave_ordered_segments_without_overlap_within_the_clip(giv
             assert len(layer.segments) == len(before.segments) - 1
 
 
-def test_commands_look_only_at_what_they_change_however_many_segments_there_are():
+def test_commands_look_only_at_what_they_change_however_many_segments_there_are() -> None:
     class Watched(Segment):
         """A segment that counts who asks for its frames."""
 
         looks = 0
 
         @property
-        def start(self):
+        def start(self) -> int:
             Watched.looks += 1
             return self[1]
 

@@ -1,5 +1,6 @@
 """Two evaluations of the same trials, told apart trial by trial."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from statistics import NormalDist
 
@@ -9,23 +10,26 @@ from tests.support.smaller_databases import without_sources
 from tests.support.suggestion_cases import OPTIONS, UNWANTED, evaluated, named, wandering_tracks
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import compare_results, paired_change
 from marey_motion.evaluation.improvement.selection import joined
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.matching.building import union_normaliser, with_normaliser
+from marey_motion.matching.database import MatchingDatabase
 
 
 @pytest.fixture(scope="module")
-def database():
+def database() -> MatchingDatabase:
     return synthetic_database(wandering_tracks())
 
 
 @pytest.fixture(scope="module")
-def result(database):
+def result(database: MatchingDatabase) -> EvaluationResult:
     return evaluated(database)
 
 
-def test_an_evaluation_compared_with_itself_has_not_changed(result):
+def test_an_evaluation_compared_with_itself_has_not_changed(result: EvaluationResult) -> None:
     found = compare_results(result, result)
     assert found.changed == ()
     assert {change.verdict for change in found.metrics} == {"same"}
@@ -34,14 +38,18 @@ def test_an_evaluation_compared_with_itself_has_not_changed(result):
     assert (found.removed, found.added, found.newly_unused) == ((), (), ())
 
 
-def test_removing_unused_clips_changes_no_trial_although_rows_are_numbered_anew(database, result):
+def test_removing_unused_clips_changes_no_trial_although_rows_are_numbered_anew(
+    database: MatchingDatabase, result: EvaluationResult
+) -> None:
     after = evaluated(without_sources(database, UNWANTED))
     found = compare_results(result, after)
     assert found.changed == ()
     assert found.removed == UNWANTED
 
 
-def test_only_trials_that_went_another_way_are_told_and_from_where_on(database, result):
+def test_only_trials_that_went_another_way_are_told_and_from_where_on(
+    database: MatchingDatabase, result: EvaluationResult
+) -> None:
     after = evaluated(without_sources(database, ["clip_001"]))
     found = compare_results(result, after)
     changed = {change.trial: change for change in found.changed}
@@ -56,7 +64,9 @@ def test_only_trials_that_went_another_way_are_told_and_from_where_on(database, 
 
 
 @pytest.mark.parametrize("kept", ["positions", "headings", "status", "match_cost", "continuing_cost", "pose_cost"])
-def test_a_trial_that_differs_in_anything_at_one_tick_is_told_with_that_tick(result, kept):
+def test_a_trial_that_differs_in_anything_at_one_tick_is_told_with_that_tick(
+    result: EvaluationResult, kept: str
+) -> None:
     values = getattr(result.records[1], kept).copy()
     values[7] = 1 if np.isnan(values[7]).any() else values[7] + 1
     records = (result.records[0], replace(result.records[1], **{kept: values}), *result.records[2:])
@@ -64,7 +74,7 @@ def test_a_trial_that_differs_in_anything_at_one_tick_is_told_with_that_tick(res
     assert (change.trial, change.first_tick, change.same_motion) == (result.trials[1].trial.name, 7, False)
 
 
-def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion():
+def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion() -> None:
     tracks = named(wandering_tracks()[:4])
     database = synthetic_database(tracks)
     copies = [tracks[number]._replace(uid=f"a_{number}") for number in range(4)]
@@ -77,7 +87,7 @@ def test_a_copy_under_a_lower_uid_is_told_as_the_same_motion():
     assert found.added == ("a_0", "a_1", "a_2", "a_3")
 
 
-def test_changes_of_metrics_are_means_over_paired_trials(database, result):
+def test_changes_of_metrics_are_means_over_paired_trials(database: MatchingDatabase, result: EvaluationResult) -> None:
     after = evaluated(without_sources(database, ["clip_003"]))
     for change in compare_results(result, after).metrics:
         pairs = [
@@ -92,7 +102,7 @@ def test_changes_of_metrics_are_means_over_paired_trials(database, result):
         assert change.change - 1e-12 <= change.high
 
 
-def test_the_interval_holds_the_true_change_about_as_often_as_it_says():
+def test_the_interval_holds_the_true_change_about_as_often_as_it_says() -> None:
     random = np.random.default_rng(1)
     held = 0
     for _ in range(60):
@@ -103,14 +113,14 @@ def test_the_interval_holds_the_true_change_about_as_often_as_it_says():
     assert 51 <= held <= 60
 
 
-def test_the_interval_of_normal_changes_is_two_standard_errors_to_each_side():
+def test_the_interval_of_normal_changes_is_two_standard_errors_to_each_side() -> None:
     changes = np.random.default_rng(4).normal(0.3, 1.0, 400)
     found = paired_change("offset_mean", np.zeros(400), changes)
     reach = 1.96 * changes.std() / np.sqrt(400)
     assert (found.low, found.high) == pytest.approx((changes.mean() - reach, changes.mean() + reach), abs=0.05 * reach)
 
 
-def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side():
+def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side() -> None:
     changes = np.sort(np.random.default_rng(5).exponential(size=25))
     found = paired_change("offset_mean", np.zeros(25), changes)
     low, high = efron_bounds(changes)
@@ -118,7 +128,7 @@ def test_the_interval_of_skewed_changes_reaches_farther_to_the_long_side():
     assert high - changes.mean() > 1.25 * (changes.mean() - low)
 
 
-def efron_bounds(changes):
+def efron_bounds(changes: Floats) -> Iterator[float]:
     """Bias corrected and accelerated bounds of the mean as Efron (1987) writes them, of other resamples."""
     normal, random, count = NormalDist(), np.random.default_rng(6), len(changes)
     means = np.sort(random.choice(changes, (20_000, count)).mean(axis=1))
@@ -132,13 +142,13 @@ def efron_bounds(changes):
         yield means[int(share * len(means))]
 
 
-def test_the_interval_is_the_same_every_time():
+def test_the_interval_is_the_same_every_time() -> None:
     random = np.random.default_rng(2)
     before, after = random.normal(size=40), random.normal(size=40)
     assert paired_change("dse_v", before, after) == paired_change("dse_v", before, after)
 
 
-def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them():
+def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them() -> None:
     counts = np.arange(9, 15)  # switches in 30 s, five more in every trial
     found = paired_change("transitions_per_s", counts / 30, (counts + 5) / 30)
     assert found.low <= found.high
@@ -146,7 +156,7 @@ def test_changes_that_differ_by_rounding_alone_have_an_interval_around_them():
     assert paired_change("transitions_per_s", [2.0, 2.0], [2.0, 2.0]).verdict == "same"
 
 
-def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction():
+def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction() -> None:
     before = np.linspace(1.0, 2.0, 30)
     noise = np.random.default_rng(3).normal(size=30)
     assert paired_change("offset_mean", before, before - 0.5 + 0.1 * noise).verdict == "better"
@@ -157,7 +167,9 @@ def test_a_verdict_needs_an_interval_without_zero_and_a_metric_with_a_direction(
     assert paired_change("offset_mean", [1.0], [0.5]).verdict == "unclear"
 
 
-def test_evaluations_under_other_conditions_are_refused_by_name(database, result):
+def test_evaluations_under_other_conditions_are_refused_by_name(
+    database: MatchingDatabase, result: EvaluationResult
+) -> None:
     fitted_anew = synthetic_database(wandering_tracks()[:5])
     with pytest.raises(MotionError, match="normaliser"):
         compare_results(result, evaluated(fitted_anew))
@@ -170,7 +182,7 @@ def test_evaluations_under_other_conditions_are_refused_by_name(database, result
         compare_results(result, replace(result, records=()))
 
 
-def test_one_normaliser_makes_two_databases_comparable():
+def test_one_normaliser_makes_two_databases_comparable() -> None:
     tracks = wandering_tracks()
     before, after = (
         synthetic_database(tracks[:6]),

@@ -1,19 +1,21 @@
 from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.evaluation_cases import arc, clips_of, record_of, root_database
 
 from marey_motion.errors import MotionError
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.result_documents import (
     records_from_tree,
     records_to_tree,
     result_from_tree,
     result_to_tree,
 )
-from marey_motion.evaluation.scenario import reference, suite_trials
+from marey_motion.evaluation.scenario import Trial, reference, suite_trials
 from marey_motion.evaluation.suite import assemble
-from marey_motion.matching.record import Status
+from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
@@ -29,7 +31,7 @@ OPTIONS = EvaluationOptions(
 TRIALS = suite_trials(OPTIONS)
 
 
-def searched_record(trial, number):
+def searched_record(trial: Trial, number: int) -> TrialRecord:
     """Follows its reference, with a search every six ticks and a switch now and then."""
     asked = reference(trial)
     ticks = asked.tick_count
@@ -51,7 +53,7 @@ def searched_record(trial, number):
 
 
 @pytest.fixture(scope="module")
-def result():
+def result() -> EvaluationResult:
     database = root_database(arc(1.0, 50.0, 5.0), arc(2.0, -50.0, 4.0), arc(1.0, 0.0, 0.5), options=OPTIONS.database)
     tagged = replace(database.clips[0], tags=("walk",)), replace(database.clips[1], mirrored_from="a")
     database = replace(database, clips=(*tagged, database.clips[2]))
@@ -60,7 +62,7 @@ def result():
     return assemble(database, OPTIONS, TRIALS, records, baseline=baseline)
 
 
-def same(left, right):
+def same(left: Any, right: Any) -> bool:
     """Whether two results say the same, to the bit and to the type of every array."""
     if is_dataclass(left):
         return type(left) is type(right) and all(
@@ -75,11 +77,11 @@ def same(left, right):
     return type(left) is type(right) and left == right
 
 
-def test_an_evaluation_comes_back_from_its_tree_as_it_was(result):
+def test_an_evaluation_comes_back_from_its_tree_as_it_was(result: EvaluationResult) -> None:
     assert same(result_from_tree(result_to_tree(result), result.records), result)
 
 
-def test_records_come_back_from_their_tree_as_they_were(result):
+def test_records_come_back_from_their_tree_as_they_were(result: EvaluationResult) -> None:
     known = records_from_tree(records_to_tree(TRIALS, result.records))
 
     assert list(known) == [trial.name for trial in TRIALS]
@@ -87,7 +89,7 @@ def test_records_come_back_from_their_tree_as_they_were(result):
 
 
 @pytest.mark.parametrize("media_type", MEDIA_TYPES)
-def test_both_documents_travel_in_every_format(result, media_type):
+def test_both_documents_travel_in_every_format(result: EvaluationResult, media_type: str) -> None:
     evaluation = decode_tree(encode_tree(result_to_tree(result), media_type), media_type)
     records = decode_tree(encode_tree(records_to_tree(TRIALS, result.records), media_type), media_type)
     back = result_from_tree(evaluation, tuple(records_from_tree(records).values()))
@@ -99,7 +101,7 @@ def test_both_documents_travel_in_every_format(result, media_type):
     assert result_to_tree(back).keys() == result_to_tree(result).keys()
 
 
-def test_blocks_keep_every_bit(result):
+def test_blocks_keep_every_bit(result: EvaluationResult) -> None:
     media_type = "application/msgpack"
     tree = records_to_tree(TRIALS, result.records)
     back = records_from_tree(decode_tree(encode_tree(tree, media_type, arrays="blocks"), media_type))
@@ -107,21 +109,21 @@ def test_blocks_keep_every_bit(result):
     assert same(tuple(back.values()), result.records)
 
 
-def test_records_of_shares_of_the_trials_join_to_those_of_all(result):
+def test_records_of_shares_of_the_trials_join_to_those_of_all(result: EvaluationResult) -> None:
     shares = [records_from_tree(records_to_tree(TRIALS[share::3], result.records[share::3])) for share in (2, 0, 1)]
     known = shares[0] | shares[1] | shares[2]
 
     assert same(tuple(known[trial.name] for trial in TRIALS), result.records)
 
 
-def test_records_without_any_search_come_back(result):
+def test_records_without_any_search_come_back(result: EvaluationResult) -> None:
     quiet = record_of(reference(TRIALS[0]))
     (back,) = records_from_tree(records_to_tree(TRIALS[:1], [quiet])).values()
 
     assert same(back, quiet)
 
 
-def test_the_same_result_gives_the_same_bytes(result):
+def test_the_same_result_gives_the_same_bytes(result: EvaluationResult) -> None:
     first, second = (
         encode_tree(tree, "application/msgpack", arrays="blocks")
         for tree in (result_to_tree(result), result_to_tree(result_from_tree(result_to_tree(result))))
@@ -129,19 +131,19 @@ def test_the_same_result_gives_the_same_bytes(result):
     assert first == second
 
 
-def test_a_document_of_another_schema_is_refused(result):
+def test_a_document_of_another_schema_is_refused(result: EvaluationResult) -> None:
     with pytest.raises(MotionError, match="marey/evaluation-records@1 is needed, not marey/evaluation@1"):
         records_from_tree(result_to_tree(result))
     with pytest.raises(MotionError, match="not None"):
         result_from_tree({})
 
 
-def test_records_of_several_rates_are_refused(result):
+def test_records_of_several_rates_are_refused(result: EvaluationResult) -> None:
     slower = replace(result.records[1], rate_hz=30.0)
     with pytest.raises(MotionError, match="rates"):
         records_to_tree(TRIALS[:2], [result.records[0], slower])
 
 
-def test_clips_of_an_evaluation_tell_where_their_frames_are(result):
+def test_clips_of_an_evaluation_tell_where_their_frames_are(result: EvaluationResult) -> None:
     assert [usage.popularity.shape for usage in result.usage] == [(301,), (241,), (31,)]
     assert clips_of(301, 241, 31)[1].start == result.clips[1].start

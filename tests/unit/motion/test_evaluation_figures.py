@@ -8,6 +8,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from tests.support.evaluation_results import SMALL, evaluated, some_coverage, sy
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import demand, suite_trials
 from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status
@@ -30,18 +32,20 @@ SWITCHING = "switching v=2 w=50"
 
 
 @pytest.fixture(scope="module")
-def result():
+def result() -> EvaluationResult:
     return synthetic_result()
 
 
 @pytest.fixture(scope="module")
-def other():
+def other() -> EvaluationResult:
     return synthetic_result(seed=5, clips=9, sway_m=0.05)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_time(name, result, other):
+def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_time(
+    name: Any, result: EvaluationResult, other: Any
+) -> None:
     for compared in (None, other):
         first, second = (is_sound(draw_figure(name, result, other=compared)) for _ in range(2))
         assert first.png == second.png
@@ -49,7 +53,7 @@ def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_tim
         assert first.files() == second.files()
 
 
-def test_threads_draw_the_same_figures_at_once(result):
+def test_threads_draw_the_same_figures_at_once(result: EvaluationResult) -> None:
     alone = draw_figure("clip-graph", result)
     with ThreadPoolExecutor(4) as pool:
         drawn = list(pool.map(lambda _: draw_figure("clip-graph", result), range(4)))
@@ -58,7 +62,7 @@ def test_threads_draw_the_same_figures_at_once(result):
     assert {figure.png for figure in drawn} == {alone.png}
 
 
-def test_drawing_leaves_the_settings_of_matplotlib_alone(result):
+def test_drawing_leaves_the_settings_of_matplotlib_alone(result: EvaluationResult) -> None:
     import matplotlib
 
     before = dict(matplotlib.rcParams)
@@ -66,12 +70,12 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone(result):
     assert dict(matplotlib.rcParams) == before
 
 
-def test_matplotlib_is_not_loaded_before_something_is_drawn():
+def test_matplotlib_is_not_loaded_before_something_is_drawn() -> None:
     script = "import sys, marey_reports.evaluation.page; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
-def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
+def test_the_files_of_a_figure_are_its_pictures_and_its_data(result: EvaluationResult) -> None:
     figure = draw_figure("errors", result)
     files = figure.files()
 
@@ -82,7 +86,7 @@ def test_the_files_of_a_figure_are_its_pictures_and_its_data(result):
 
 
 @pytest.mark.slow
-def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result):
+def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records_for(result: EvaluationResult) -> None:
     assert list(draw_figures(result)) == list(FIGURES)
     assert not set(draw_figures(replace(result, records=()))) & set(ONE_TRIAL)
     circles = synthetic_result(SMALL.replace(families=("circle",)))
@@ -92,7 +96,7 @@ def test_all_figures_of_a_result_are_drawn_but_those_it_has_no_trials_or_records
 # Figure 1
 
 
-def test_points_are_the_windows_of_the_coverage(result):
+def test_points_are_the_windows_of_the_coverage(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("points", result), "points")
     coverage = result.coverage
 
@@ -101,7 +105,7 @@ def test_points_are_the_windows_of_the_coverage(result):
     assert [row["clip"] for row in rows] == [result.clips[clip].uid for clip in coverage.clip]
 
 
-def test_of_very_many_windows_evenly_spaced_ones_are_drawn():
+def test_of_very_many_windows_evenly_spaced_ones_are_drawn() -> None:
     big = synthetic_result(clips=300, frames=500)
     figure = draw_figure("points", big)
     drawn = figure.data["tables"]["points"]["speed_m_s"]
@@ -114,7 +118,7 @@ def test_of_very_many_windows_evenly_spaced_ones_are_drawn():
 # Figures 4a and 4b
 
 
-def test_a_scenario_has_the_approach_and_a_section_for_each_speed(result):
+def test_a_scenario_has_the_approach_and_a_section_for_each_speed(result: EvaluationResult) -> None:
     sections = rows_of(draw_figure("scenario-switching", result, trial=SWITCHING), "sections")
 
     assert [row["section"] for row in sections] == [1, 2, 3, 4]
@@ -123,7 +127,9 @@ def test_a_scenario_has_the_approach_and_a_section_for_each_speed(result):
     assert [row["turn_rate_deg_s"] for row in sections] == pytest.approx([0.0, 50.0, 50.0, 50.0])
 
 
-def test_a_scenario_shows_where_the_character_went_beside_where_it_should_have(result, other):
+def test_a_scenario_shows_where_the_character_went_beside_where_it_should_have(
+    result: EvaluationResult, other: EvaluationResult
+) -> None:
     name = "circle v=1 w=100"
     index = [each.trial.name for each in result.trials].index(name)
     paths = draw_figure("scenario-circle", result, trial=name, other=other, labels=("old", "new")).tables["paths"]
@@ -133,7 +139,7 @@ def test_a_scenario_shows_where_the_character_went_beside_where_it_should_have(r
     assert np.max(np.asarray(paths["reference_x_m"])) > 0.5  # a left turn
 
 
-def test_scenarios_can_be_drawn_without_records(result):
+def test_scenarios_can_be_drawn_without_records(result: EvaluationResult) -> None:
     bare = replace(result, records=())
     assert set(draw_figure("scenario-circle", bare).tables["paths"]) == {"time_s", "reference_x_m", "reference_z_m"}
 
@@ -141,7 +147,7 @@ def test_scenarios_can_be_drawn_without_records(result):
 # Figure 5
 
 
-def test_offsets_are_those_of_the_trials(result):
+def test_offsets_are_those_of_the_trials(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("offsets", result), "offsets")
     drawn = {(row["family"], row["speed_m_s"], round(row["turn_rate_deg_s"])): row["offset_mean_m"] for row in rows}
 
@@ -151,7 +157,7 @@ def test_offsets_are_those_of_the_trials(result):
         assert drawn[key] == each.metrics["offset_mean"]
 
 
-def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value():
+def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value() -> None:
     assert nice_levels(0.61).tolist() == pytest.approx(np.arange(0, 0.71, 0.1).tolist())
     assert nice_levels(14.0).tolist() == list(range(0, 15, 2))
     assert nice_levels(1.0)[-1] == pytest.approx(1.0)
@@ -162,7 +168,7 @@ def test_levels_of_a_scale_are_round_numbers_that_reach_the_largest_value():
 
 
 @pytest.mark.parametrize(("name", "cell"), [("density", 50.0 * 1.0), ("directions", 0.25 * 0.25)])
-def test_the_map_of_density_holds_all_seconds_of_data(name, cell, result):
+def test_the_map_of_density_holds_all_seconds_of_data(name: str, cell: float, result: EvaluationResult) -> None:
     table = draw_figure(name, result).data["tables"]["density"]
     x, y = (np.unique(values) for values in list(table.values())[:2])
     fine = (x[1] - x[0]) * (y[1] - y[0])
@@ -175,7 +181,7 @@ def test_the_map_of_density_holds_all_seconds_of_data(name, cell, result):
 # Figure 7
 
 
-def test_transition_costs_and_switches_are_those_of_the_record(result):
+def test_transition_costs_and_switches_are_those_of_the_record(result: EvaluationResult) -> None:
     table = draw_figure("transition-cost", result, trial=SWITCHING).tables["costs"]
     record = result.records[[each.trial.name for each in result.trials].index(SWITCHING)]
 
@@ -187,7 +193,7 @@ def test_transition_costs_and_switches_are_those_of_the_record(result):
 # Figure 8
 
 
-def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(result):
+def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(result: EvaluationResult) -> None:
     trial = "circle v=3 w=-50"
     metrics = next(each.metrics for each in result.trials if each.trial.name == trial)
     for negate, sign in ((False, 1.0), (True, -1.0)):
@@ -199,20 +205,20 @@ def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(
 
 
 @pytest.mark.parametrize("name", ["errors", "transition-cost"])
-def test_the_title_says_in_words_and_units_what_the_trial_asks_for(name, result):
+def test_the_title_says_in_words_and_units_what_the_trial_asks_for(name: str, result: EvaluationResult) -> None:
     figure = draw_figure(name, result, trial=SWITCHING)
     assert ">left turn of 50 deg/s at 2 m/s switching to 4<" in figure.svg
     assert SWITCHING not in figure.svg + figure.caption
 
 
-def test_the_histogram_holds_the_evaluated_seconds(result):
+def test_the_histogram_holds_the_evaluated_seconds(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("errors", result, trial=SWITCHING), "histogram")
     for quantity in ("speed_m_s", "turn_rate_deg_s"):
         held = sum(row["seconds"] for row in rows if row["quantity"] == quantity)
         assert held == pytest.approx(12.0, abs=0.1)
 
 
-def test_two_normals_are_found_again():
+def test_two_normals_are_found_again() -> None:
     random = np.random.default_rng(0)
     values = np.concatenate((random.normal(-0.1, 0.2, 3_000), random.normal(-1.5, 0.1, 2_000)))
     begins = np.arange(5_000) >= 2_800  # the begin need not be right
@@ -223,7 +229,7 @@ def test_two_normals_are_found_again():
     assert fit.weights == pytest.approx((0.4, 0.6), abs=0.02)
 
 
-def test_a_fit_without_spread_or_without_groups_is_still_one():
+def test_a_fit_without_spread_or_without_groups_is_still_one() -> None:
     fit = fit_two(np.full(50, 0.3), np.zeros(50, dtype=bool))
     assert fit.means == pytest.approx((0.3, 0.3))
     assert fit.weights.sum() == 1.0
@@ -235,7 +241,7 @@ def test_a_fit_without_spread_or_without_groups_is_still_one():
 # Figure 9
 
 
-def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result):
+def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("usage", result), "usage")
 
     assert {row["clip"]: row["frames"] for row in rows[:-1]} == {
@@ -245,14 +251,14 @@ def test_usage_counts_the_frames_of_every_clip_and_the_transitions(result):
     assert rows[-1]["frames"] == sum(each.metrics["transitions"] for each in result.trials)
 
 
-def test_usage_of_one_trial_is_that_of_its_record(result):
+def test_usage_of_one_trial_is_that_of_its_record(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("usage", result, trial=SWITCHING), "usage")
     record = result.records[[each.trial.name for each in result.trials].index(SWITCHING)]
 
     assert sum(row["frames"] for row in rows[:-1]) == len(record.rows)
 
 
-def test_less_used_clips_are_one_bar(result):
+def test_less_used_clips_are_one_bar(result: EvaluationResult) -> None:
     figure = draw_figure("usage", result, options=FigureOptions(most_clips=4, logarithmic=True))
 
     assert "6 other clips" in figure.svg
@@ -262,7 +268,7 @@ def test_less_used_clips_are_one_bar(result):
 # Figure 10
 
 
-def test_the_dots_hold_all_displayed_frames_and_the_lines_all_jumps(result):
+def test_the_dots_hold_all_displayed_frames_and_the_lines_all_jumps(result: EvaluationResult) -> None:
     figure = draw_figure("clip-graph", result)
     frames, lines = rows_of(figure, "frames"), rows_of(figure, "transitions")
 
@@ -275,7 +281,7 @@ def test_the_dots_hold_all_displayed_frames_and_the_lines_all_jumps(result):
     assert len(lines) <= 400
 
 
-def test_lines_of_many_clips_are_joined_rather_than_left_out():
+def test_lines_of_many_clips_are_joined_rather_than_left_out() -> None:
     big = synthetic_result(clips=40, unused=0, seed=3)
     figure = draw_figure("clip-graph", big)
     shown = set(figure.data["tables"]["frames"]["clip"])
@@ -294,7 +300,7 @@ def test_lines_of_many_clips_are_joined_rather_than_left_out():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 24])
-def test_circles_touch_none_other_and_hold_each_frame_in_one_dot(count):
+def test_circles_touch_none_other_and_hold_each_frame_in_one_dot(count: int) -> None:
     frames = {f"clip{index}": 5 + 400 * index for index in range(count)}
     circles = list(arrange(frames, {("clip0", "clip2"): 9}).values())
 
@@ -312,7 +318,7 @@ def test_circles_touch_none_other_and_hold_each_frame_in_one_dot(count):
 # Holes, and use of frames
 
 
-def test_holes_are_the_deficits_of_the_coverage(result):
+def test_holes_are_the_deficits_of_the_coverage(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("holes", result), "holes")
 
     assert [row["missing_s"] for row in rows] == result.coverage.deficit_s.ravel().tolist()
@@ -320,7 +326,7 @@ def test_holes_are_the_deficits_of_the_coverage(result):
     assert [row["turn_rate_deg_s"] for row in rows[:5]] == pytest.approx([-100, -50, 0, 50, 100])
 
 
-def test_the_use_of_frames_averages_their_popularity(result):
+def test_the_use_of_frames_averages_their_popularity(result: EvaluationResult) -> None:
     rows = rows_of(draw_figure("frame-use", result), "stretches")
     most = max(result.usage, key=lambda usage: usage.ticks)
     mine = [row for row in rows if row["clip"] == result.clips[most.clip].uid]
@@ -332,7 +338,7 @@ def test_the_use_of_frames_averages_their_popularity(result):
 # What is asked for
 
 
-def test_without_a_name_the_trial_that_went_worst_is_shown(result):
+def test_without_a_name_the_trial_that_went_worst_is_shown(result: EvaluationResult) -> None:
     worst = max(
         (each for each in result.trials if each.trial.family == "switching"),
         key=lambda each: each.metrics["offset_mean"],
@@ -340,7 +346,7 @@ def test_without_a_name_the_trial_that_went_worst_is_shown(result):
     assert demand(worst.trial) in draw_figure("transition-cost", result).svg
 
 
-def test_what_there_is_not_is_refused(result):
+def test_what_there_is_not_is_refused(result: EvaluationResult) -> None:
     for name, trial, code in (
         ("offset", None, "unknown-figure"),
         ("errors", "circle v=9 w=0", "unknown-trial"),
@@ -359,7 +365,9 @@ def test_what_there_is_not_is_refused(result):
 # Evaluations of little
 
 
-def tiny(clips, options=SMALL, seed=0, covered=True):
+def tiny(
+    clips: tuple[DatabaseClip, ...], options: EvaluationOptions = SMALL, seed: int = 0, covered: bool = True
+) -> EvaluationResult:
     random = np.random.default_rng(seed)
     trials = suite_trials(options)
     records = tuple(wandering(trial, clips, 0.1, random) for trial in trials)
@@ -368,7 +376,7 @@ def tiny(clips, options=SMALL, seed=0, covered=True):
     return evaluated(options, clips, trials, records, coverage)
 
 
-def without_transitions(result):
+def without_transitions(result: Any) -> Any:
     records = tuple(
         replace(
             record,
@@ -411,18 +419,18 @@ LITTLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("little", LITTLE)
-def test_evaluations_of_little_are_drawn(little):
+def test_evaluations_of_little_are_drawn(little: str) -> None:
     for figure in draw_figures(LITTLE[little]()).values():
         is_sound(figure)
 
 
 @pytest.mark.parametrize("little", ["one clip", "no windows", "one speed", "unknown numbers"])
-def test_evaluations_of_little_are_compared(little, other):
+def test_evaluations_of_little_are_compared(little: str, other: EvaluationResult) -> None:
     for figure in draw_figures(other, other=LITTLE[little]()).values():
         is_sound(figure)
 
 
-def standing():
+def standing() -> EvaluationResult:
     """A clip that stands but for rounding: its windows and what the trials recorded."""
     made = tiny(
         (DatabaseClip("only", "only", "", 0, 900),),
@@ -436,7 +444,7 @@ def standing():
     return replace(made, records=records, coverage=coverage)
 
 
-def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion():
+def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion() -> None:
     figures = draw_figures(standing())
     assert "0 % of the time backward, 0 % mainly sideways." in figures["directions"].caption
     assert "840 windows from 1 clip, all" in figures["points"].caption
@@ -444,7 +452,7 @@ def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion():
         assert not re.search(r">1e", figure.svg.replace("\N{MINUS SIGN}", "-"))  # an axis in powers of ten
 
 
-def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():
+def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be() -> None:
     names = (r"cost $5 and \frac{1}{0} ^_ {", "<b>bold</b> & more", "line\nbreak \x00\x1b", "x" * 5000, "")
     for figure in draw_figures(synthetic_result(names=names)).values():
         is_sound(figure)
@@ -452,14 +460,14 @@ def test_names_of_clips_are_drawn_as_they_are_but_for_signs_that_cannot_be():
     assert shortened("a" * 20 + "b" * 20, 11) == "aaaaa…bbbbb"[:11]
 
 
-def test_labels_leave_out_the_folder_that_all_clips_lie_in():
+def test_labels_leave_out_the_folder_that_all_clips_lie_in() -> None:
     assert without_shared_folder(["lab/walks/a_01", "lab/walks/a_02"]) == ["a_01", "a_02"]
     assert without_shared_folder(["lab/walks/a", "lab/runs/a"]) == ["walks/a", "runs/a"]
     assert without_shared_folder(["walk", "wander"]) == ["walk", "wander"]
     assert without_shared_folder([]) == []
 
 
-def test_labels_tell_clips_apart_however_long_their_names_are():
+def test_labels_tell_clips_apart_however_long_their_names_are() -> None:
     takes = [f"set/walks/dataset-1_{action}_001" for action in ("walk-left_feminine", "walk-right_feminine", "run_sad")]
     assert labels_of(takes) == ["walk-left_feminine_001", "walk-right_feminine_001", "run_sad_001"]
     assert labels_of(["cmu/16_15", "cmu/16_17"]) == ["16_15", "16_17"]
@@ -473,7 +481,7 @@ def test_labels_tell_clips_apart_however_long_their_names_are():
     assert labels_of([]) == []
 
 
-def test_a_clip_has_the_same_label_in_the_graphs_of_both_results():
+def test_a_clip_has_the_same_label_in_the_graphs_of_both_results() -> None:
     takes = [f"set/walks/dataset-1_walk-left_feminine_{take:03d}" for take in range(10)]
     before = synthetic_result(names=takes)
     other = replace(before.clips[0], uid="new@1", name="more/dataset-2_walk-turn-left_active_001")
@@ -484,7 +492,7 @@ def test_a_clip_has_the_same_label_in_the_graphs_of_both_results():
     assert len(set(second)) == 1
 
 
-def test_bars_of_usage_are_called_by_what_tells_their_clips_apart():
+def test_bars_of_usage_are_called_by_what_tells_their_clips_apart() -> None:
     names = [
         f"set/walks/walk-{side}_feminine_before_noon_{take:03d}" for side in ("left", "right") for take in range(5)
     ]

@@ -1,6 +1,7 @@
 """Clips of other collections that fill holes come first, as far as they can be blended."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,25 +13,26 @@ from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.improvement.filling import plan_fillings, rank_fillings
 from marey_motion.evaluation.improvement.selection import joined
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
 
 THRESHOLD = 1.5
 
 
-def straight_set():
+def straight_set() -> MatchingDatabase:
     """Walks straight ahead at both speeds of the grid, and no turns."""
     return synthetic_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0)]))
 
 
-def others(**tracks):
+def others(**tracks: Any) -> MatchingDatabase:
     return synthetic_database([track._replace(uid=uid) for uid, track in sorted(tracks.items())])
 
 
-def ranked(database, **collections):
+def ranked(database: MatchingDatabase, **collections: Any) -> tuple[Any, ...]:
     coverage = measure_coverage(database, OPTIONS)
     return rank_fillings(database, coverage, collections, OPTIONS, THRESHOLD)
 
 
-def test_the_clip_that_fills_a_hole_comes_first_and_what_fills_none_is_left_out():
+def test_the_clip_that_fills_a_hole_comes_first_and_what_fills_none_is_left_out() -> None:
     outside = others(
         left=arc_track(1.0, 50.0, 4.0), short_left=arc_track(1.0, 50.0, 1.5), straight=arc_track(1.0, 0.0, 9.0)
     )
@@ -42,7 +44,7 @@ def test_the_clip_that_fills_a_hole_comes_first_and_what_fills_none_is_left_out(
     assert found[1].filled_s == pytest.approx(0.5)
 
 
-def test_the_predicted_index_is_that_of_the_set_with_the_clip():
+def test_the_predicted_index_is_that_of_the_set_with_the_clip() -> None:
     database, outside = straight_set(), others(left=arc_track(1.0, 50.0, 4.0), right=arc_track(2.0, -50.0, 4.0))
     for filling in ranked(database, outside=outside):
         rest = [clip.uid for clip in outside.clips if clip.uid != filling.source]
@@ -50,7 +52,7 @@ def test_the_predicted_index_is_that_of_the_set_with_the_clip():
         assert filling.coverage_index == measure_coverage(union, OPTIONS).index
 
 
-def test_the_better_blendable_of_two_clips_that_fill_alike_comes_first():
+def test_the_better_blendable_of_two_clips_that_fill_alike_comes_first() -> None:
     turn = arc_track(1.0, 50.0, 4.0)
     outside = others(alien=turn._replace(pose=turn.pose + 3.0), kindred=turn)
     kindred, alien = ranked(straight_set(), outside=outside)
@@ -58,7 +60,7 @@ def test_the_better_blendable_of_two_clips_that_fill_alike_comes_first():
     assert (alien.source, alien.blendable_share, alien.score) == ("alien", 0.0, 0.0)
 
 
-def test_a_cell_that_is_filled_to_the_last_frame_is_full_however_its_seconds_are_rounded():
+def test_a_cell_that_is_filled_to_the_last_frame_is_full_however_its_seconds_are_rounded() -> None:
     turn = arc_track(1.0, 50.0, 4.0)
     names = ("positions", "headings", "pose")
     part, rest = (turn._replace(**{name: getattr(turn, name)[:frames] for name in names}) for frames in (80, 100))
@@ -72,7 +74,7 @@ def test_a_cell_that_is_filled_to_the_last_frame_is_full_however_its_seconds_are
     assert filling.coverage_index == pytest.approx(coverage.index + 1 / 6)
 
 
-def test_only_the_frames_that_fill_holes_are_asked_whether_they_can_be_blended():
+def test_only_the_frames_that_fill_holes_are_asked_whether_they_can_be_blended() -> None:
     ahead, turn = arc_track(1.0, 0.0, 3.0), arc_track(1.0, 50.0, 3.0)
     pose = np.concatenate((ahead.pose, turn.pose))
     pose[:120] += 3.0  # like nothing in the set, where there is enough already
@@ -86,7 +88,7 @@ def test_only_the_frames_that_fill_holes_are_asked_whether_they_can_be_blended()
     assert filling.blendable_share == 1.0
 
 
-def test_clips_of_another_skeleton_need_a_retarget_and_come_last():
+def test_clips_of_another_skeleton_need_a_retarget_and_come_last() -> None:
     outside = others(left=arc_track(1.0, 50.0, 4.0))
     skeleton = replace(outside.body.skeleton, offsets=outside.body.skeleton.offsets * 1.2)
     foreign = others(foreign_left=arc_track(1.0, 50.0, 4.0), foreign_right=arc_track(2.0, -50.0, 4.0))
@@ -98,13 +100,13 @@ def test_clips_of_another_skeleton_need_a_retarget_and_come_last():
     assert found[1].score is None
 
 
-def test_clips_that_the_set_has_already_are_no_candidates():
+def test_clips_that_the_set_has_already_are_no_candidates() -> None:
     turn = arc_track(1.0, 50.0, 1.5)
     database = synthetic_database([arc_track(1.0, 0.0, 6.0, uid="a"), turn._replace(uid="left")])
     assert ranked(database, outside=others(left=turn)) == ()
 
 
-def test_a_plan_adds_what_the_earlier_additions_leave_open():
+def test_a_plan_adds_what_the_earlier_additions_leave_open() -> None:
     outside = others(
         left_long=arc_track(1.0, 50.0, 4.0), left_too=arc_track(1.0, 50.0, 3.0), right=arc_track(1.0, -50.0, 1.6)
     )
@@ -118,14 +120,14 @@ def test_a_plan_adds_what_the_earlier_additions_leave_open():
     assert plan[1].filled_s == pytest.approx(0.6)
 
 
-def test_a_mirrored_collection_fills_both_sides():
+def test_a_mirrored_collection_fills_both_sides() -> None:
     outside = with_mirrored([arc_track(1.0, 50.0, 4.0, uid="left")])
     (filling,) = ranked(with_mirrored(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0)])), outside=outside)
     assert {cell.turn_rate_deg_s for cell in filling.cells} == {-50.0, 50.0}
     assert filling.filled_s == 2.0
 
 
-def test_adding_what_fills_a_hole_improves_the_trials_of_its_cells():
+def test_adding_what_fills_a_hole_improves_the_trials_of_its_cells() -> None:
     database = straight_set()
     outside = others(left=arc_track(1.0, 50.0, 8.0), right=arc_track(1.0, -50.0, 8.0))
     before, after = evaluated(database), evaluated(joined(database, outside))
@@ -134,7 +136,7 @@ def test_adding_what_fills_a_hole_improves_the_trials_of_its_cells():
             assert other.metrics["offset_mean"] < 0.5 * one.metrics["offset_mean"]
 
 
-def test_only_so_many_frames_of_a_long_clip_are_compared():
+def test_only_so_many_frames_of_a_long_clip_are_compared() -> None:
     database, outside = straight_set(), others(left=arc_track(1.0, 50.0, 20.0))
     coverage = measure_coverage(database, OPTIONS)
     (few,) = rank_fillings(database, coverage, {"outside": outside}, OPTIONS, THRESHOLD, most_frames=50)
@@ -143,7 +145,7 @@ def test_only_so_many_frames_of_a_long_clip_are_compared():
     assert many.measured == np.sum(measure_coverage(outside, OPTIONS).turn_rate_rad_s > 0)
 
 
-def test_the_search_can_be_stopped():
+def test_the_search_can_be_stopped() -> None:
     database = straight_set()
     coverage = measure_coverage(database, OPTIONS)
     with pytest.raises(EvaluationCancelled):

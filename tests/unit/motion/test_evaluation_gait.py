@@ -2,6 +2,7 @@
 
 from itertools import product
 from math import radians
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.evaluation import suite as suites
 from marey_motion.evaluation.coverage import measure_coverage
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.scenario import reference, suite_trials
 from marey_motion.evaluation.suite import assemble, evaluate, evaluate_baseline, run_suite
 from marey_motion.gait import GaitStyle, generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.controller import run_trial
-from marey_motion.matching.database import SourceClip
+from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.matching.search import build_index
 from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
@@ -31,7 +33,7 @@ SMALL = EvaluationOptions(
 )
 
 
-def gait_clips(cells, seconds, *, varied=False):
+def gait_clips(cells: Any, seconds: float, *, varied: bool = False) -> list[SourceClip]:
     return [
         SourceClip(
             f"gait-{number:03d}",
@@ -42,23 +44,23 @@ def gait_clips(cells, seconds, *, varied=False):
     ]
 
 
-def database_of(clips, options=None, **given):
+def database_of(clips: list[SourceClip], options: DatabaseOptions | None = None, **given: Any) -> MatchingDatabase:
     skeleton = clips[0].clip.skeleton
     body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
     return build_database(clips, body, options or DatabaseOptions(), **given)
 
 
-def evaluated(database, options):
+def evaluated(database: MatchingDatabase, options: EvaluationOptions) -> EvaluationResult:
     trials = suite_trials(options)
     return assemble(database, options, trials, run_suite(database, options, trials=trials))
 
 
 @pytest.fixture(scope="module")
-def grid_clips():
+def grid_clips() -> list[SourceClip]:
     return gait_clips(product(CIRCLES.speeds_m_s, CIRCLES.turn_rates_deg_s), 10.0)
 
 
-def test_a_mirror_closed_data_set_turns_alike_to_both_sides():
+def test_a_mirror_closed_data_set_turns_alike_to_both_sides() -> None:
     clips = gait_clips(((v, w) for v in CIRCLES.speeds_m_s for w in CIRCLES.turn_rates_deg_s if w >= 0.0), 10.0)
     mirrored = DatabaseOptions(mirroring="add")
     # From the first tick on the circle: the way straight ahead has no side, and begins on the same foot for both.
@@ -71,7 +73,7 @@ def test_a_mirror_closed_data_set_turns_alike_to_both_sides():
 
 
 @pytest.mark.parametrize("family", ["circle", "switching"])
-def test_a_mirrored_data_set_does_to_the_right_what_the_original_does_to_the_left(family):
+def test_a_mirrored_data_set_does_to_the_right_what_the_original_does_to_the_left(family: str) -> None:
     generator = np.random.default_rng(7)
     cells = np.stack((generator.uniform(0.8, 3.2, 25), generator.uniform(-30.0, 110.0, 25)), axis=1).tolist()
     clips = gait_clips(cells, 6.0, varied=True)
@@ -92,7 +94,7 @@ def test_a_mirrored_data_set_does_to_the_right_what_the_original_does_to_the_lef
     assert plain.suite["offset_mean"] > 0.1  # the trials are not trivially the same
 
 
-def test_clips_that_own_every_cell_follow_every_circle(grid_clips):
+def test_clips_that_own_every_cell_follow_every_circle(grid_clips: list[SourceClip]) -> None:
     result = evaluated(database_of(grid_clips), CIRCLES)
 
     assert max(one.metrics["offset_mean"] for one in result.trials) < 0.8
@@ -101,7 +103,7 @@ def test_clips_that_own_every_cell_follow_every_circle(grid_clips):
     assert not result.coverage.deficit_s.any()
 
 
-def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not(grid_clips):
+def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not(grid_clips: list[SourceClip]) -> None:
     options = CIRCLES
     wide = [clip for clip in grid_clips if abs(float(clip.name.split("w=")[1])) <= 70.0]
     result = evaluated(database_of(wide), options)
@@ -116,7 +118,7 @@ def test_without_tight_turns_the_tight_circles_are_missed_and_the_others_are_not
     assert result.coverage.index == pytest.approx(5 / 9)
 
 
-def test_the_windows_of_a_generated_circle_lie_at_its_speed_and_turn_rate():
+def test_the_windows_of_a_generated_circle_lie_at_its_speed_and_turn_rate() -> None:
     clip = generate_gait(2.0, radians(50.0), 10.0 + 1 / 60, style=RIGID)
     coverage = measure_coverage(database_of([SourceClip("circle", "circle", clip)]), SMALL)
 
@@ -128,7 +130,7 @@ def test_the_windows_of_a_generated_circle_lie_at_its_speed_and_turn_rate():
     assert coverage.strafe_m_s == pytest.approx(0.0, abs=0.02)  # the spine swings about the hips
 
 
-def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
+def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser() -> None:
     clips = gait_clips(product((1.0, 2.0, 4.0), (-50.0, 0.0, 50.0, 300.0)), 6.0)
     database = database_of(clips)
     result = evaluated(database, SMALL)
@@ -144,7 +146,7 @@ def test_removing_what_no_trial_used_changes_no_bit_with_a_pinned_normaliser():
             assert getattr(before, name).tobytes() == getattr(after, name).tobytes()
 
 
-def test_a_database_that_looks_farther_than_a_second_ahead_sees_every_switch_that_comes():
+def test_a_database_that_looks_farther_than_a_second_ahead_sees_every_switch_that_comes() -> None:
     looking_far = DatabaseOptions(horizons_s=(1.0, 2.0, 3.0))
     database = database_of(gait_clips(product((1.0, 2.0, 4.0), (0.0, 50.0)), 6.0), looking_far)
     options = SMALL.replace(speeds_m_s=(1.0,), turn_rates_deg_s=(50.0,), families=("switching",), switch_every_s=1.0)
@@ -161,7 +163,7 @@ def test_a_database_that_looks_farther_than_a_second_ahead_sees_every_switch_tha
 # The baseline
 
 
-def test_the_baseline_owns_every_cell_and_both_speeds():
+def test_the_baseline_owns_every_cell_and_both_speeds() -> None:
     baseline = evaluate_baseline(SMALL)
 
     assert baseline.coverage.index == 1.0
@@ -171,7 +173,7 @@ def test_the_baseline_owns_every_cell_and_both_speeds():
     assert baseline.suite["circle.offset_mean"] < 0.8
 
 
-def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch):
+def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     first = evaluate_baseline(SMALL, threads=1)
     assert evaluate_baseline(SMALL) is first
     monkeypatch.setattr(suites, "_baselines", {})
@@ -183,7 +185,7 @@ def test_the_baseline_is_the_same_whenever_it_is_made(monkeypatch):
     assert second.suite == first.suite
 
 
-def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named(monkeypatch):
+def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def generate_slow_gait(speed_m_s: float, *arguments: float) -> Clip:
         if speed_m_s >= IMPOSSIBLE_M_S:
             raise MotionError("the legs are too short", code="gait-out-of-reach")
@@ -198,7 +200,7 @@ def test_cells_that_nobody_can_walk_are_left_out_of_the_baseline_and_named(monke
     assert baseline.notes[0].startswith(f"no generated clip for v={IMPOSSIBLE_M_S:g} w=0: ")
 
 
-def test_an_evaluation_has_its_baseline_beside_it():
+def test_an_evaluation_has_its_baseline_beside_it() -> None:
     database = database_of(gait_clips([(1.0, 0.0), (1.0, 50.0)], 6.0))
     told = []
     result = evaluate(database, SMALL, threads=2, progress=lambda done, total, _note: told.append(done / total))

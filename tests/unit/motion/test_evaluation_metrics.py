@@ -1,12 +1,15 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.support.evaluation_cases import RATE_HZ, closed_reference, record_of, straight_record
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.metrics import measure_trial, offset_asymmetry, pooled_metrics, trial_series
 from marey_motion.evaluation.result import TrialResult
-from marey_motion.evaluation.scenario import Trial, reference
-from marey_motion.matching.record import Status
+from marey_motion.evaluation.scenario import Reference, Trial, reference
+from marey_motion.matching.record import Status, TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
 
 OPTIONS = EvaluationOptions()
@@ -15,11 +18,13 @@ LEFT = Trial("circle", 2.0, np.radians(50.0))
 SWITCHING = Trial("switching", 1.0, np.radians(-25.0))
 
 
-def measured(trial, record, options=OPTIONS, asked=None):
+def measured(
+    trial: Trial, record: TrialRecord, options: EvaluationOptions = OPTIONS, asked: Reference | None = None
+) -> TrialResult:
     return measure_trial(trial, asked or closed_reference(trial), record, options)
 
 
-def answering(asked, delay_s):
+def answering(asked: Reference, delay_s: float) -> Floats:
     """Speeds of each step: those asked for, each change `delay_s` late."""
     wanted = asked.speeds_m_s[: asked.tick_count - 1]
     late = round(delay_s * RATE_HZ)
@@ -30,7 +35,7 @@ def answering(asked, delay_s):
 
 
 @pytest.mark.parametrize(("speed", "turn_rate"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
-def test_a_perfect_trial_has_only_the_error_of_chords(speed, turn_rate):
+def test_a_perfect_trial_has_only_the_error_of_chords(speed: float, turn_rate: float) -> None:
     trial = Trial("circle", speed, np.radians(turn_rate))
     metrics = measure_trial(trial, reference(trial), record_of(reference(trial)), OPTIONS).metrics
 
@@ -42,7 +47,7 @@ def test_a_perfect_trial_has_only_the_error_of_chords(speed, turn_rate):
     assert abs(metrics["se_omega_path_deg"]) < 1e-9
 
 
-def test_a_speed_that_swings_by_a_over_whole_periods_has_a_spread_of_a_over_root_two():
+def test_a_speed_that_swings_by_a_over_whole_periods_has_a_spread_of_a_over_root_two() -> None:
     asked = closed_reference(STRAIGHT)
     times = np.arange(1, asked.tick_count) / RATE_HZ
     metrics = measured(STRAIGHT, straight_record(asked, 1.5 + 0.3 * np.sin(2 * np.pi * times))).metrics
@@ -51,7 +56,7 @@ def test_a_speed_that_swings_by_a_over_whole_periods_has_a_spread_of_a_over_root
     assert metrics["se_v"] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_trajectory_shifted_by_thirty_and_forty_centimetres_is_half_a_metre_off():
+def test_a_trajectory_shifted_by_thirty_and_forty_centimetres_is_half_a_metre_off() -> None:
     asked = closed_reference(LEFT)
     shifted = record_of(asked, positions=asked.positions[: asked.tick_count] + np.array((0.3, 0.4)))
     metrics = measured(LEFT, shifted).metrics
@@ -64,7 +69,7 @@ def test_a_trajectory_shifted_by_thirty_and_forty_centimetres_is_half_a_metre_of
     assert abs(metrics["se_v"]) < 1e-4
 
 
-def test_going_too_fast_by_twenty_centimetres_a_second_is_a_static_error_of_that():
+def test_going_too_fast_by_twenty_centimetres_a_second_is_a_static_error_of_that() -> None:
     asked = closed_reference(STRAIGHT)
     fast = measured(STRAIGHT, straight_record(asked, np.full(asked.tick_count - 1, 1.7))).metrics
     slow = measured(STRAIGHT, straight_record(asked, np.full(asked.tick_count - 1, 1.3))).metrics
@@ -74,7 +79,7 @@ def test_going_too_fast_by_twenty_centimetres_a_second_is_a_static_error_of_that
     assert fast["dse_v"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_turning_more_to_the_left_than_asked_is_a_positive_error():
+def test_turning_more_to_the_left_than_asked_is_a_positive_error() -> None:
     for turn_rate in (-50.0, 0.0, 50.0):
         trial = Trial("circle", 1.0, np.radians(turn_rate))
         asked = closed_reference(trial)
@@ -84,7 +89,7 @@ def test_turning_more_to_the_left_than_asked_is_a_positive_error():
         assert metrics["se_omega_path_deg"] == pytest.approx(10.0, abs=1e-9)
 
 
-def test_left_of_the_path_and_ahead_on_it_are_positive():
+def test_left_of_the_path_and_ahead_on_it_are_positive() -> None:
     asked = closed_reference(LEFT)
     heading = asked.headings[: asked.tick_count]
     leftward = np.stack((np.cos(heading), -np.sin(heading)), axis=1)
@@ -98,7 +103,7 @@ def test_left_of_the_path_and_ahead_on_it_are_positive():
     assert metrics["offset_rms"] == pytest.approx(np.hypot(0.2, 0.1), abs=1e-12)
 
 
-def test_side_steps_turn_with_the_path_while_the_character_faces_one_way():
+def test_side_steps_turn_with_the_path_while_the_character_faces_one_way() -> None:
     asked = closed_reference(LEFT)
     metrics = measured(LEFT, record_of(asked, headings=np.zeros(asked.tick_count))).metrics
 
@@ -106,7 +111,7 @@ def test_side_steps_turn_with_the_path_while_the_character_faces_one_way():
     assert metrics["se_omega_path_deg"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_character_that_stands_still_has_no_direction_of_travel():
+def test_a_character_that_stands_still_has_no_direction_of_travel() -> None:
     asked = closed_reference(STRAIGHT)
     metrics = measured(STRAIGHT, straight_record(asked, np.zeros(asked.tick_count - 1))).metrics
 
@@ -115,7 +120,7 @@ def test_a_character_that_stands_still_has_no_direction_of_travel():
     assert metrics["se_v"] == -1.5
 
 
-def test_the_approach_counts_only_when_asked_for():
+def test_the_approach_counts_only_when_asked_for() -> None:
     asked = closed_reference(LEFT)
     apart = np.zeros((asked.tick_count, 2))
     apart[: 180 + 1, 0] = 1.0  # the approach and the tick at which the circle begins
@@ -130,14 +135,14 @@ def test_the_approach_counts_only_when_asked_for():
     assert whole.regimes["base"]["offset_mean"] == 0.0
 
 
-def test_the_approach_does_not_count_as_spread_of_the_turn_rate():
+def test_the_approach_does_not_count_as_spread_of_the_turn_rate() -> None:
     metrics = measured(LEFT, record_of(closed_reference(LEFT)), EvaluationOptions(window="all")).metrics
 
     assert metrics["dse_omega_deg"] == pytest.approx(0.0, abs=1e-9)
     assert metrics["se_omega_deg"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_trial_without_a_circle_measures_nothing_on_it():
+def test_a_trial_without_a_circle_measures_nothing_on_it() -> None:
     trial = Trial("circle", 1.0, 0.5, duration_s=0.0)
     metrics = measured(trial, record_of(closed_reference(trial))).metrics
 
@@ -147,7 +152,7 @@ def test_a_trial_without_a_circle_measures_nothing_on_it():
     assert metrics["transitions"] == 0.0
 
 
-def test_a_record_of_another_trial_is_refused_by_name():
+def test_a_record_of_another_trial_is_refused_by_name() -> None:
     with pytest.raises(MotionError, match=r"circle v=2 w=50: the record has 61 ticks"):
         measure_trial(LEFT, reference(LEFT), record_of(closed_reference(Trial("circle", 1.0, 0.0, 0.0, 1.0))), OPTIONS)
 
@@ -155,7 +160,7 @@ def test_a_record_of_another_trial_is_refused_by_name():
 # Regimes and response
 
 
-def test_each_speed_of_a_switching_trial_is_measured_by_itself():
+def test_each_speed_of_a_switching_trial_is_measured_by_itself() -> None:
     asked = closed_reference(SWITCHING)
     wanted = asked.speeds_m_s[: asked.tick_count - 1]
     times = np.arange(1, asked.tick_count) / RATE_HZ
@@ -172,7 +177,7 @@ def test_each_speed_of_a_switching_trial_is_measured_by_itself():
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.25, 1.0])
-def test_the_response_time_is_how_late_the_speed_comes_right(delay_s):
+def test_the_response_time_is_how_late_the_speed_comes_right(delay_s: float) -> None:
     asked = closed_reference(SWITCHING)
     result = measured(SWITCHING, straight_record(asked, answering(asked, delay_s)))
 
@@ -182,7 +187,7 @@ def test_the_response_time_is_how_late_the_speed_comes_right(delay_s):
     assert result.regimes["base"]["response_s"] == pytest.approx(delay_s)
 
 
-def test_a_switch_that_is_never_answered_has_no_response_time():
+def test_a_switch_that_is_never_answered_has_no_response_time() -> None:
     asked = closed_reference(SWITCHING)
     result = measured(SWITCHING, straight_record(asked, np.full(asked.tick_count - 1, 1.0)))
 
@@ -192,7 +197,7 @@ def test_a_switch_that_is_never_answered_has_no_response_time():
     assert result.metrics["response_missed"] == 3.0
 
 
-def test_a_speed_that_is_right_for_less_than_half_a_second_has_not_responded():
+def test_a_speed_that_is_right_for_less_than_half_a_second_has_not_responded() -> None:
     asked = closed_reference(SWITCHING)
     wanted = asked.speeds_m_s[: asked.tick_count - 1]
     speeds = np.full(len(wanted), 1.0)
@@ -208,7 +213,7 @@ def test_a_speed_that_is_right_for_less_than_half_a_second_has_not_responded():
 # Switches and costs
 
 
-def test_only_chosen_jumps_are_transitions():
+def test_only_chosen_jumps_are_transitions() -> None:
     asked = closed_reference(LEFT)
     status = np.full(asked.tick_count, Status.KEPT, dtype=np.int8)
     # The first two were decided during the approach, the third at the first tick of the circle.
@@ -222,7 +227,7 @@ def test_only_chosen_jumps_are_transitions():
     assert metrics["clip_ends"] == 2.0
 
 
-def test_costs_are_summed_up_where_they_are_defined():
+def test_costs_are_summed_up_where_they_are_defined() -> None:
     asked = closed_reference(LEFT)
     ticks = asked.tick_count
     match_cost = np.full(ticks, np.nan)
@@ -242,7 +247,7 @@ def test_costs_are_summed_up_where_they_are_defined():
     assert metrics["switch_pose_cost_mean"] == pytest.approx(0.6)
 
 
-def test_costs_of_each_speed_are_told_apart():
+def test_costs_of_each_speed_are_told_apart() -> None:
     asked = closed_reference(SWITCHING)
     fast = asked.speeds_m_s[: asked.tick_count] == 4.0
     result = measured(SWITCHING, record_of(asked, pose_cost=np.where(fast, 0.9, 0.2)))
@@ -254,7 +259,7 @@ def test_costs_of_each_speed_are_told_apart():
 # The formulas as printed
 
 
-def test_the_printed_formulas_are_measured_on_request():
+def test_the_printed_formulas_are_measured_on_request() -> None:
     asked = closed_reference(STRAIGHT)
     record = straight_record(asked, np.full(asked.tick_count - 1, 1.7))
     plain = measured(STRAIGHT, record).metrics
@@ -271,14 +276,14 @@ def test_the_printed_formulas_are_measured_on_request():
 # Several trials
 
 
-def results_of(*values):
+def results_of(*values: Any) -> list[TrialResult]:
     return [
         TrialResult(Trial("circle", 1.0, turn_rate), metrics)
         for turn_rate, metrics in zip((-1.0, 1.0), values, strict=False)
     ]
 
 
-def test_trials_are_pooled_by_what_each_metric_is():
+def test_trials_are_pooled_by_what_each_metric_is() -> None:
     pooled = pooled_metrics(
         results_of(
             {"se_v": 1.0, "dse_v": 3.0, "offset_max": 2.0, "offset_rms": 3.0, "transitions": 5.0, "response_s": None},
@@ -295,7 +300,7 @@ def test_trials_are_pooled_by_what_each_metric_is():
     assert pooled["response_s"] == 0.5
 
 
-def test_regimes_are_pooled_under_their_names():
+def test_regimes_are_pooled_under_their_names() -> None:
     trials = [
         TrialResult(SWITCHING, {"se_v": 0.0}, {"base": {"se_v": base}, "switched": {"se_v": None}})
         for base in (1.0, 2.0)
@@ -306,7 +311,7 @@ def test_regimes_are_pooled_under_their_names():
     assert pooled["switched.se_v"] is None
 
 
-def test_asymmetry_is_the_difference_between_left_and_right_turns():
+def test_asymmetry_is_the_difference_between_left_and_right_turns() -> None:
     assert offset_asymmetry(results_of({"offset_mean": 0.5}, {"offset_mean": 0.2})) == pytest.approx(0.3)
     assert offset_asymmetry(results_of({"offset_mean": 0.5})) is None
     straight = TrialResult(STRAIGHT, {"offset_mean": 0.1}, {})
@@ -315,7 +320,7 @@ def test_asymmetry_is_the_difference_between_left_and_right_turns():
     assert offset_asymmetry((*pair, straight)) == pytest.approx(0.3)
 
 
-def test_a_series_has_a_value_per_step_and_says_what_was_asked():
+def test_a_series_has_a_value_per_step_and_says_what_was_asked() -> None:
     asked = closed_reference(SWITCHING)
     series = trial_series(SWITCHING, asked, record_of(asked))
 

@@ -11,10 +11,11 @@ from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import headline_means, objective_value
-from marey_motion.evaluation.improvement.optimise import optimise
+from marey_motion.evaluation.improvement.optimise import Optimisation, optimise
 from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.options.improvement import ObjectiveOptions, OptimisationOptions
 
 TURNS = ("turn_left", "turn_right")
@@ -22,29 +23,29 @@ AIM = OptimisationOptions(objective=ObjectiveOptions(seconds=0.002), max_steps=6
 
 
 @pytest.fixture(scope="module")
-def pool():
+def pool() -> MatchingDatabase:
     """A set of wandering clips, and two turns that may be added."""
     turns = [arc_track(2.0, turn_rate, 6.0, uid=uid) for uid, turn_rate in zip(TURNS, (50.0, -50.0), strict=True)]
     return synthetic_database([*wandering_tracks(), *turns])
 
 
 @pytest.fixture
-def simulation(pool):
+def simulation(pool: MatchingDatabase) -> Resimulation:
     return Resimulation(pool, OPTIONS)
 
 
 @pytest.fixture(scope="module")
-def found(pool):
+def found(pool: MatchingDatabase) -> Optimisation:
     return optimise(Resimulation(pool, OPTIONS), AIM, absent=TURNS)
 
 
-def test_the_objective_falls_with_every_step(found):
+def test_the_objective_falls_with_every_step(found: Optimisation) -> None:
     values = [step.objective for step in found.steps]
     assert len(values) > 2
     assert all(before - after >= AIM.least_gain for before, after in pairwise(values))
 
 
-def test_every_step_can_be_evaluated_again(pool, found):
+def test_every_step_can_be_evaluated_again(pool: MatchingDatabase, found: Optimisation) -> None:
     for step in found.steps:
         again = evaluated(without_sources(pool, step.absent))
         seconds = sum(clip.frame_count for clip in again.clips) / 60
@@ -53,7 +54,7 @@ def test_every_step_can_be_evaluated_again(pool, found):
         assert step.objective == objective_value(AIM.objective, again.trials, seconds)
 
 
-def test_the_log_says_what_each_step_did(found):
+def test_the_log_says_what_each_step_did(found: Optimisation) -> None:
     assert [step.number for step in found.steps] == list(range(len(found.steps)))
     assert (found.steps[0].action, found.steps[0].absent) == ("start", TURNS)
     for before, after in pairwise(found.steps):
@@ -63,12 +64,12 @@ def test_the_log_says_what_each_step_did(found):
         assert after.evaluations > before.evaluations
 
 
-def test_what_nothing_needs_goes_at_once_and_changes_no_trial(found):
+def test_what_nothing_needs_goes_at_once_and_changes_no_trial(found: Optimisation) -> None:
     (step,) = (step for step in found.steps if set(UNWANTED) <= set(step.sources))
     assert step.changed_trials == 0
 
 
-def test_no_candidate_would_have_been_better_at_any_step(pool):
+def test_no_candidate_would_have_been_better_at_any_step(pool: MatchingDatabase) -> None:
     simulation = Resimulation(pool, OPTIONS)
     aim = AIM.replace(consider=None, max_steps=2)
     found = optimise(simulation, aim, absent=TURNS)
@@ -81,7 +82,7 @@ def test_no_candidate_would_have_been_better_at_any_step(pool):
             )
 
 
-def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
+def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool: MatchingDatabase) -> None:
     straight = synthetic_database(
         named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0), arc_track(2.0, 50.0, 6.0)])
     )
@@ -93,7 +94,7 @@ def test_a_clip_that_helps_is_added_where_the_budget_of_data_allows(pool):
     assert all(step.data_s <= 15.0 for step in tight.steps)
 
 
-def test_it_ends_when_nothing_gains_or_the_budget_is_spent(simulation):
+def test_it_ends_when_nothing_gains_or_the_budget_is_spent(simulation: Resimulation) -> None:
     greedy = optimise(simulation, AIM.replace(least_gain=1000.0))
     assert (greedy.ended, len(greedy.steps)) == ("no gain", 1)
     assert optimise(simulation, AIM.replace(max_steps=1)).ended == "steps"
@@ -102,12 +103,14 @@ def test_it_ends_when_nothing_gains_or_the_budget_is_spent(simulation):
     assert spent.steps[-1].evaluations <= 3
 
 
-def test_an_optimisation_goes_on_from_its_log_as_if_it_had_not_stopped(pool, found):
+def test_an_optimisation_goes_on_from_its_log_as_if_it_had_not_stopped(
+    pool: MatchingDatabase, found: Optimisation
+) -> None:
     resumed = optimise(Resimulation(pool, OPTIONS), AIM, absent=TURNS, log=found.steps[:2])
     assert resumed == found
 
 
-def test_the_log_of_an_optimisation_is_a_plain_document(found):
+def test_the_log_of_an_optimisation_is_a_plain_document(found: Optimisation) -> None:
     written = json.loads(json.dumps(optimisation_to_tree(found)))
     assert written["ended"] == found.ended
     assert [(step["objective"], step["sources"]) for step in written["steps"]] == [
@@ -115,13 +118,13 @@ def test_the_log_of_an_optimisation_is_a_plain_document(found):
     ]
 
 
-def test_each_step_is_handed_over_as_soon_as_it_is_made(simulation):
+def test_each_step_is_handed_over_as_soon_as_it_is_made(simulation: Resimulation) -> None:
     made: list[Any] = []
     found = optimise(simulation, AIM.replace(max_steps=2), absent=TURNS, made=made.append)
     assert tuple(made) == found.steps
 
 
-def test_a_log_of_something_else_is_refused(pool, found):
+def test_a_log_of_something_else_is_refused(pool: MatchingDatabase, found: Optimisation) -> None:
     with pytest.raises(MotionError, match="step"):
         optimise(Resimulation(pool, OPTIONS.replace(duration_s=4.0)), AIM, log=found.steps)
     smaller = without_sources(pool, TURNS)
@@ -129,6 +132,6 @@ def test_a_log_of_something_else_is_refused(pool, found):
         optimise(Resimulation(smaller, OPTIONS), AIM, log=found.steps[:1])
 
 
-def test_the_work_can_be_stopped(pool):
+def test_the_work_can_be_stopped(pool: MatchingDatabase) -> None:
     with pytest.raises(EvaluationCancelled):
         optimise(Resimulation(pool, OPTIONS, cancelled=lambda: True), AIM)

@@ -10,32 +10,38 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.improvement.objective import HEADLINES, headline_means, objective_value
 from marey_motion.evaluation.improvement.redundancy import leave_one_out, plan_removals
 from marey_motion.evaluation.improvement.resimulation import Resimulation
+from marey_motion.evaluation.result import EvaluationResult
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
 from marey_schemas.options.improvement import ObjectiveOptions
 
 
 @pytest.fixture(scope="module")
-def database():
+def database() -> MatchingDatabase:
     return synthetic_database(wandering_tracks())
 
 
 @pytest.fixture(scope="module")
-def result(database):
+def result(database: MatchingDatabase) -> EvaluationResult:
     return evaluated(database)
 
 
 @pytest.fixture
-def simulation(database, result):
+def simulation(database: MatchingDatabase, result: EvaluationResult) -> Resimulation:
     return Resimulation(database, OPTIONS, records=result.records)
 
 
-def test_trials_without_some_clips_are_those_of_a_database_made_without_them(database, simulation):
+def test_trials_without_some_clips_are_those_of_a_database_made_without_them(
+    database: MatchingDatabase, simulation: Resimulation
+) -> None:
     for removed in (["clip_001"], ["clip_000", "clip_004"], ["fast_000"], ["clip_002", "clip_003", "clip_005"]):
         again = evaluated(without_sources(database, removed))
         assert simulation.results(removed) == again.trials
 
 
-def test_the_order_in_which_parts_are_asked_for_does_not_matter(database, result):
+def test_the_order_in_which_parts_are_asked_for_does_not_matter(
+    database: MatchingDatabase, result: EvaluationResult
+) -> None:
     parts = [["clip_001"], ["clip_001", "clip_004"], [], ["clip_004"], ["clip_000", "clip_001", "clip_004"]]
     forwards, backwards = (Resimulation(database, OPTIONS) for _ in range(2))
     found = {tuple(part): forwards.results(part) for part in parts}
@@ -43,7 +49,7 @@ def test_the_order_in_which_parts_are_asked_for_does_not_matter(database, result
     assert found[()] == result.trials
 
 
-def test_trials_that_do_not_need_a_clip_are_not_run_again(database, simulation):
+def test_trials_that_do_not_need_a_clip_are_not_run_again(database: MatchingDatabase, simulation: Resimulation) -> None:
     needing = [outcome for outcome in simulation.outcomes() if "clip_001" in outcome.needed]
     assert 0 < len(needing) < len(simulation.trials)
     simulation.outcomes(["clip_001"])
@@ -52,7 +58,9 @@ def test_trials_that_do_not_need_a_clip_are_not_run_again(database, simulation):
     assert simulation.simulated == len(needing)
 
 
-def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database, result, simulation):
+def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(
+    database: MatchingDatabase, result: EvaluationResult, simulation: Resimulation
+) -> None:
     objective = ObjectiveOptions()
     removals = leave_one_out(simulation, objective)
     assert {removal.source for removal in removals} == simulation.needed()
@@ -67,7 +75,7 @@ def test_every_removal_is_told_with_the_change_that_an_evaluation_finds(database
     assert [removal.harm_per_s for removal in removals] == sorted(removal.harm_per_s for removal in removals)
 
 
-def test_a_plan_predicts_every_step_exactly(database, simulation):
+def test_a_plan_predicts_every_step_exactly(database: MatchingDatabase, simulation: Resimulation) -> None:
     plan = plan_removals(simulation, 4, ObjectiveOptions(), removed=["fast_000", "fast_001"])
     gone = ["fast_000", "fast_001"]
     for step in plan:
@@ -78,7 +86,7 @@ def test_a_plan_predicts_every_step_exactly(database, simulation):
     assert len(plan) == len(set(gone)) - 2 == 4
 
 
-def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
+def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation: Resimulation) -> None:
     plan = plan_removals(simulation, 3, ObjectiveOptions())
     gone: list[str] = []
     for step in plan:
@@ -86,14 +94,14 @@ def test_a_plan_takes_the_least_harmful_removal_at_each_step(simulation):
         gone.append(step.removal.source)
 
 
-def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation):
+def test_only_as_many_clips_are_tried_as_asked_for_those_first_that_few_trials_need(simulation: Resimulation) -> None:
     few = leave_one_out(simulation, ObjectiveOptions(), consider=2)
     everything = leave_one_out(simulation, ObjectiveOptions())
     assert len(few) == 2
     assert max(removal.trials for removal in few) <= sorted(removal.trials for removal in everything)[1]
 
 
-def test_a_clip_and_its_mirrored_twin_go_together():
+def test_a_clip_and_its_mirrored_twin_go_together() -> None:
     database = with_mirrored(wandering_tracks(3))
     simulation = Resimulation(database, OPTIONS)
     again = evaluated(without_sources(database, ["clip_001"]))
@@ -101,29 +109,29 @@ def test_a_clip_and_its_mirrored_twin_go_together():
     assert simulation.seconds() == sum(clip.frame_count for clip in database.clips) / 60 / 2
 
 
-def test_the_last_clip_is_never_taken():
+def test_the_last_clip_is_never_taken() -> None:
     simulation = Resimulation(synthetic_database(named(wandering_tracks(2)[:2])), OPTIONS)
     assert len(plan_removals(simulation, 5, ObjectiveOptions())) <= 1
 
 
-def test_a_clip_that_is_not_there_cannot_be_left_out(simulation):
+def test_a_clip_that_is_not_there_cannot_be_left_out(simulation: Resimulation) -> None:
     with pytest.raises(MotionError, match="no clip nobody"):
         simulation.results(["nobody"])
 
 
-def test_the_work_can_be_stopped(database):
+def test_the_work_can_be_stopped(database: MatchingDatabase) -> None:
     stopped = Resimulation(database, OPTIONS, cancelled=lambda: True)
     with pytest.raises(EvaluationCancelled):
         leave_one_out(stopped, ObjectiveOptions())
 
 
-def test_progress_is_told_clip_by_clip(simulation):
+def test_progress_is_told_clip_by_clip(simulation: Resimulation) -> None:
     told = []
     leave_one_out(simulation, ObjectiveOptions(), progress=lambda *step: told.append(step))
     assert [step[0] for step in told] == list(range(1, len(told) + 1))
     assert {step[1] for step in told} == {len(told)}
 
 
-def test_weights_that_make_no_sense_are_refused():
+def test_weights_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValidationError, match="pose_cost"):
         ObjectiveOptions(pose_cost=-1.0)

@@ -3,15 +3,16 @@
 import json
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.evaluation_results import synthetic_result
-from tests.support.report_pages import HOSTILE, is_sound
+from tests.support.report_pages import HOSTILE, Page, is_sound
 
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
-from marey_motion.evaluation.result import TrialResult
+from marey_motion.evaluation.result import EvaluationResult, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
 from marey_motion.evaluation.suite import evaluate
 from marey_motion.gait import generate_gait
@@ -19,6 +20,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
 from marey_motion.matching.database import SourceClip
 from marey_motion.rigs import map_joints
+from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
 from marey_reports.evaluation.definitions import METRICS
@@ -30,24 +32,24 @@ from marey_schemas.wording import counted
 
 
 @pytest.fixture(scope="module")
-def result():
+def result() -> EvaluationResult:
     return synthetic_result(seed=4, turns_deg_s=(-90.0, 20.0))
 
 
 @pytest.fixture(scope="module")
-def figures(result):
+def figures(result: EvaluationResult) -> dict[str, DrawnFigure]:
     return draw_figures(result)
 
 
 @pytest.fixture(scope="module")
-def page(result, figures):
+def page(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> Page:
     return is_sound(render_report(result, title="Walks", figures=figures))
 
 
 # The page
 
 
-def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
+def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: dict[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(FIGURES)
     assert page.tags["h1"] == 1
     assert page.text.count("What to record next") == 2  # the link and the heading
@@ -56,15 +58,15 @@ def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
 
 
 @pytest.mark.slow
-def test_the_same_result_gives_the_same_page(result):
+def test_the_same_result_gives_the_same_page(result: EvaluationResult) -> None:
     assert render_report(result, title="Walks") == render_report(result, title="Walks")
 
 
-def test_the_page_opens_with_the_verdict(page, result):
+def test_the_page_opens_with_the_verdict(page: Page, result: EvaluationResult) -> None:
     assert page.text.startswith("Walks Walks " + verdict(result))
 
 
-def test_pictures_and_tables_can_be_read_aloud(result, figures):
+def test_pictures_and_tables_can_be_read_aloud(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
     source = render_report(result, title="Walks", figures=figures)
 
     for svg in re.findall(r"<svg.*?</svg>", source, re.DOTALL):
@@ -78,7 +80,7 @@ def test_pictures_and_tables_can_be_read_aloud(result, figures):
 
 
 @pytest.mark.slow
-def test_names_of_clips_and_titles_are_shown_and_never_run(result):
+def test_names_of_clips_and_titles_are_shown_and_never_run(result: EvaluationResult) -> None:
     hostile = synthetic_result(names=HOSTILE, unused=10, seed=2)
     page = is_sound(render_report(hostile, title=HOSTILE[1]))
 
@@ -89,12 +91,12 @@ def test_names_of_clips_and_titles_are_shown_and_never_run(result):
     assert is_sound(render_comparison(hostile, result, title=HOSTILE[0], labels=("<i>", "</td>")))
 
 
-def test_notes_of_the_evaluation_are_told(result, figures):
+def test_notes_of_the_evaluation_are_told(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
     source = render_report(replace(result, notes=("walk_<3> stays in place",)), title="t", figures=figures)
     assert "walk_<3> stays in place" in is_sound(source).text
 
 
-def test_markup_is_escaped_unless_it_was_made_here():
+def test_markup_is_escaped_unless_it_was_made_here() -> None:
     assert element("p", "<b>", element("b", "&"), class_='x"y') == '<p class="x&#34;y">&lt;b&gt;<b>&amp;</b></p>'
     assert element("td", None, ["a", None, "b"], data_value="1", title=None) == '<td data-value="1">ab</td>'
     assert text("a\x00b\ud800") == "a\ufffdb\ufffd"
@@ -103,7 +105,7 @@ def test_markup_is_escaped_unless_it_was_made_here():
 # What it says
 
 
-def test_all_trials_and_clips_are_listed_with_their_numbers(page, result):
+def test_all_trials_and_clips_are_listed_with_their_numbers(page: Page, result: EvaluationResult) -> None:
     for each in result.trials:
         assert demand(each.trial) in page.text
         assert f"{each.metrics['offset_mean']:.2f}" in page.text
@@ -111,7 +113,9 @@ def test_all_trials_and_clips_are_listed_with_their_numbers(page, result):
         assert clip.name in page.text
 
 
-def test_the_suite_s_numbers_stand_beside_the_baseline_s(result, figures):
+def test_the_suite_s_numbers_stand_beside_the_baseline_s(
+    result: EvaluationResult, figures: dict[str, DrawnFigure]
+) -> None:
     base = replace(synthetic_result(seed=9, sway_m=0.02), records=())
     page = is_sound(render_report(replace(result, baseline=base), title="t", figures=figures))
 
@@ -122,13 +126,15 @@ def test_the_suite_s_numbers_stand_beside_the_baseline_s(result, figures):
     assert f"{base.suite['offset_mean']:.2f} m with generated clips" in page.text
 
 
-def test_the_suite_s_numbers_are_called_means_largest_and_sums_as_they_are(result, page):
+def test_the_suite_s_numbers_are_called_means_largest_and_sums_as_they_are(
+    result: EvaluationResult, page: Page
+) -> None:
     largest = max(each.metrics["offset_max"] for each in result.trials)
     assert "of largest distances the largest, of counts the sum" in page.text
     assert f"largest distance {largest:.2f}" in page.text
 
 
-def test_clips_that_were_never_used_are_named(page, result):
+def test_clips_that_were_never_used_are_named(page: Page, result: EvaluationResult) -> None:
     unused = [result.clips[usage.clip].name for usage in result.usage if not usage.ticks]
     start = page.text.index("were displayed in no trial")
     told = page.text[start : page.text.index("What to record next", start)]
@@ -138,7 +144,7 @@ def test_clips_that_were_never_used_are_named(page, result):
     assert "Every clip was used" in is_sound(render_report(synthetic_result(unused=0), title="t", figures={})).text
 
 
-def test_digests_and_options_are_there_to_repeat_it(page, result):
+def test_digests_and_options_are_there_to_repeat_it(page: Page, result: EvaluationResult) -> None:
     for digest in (result.provenance.dataset, result.provenance.normaliser, result.provenance.options):
         assert digest in page.text
     assert "controller.search_every_s 0.1" in page.text
@@ -146,7 +152,7 @@ def test_digests_and_options_are_there_to_repeat_it(page, result):
 
 
 @pytest.mark.slow
-def test_a_report_of_a_thousand_clips_stays_small():
+def test_a_report_of_a_thousand_clips_stays_small() -> None:
     big = synthetic_result(clips=1_000, frames=1_000, unused=300)
     source = render_report(big, title="big")
 
@@ -157,7 +163,7 @@ def test_a_report_of_a_thousand_clips_stays_small():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["bare", "nothing used", "no trials", "no metrics"])
-def test_reports_are_made_of_little(change, result):
+def test_reports_are_made_of_little(change: Any, result: EvaluationResult) -> None:
     little = {
         "bare": replace(result, records=(), notes=()),
         "nothing used": replace(
@@ -174,7 +180,7 @@ def test_reports_are_made_of_little(change, result):
     is_sound(render_comparison(little, result, title="little"))
 
 
-def test_a_real_evaluation_is_reported():
+def test_a_real_evaluation_is_reported() -> None:
     options = EvaluationOptions(speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0)
     clips = [
         SourceClip(f"gait{index}", f"gait {index}", generate_gait(speed, turn_rate, 4.0))
@@ -193,7 +199,7 @@ def test_a_real_evaluation_is_reported():
 # Words
 
 
-def test_holes_in_words_hold_every_missing_second_once(result):
+def test_holes_in_words_hold_every_missing_second_once(result: EvaluationResult) -> None:
     holes = find_holes(result.coverage)
 
     assert sum(hole.missing_s for hole in holes) == pytest.approx(result.coverage.deficit_s.sum())
@@ -202,7 +208,7 @@ def test_holes_in_words_hold_every_missing_second_once(result):
         assert hole.turn_rates_deg_s[0] * hole.turn_rates_deg_s[1] >= 0.0
 
 
-def test_a_hole_is_told_as_an_animator_says_it(result):
+def test_a_hole_is_told_as_an_animator_says_it(result: EvaluationResult) -> None:
     deficit = np.zeros_like(result.coverage.deficit_s)
     deficit[1:, 3:] = (1.0, 2.0)  # 2 and 3 m/s, 50 and 100 deg/s to the left
     deficit[0, 2] = 0.5
@@ -215,7 +221,7 @@ def test_a_hole_is_told_as_an_animator_says_it(result):
     assert "left turns of 50 to 100 degrees a second at 2 to 3 m/s: 6.0 s missing" in page.text
 
 
-def test_amounts_durations_and_demands_are_words():
+def test_amounts_durations_and_demands_are_words() -> None:
     assert [counted(1, "clip"), counted(2, "trajectory"), counted(1200, "cell")] == [
         "1 clip",
         "2 trajectories",
@@ -232,11 +238,13 @@ def test_amounts_durations_and_demands_are_words():
 LEFT = Trial("circle", 2.0, 0.9)
 
 
-def outcome(trial=LEFT, offset=0.2, speed=0.0, turn=0.0):
+def outcome(
+    trial: Trial = LEFT, offset: float | None = 0.2, speed: float = 0.0, turn: float | None = 0.0
+) -> TrialResult:
     return TrialResult(trial, {"offset_mean": offset, "se_v": speed, "se_omega_deg": turn})
 
 
-def judged(result, followed, trials):
+def judged(result: EvaluationResult, followed: int, trials: int) -> EvaluationResult:
     names = [replace(result.trials[0].trial, speed_m_s=1.0 + 0.01 * index) for index in range(trials)]
     return replace(
         result,
@@ -258,11 +266,11 @@ def judged(result, followed, trials):
         ({"turn": None}, False),
     ],
 )
-def test_a_trial_is_followed_within_its_three_limits(metrics, followed):
+def test_a_trial_is_followed_within_its_three_limits(metrics: dict[str, Any], followed: bool) -> None:
     assert is_followed(outcome(**metrics)) is followed
 
 
-def test_a_switching_trial_is_measured_by_its_mean_speed():
+def test_a_switching_trial_is_measured_by_its_mean_speed() -> None:
     assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=30.0)) == pytest.approx(3.0)
     assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=12.0)) == pytest.approx(2.0 + 2.0 * 5.0 / 12.0)
     assert mean_speed_m_s(Trial("switching", 2.0, 0.0, duration_s=3.0)) == 2.0
@@ -272,12 +280,12 @@ def test_a_switching_trial_is_measured_by_its_mean_speed():
     ("followed", "grade"), [(10, "very good"), (9, "very good"), (8, "good"), (7, "good"), (6, "usable in part"),
                             (4, "usable in part"), (3, "poor"), (0, "poor")]
 )  # fmt: skip
-def test_the_share_of_followed_trials_gives_the_grade(followed, grade, result):
+def test_the_share_of_followed_trials_gives_the_grade(followed: int, grade: str, result: EvaluationResult) -> None:
     judgement = judge(judged(result, followed, 10))
     assert (judgement.grade, judgement.followed, judgement.trials) == (grade, followed, 10)
 
 
-def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result):
+def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result: EvaluationResult) -> None:
     slow = replace(result, trials=(outcome(), outcome(Trial("circle", 3.0, np.radians(-100.0)), speed=-1.62)))
     sentence = verdict(slow)
 
@@ -296,7 +304,7 @@ def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result)
 # Comparisons
 
 
-def test_a_comparison_says_whether_it_helped(result):
+def test_a_comparison_says_whether_it_helped(result: EvaluationResult) -> None:
     assert compared(judged(result, 3, 10), judged(result, 5, 10)).startswith(
         "Better: the character follows 5 of 10 trajectories, 3 before; 2 trajectories gained and 0 lost"
     )
@@ -305,7 +313,7 @@ def test_a_comparison_says_whether_it_helped(result):
 
 
 @pytest.mark.slow
-def test_a_comparison_shows_what_came_went_and_changed(result):
+def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult) -> None:
     after = synthetic_result(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
     after = replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))
     page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new")))
@@ -317,7 +325,7 @@ def test_a_comparison_shows_what_came_went_and_changed(result):
     assert "old → new" in page.text
 
 
-def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(result):
+def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(result: EvaluationResult) -> None:
     records = list(result.records)
     records[3] = replace(records[3], positions=records[3].positions + 0.01)
     comparison = compare_results(result, replace(result, records=tuple(records)))
@@ -329,7 +337,9 @@ def test_a_comparison_with_intervals_shows_them_and_the_trials_that_changed(resu
     assert "+0.00 and +0.00" in page.text
 
 
-def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_nothing(result):
+def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_nothing(
+    result: EvaluationResult,
+) -> None:
     trials = tuple(
         replace(each, metrics={**each.metrics, "clip_ends": float(index % 2), "response_missed": -1e-9 * index})
         for index, each in enumerate(result.trials)
@@ -345,7 +355,7 @@ def test_a_comparison_writes_means_of_counts_with_decimals_and_no_minus_before_n
     assert "also of what each trial has as its largest distance" in page.text
 
 
-def test_trials_that_only_show_other_clips_went_the_same_way(result):
+def test_trials_that_only_show_other_clips_went_the_same_way(result: EvaluationResult) -> None:
     clips = tuple(replace(clip, uid=f"copy-{clip.uid}") for clip in result.clips)
     comparison = compare_results(result, replace(result, clips=clips))
     page = is_sound(
@@ -354,10 +364,12 @@ def test_trials_that_only_show_other_clips_went_the_same_way(result):
     assert "0 trials of 30 went another way. 30 more went the same way with other clips." in page.text
 
 
-def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked_for_otherwise(result):
+def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked_for_otherwise(
+    result: EvaluationResult,
+) -> None:
     first, second, *rest = result.clips
     twin = replace(second, mirrored_from=first.uid)
-    usage = tuple(replace(one, popularity=np.ones(9)) if one.clip < 2 else one for one in result.usage)
+    usage = tuple(replace(one, popularity=np.ones(9, dtype=np.int64)) if one.clip < 2 else one for one in result.usage)
     options = result.options.replace(coverage_least_s=0.25)
     after = replace(result, clips=(first, twin, *rest), usage=usage, options=options)
     page = is_sound(render_comparison(result, after, title="Change", figures={}))
@@ -365,7 +377,7 @@ def test_a_comparison_counts_mirrored_twins_once_and_says_when_coverage_is_asked
     assert "where 1 s and 0.25 s are enough: not comparable" in page.text
 
 
-def test_what_the_script_sorts_by_is_a_number(result, figures):
+def test_what_the_script_sorts_by_is_a_number(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
     source = render_report(result, title="Walks", figures=figures)
     for value in re.findall(r'data-value="([^"]*)"', source):
         assert value == "" or isinstance(json.loads(value), int | float)

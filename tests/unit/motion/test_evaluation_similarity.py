@@ -1,12 +1,14 @@
 """Whether what covers a cell can be blended, against distances of all pairs of frames."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.suggestion_cases import OPTIONS, evaluated, named, wandering_tracks, with_mirrored
-from tests.support.synthetic_databases import arc_track, synthetic_database
+from tests.support.synthetic_databases import Track, arc_track, synthetic_database
 
+from marey_motion.arrays import Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import measure_coverage
 from marey_motion.evaluation.similarity import (
@@ -18,15 +20,16 @@ from marey_motion.evaluation.similarity import (
     window_rows,
 )
 from marey_motion.evaluation.suite import EvaluationCancelled
+from marey_motion.matching.database import MatchingDatabase
 from marey_motion.matching.record import Status
 
 
-def straight_walks(count=3, seconds=5.0, **given):
+def straight_walks(count: int = 3, seconds: float = 5.0, **given: Any) -> list[Track]:
     """Clips of one speed that differ in the phase of their gait, so that they fall into one cell."""
     return named([arc_track(1.0, 0.0, seconds, phase=0.4 * number, **given) for number in range(count)])
 
 
-def brute_force(database, rows):
+def brute_force(database: MatchingDatabase, rows: Ints) -> Floats:
     """Distance of each of these rows from the nearest of another source among them."""
     points = database.pose_points[rows].astype(np.float64)
     apart = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(axis=-1)
@@ -35,7 +38,7 @@ def brute_force(database, rows):
     return apart.min(axis=1)
 
 
-def test_the_nearest_pose_of_another_clip_is_found_for_every_frame():
+def test_the_nearest_pose_of_another_clip_is_found_for_every_frame() -> None:
     database = synthetic_database(wandering_tracks())
     coverage = measure_coverage(database, OPTIONS)
     rows = np.unique(window_rows(database, coverage))[::3]
@@ -44,7 +47,7 @@ def test_the_nearest_pose_of_another_clip_is_found_for_every_frame():
     assert np.allclose(nearest_poses(points, sources, points, sources), brute_force(database, rows), rtol=1e-12)
 
 
-def test_each_cell_is_measured_by_its_own_frames_alone():
+def test_each_cell_is_measured_by_its_own_frames_alone() -> None:
     database = synthetic_database(wandering_tracks(12))
     coverage = measure_coverage(database, OPTIONS)
     found = measure_similarity(database, coverage, threshold_m=4.0)
@@ -65,13 +68,13 @@ def test_each_cell_is_measured_by_its_own_frames_alone():
     assert np.isnan(found.blendable_share[found.frames == 0]).all()
 
 
-def test_a_window_belongs_to_the_frame_it_begins_with():
+def test_a_window_belongs_to_the_frame_it_begins_with() -> None:
     database = synthetic_database(named([arc_track(1.0, 0.0, 3.0), arc_track(2.0, 50.0, 4.0)]))
     rows = window_rows(database, measure_coverage(database, OPTIONS))
     assert rows.tolist() == [*range(120), *range(180, 180 + 180)]
 
 
-def test_frames_within_the_threshold_are_counted_as_blendable():
+def test_frames_within_the_threshold_are_counted_as_blendable() -> None:
     database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
     cell = np.unravel_index(np.argmax(coverage.seconds), coverage.seconds.shape)
@@ -83,7 +86,7 @@ def test_frames_within_the_threshold_are_counted_as_blendable():
     )
 
 
-def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_copy():
+def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirrored_copy() -> None:
     alone = synthetic_database(straight_walks(1))
     twins = with_mirrored(straight_walks(1))
     for database in (alone, twins):
@@ -92,7 +95,7 @@ def test_a_cell_with_one_clip_has_nothing_to_blend_with_and_neither_has_its_mirr
         assert np.isnan(found.distance_m).all()
 
 
-def test_dense_data_that_does_not_meet_is_told_from_data_that_does():
+def test_dense_data_that_does_not_meet_is_told_from_data_that_does() -> None:
     near = straight_walks(2)
     far = [near[0], near[1]._replace(pose=near[1].pose + 2.0)]
     threshold = 1.5
@@ -104,7 +107,7 @@ def test_dense_data_that_does_not_meet_is_told_from_data_that_does():
     assert shares[1] == 0.0
 
 
-def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all():
+def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all() -> None:
     database = synthetic_database(straight_walks(3))
     coverage = measure_coverage(database, OPTIONS)
     few, all_frames = (measure_similarity(database, coverage, 1.0, most_frames=most) for most in (100, 10_000))
@@ -116,7 +119,7 @@ def test_of_a_huge_cell_evenly_chosen_frames_are_measured_against_all():
     assert few.blendable_share[cell] == np.mean(brute_force(database, own)[::step] <= 1.0)
 
 
-def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made():
+def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made() -> None:
     result = evaluated(synthetic_database(wandering_tracks()))
     costs = [
         record.pose_cost[tick - 1]
@@ -129,7 +132,7 @@ def test_the_usual_threshold_is_the_median_cost_of_the_switches_that_were_made()
     assert accepted_distance(still) is None
 
 
-def test_thresholds_that_are_no_distance_are_refused_and_the_work_can_be_stopped():
+def test_thresholds_that_are_no_distance_are_refused_and_the_work_can_be_stopped() -> None:
     database = synthetic_database(straight_walks())
     coverage = measure_coverage(database, OPTIONS)
     with pytest.raises(MotionError, match="threshold_m"):

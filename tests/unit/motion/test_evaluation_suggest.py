@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,37 +24,37 @@ from marey_motion.evaluation.improvement.objective import headline_means
 from marey_motion.evaluation.improvement.reasons import why_filling, why_redundant
 from marey_motion.evaluation.improvement.redundancy import Removal
 from marey_motion.evaluation.improvement.selection import joined
-from marey_motion.evaluation.improvement.suggest import suggest
+from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree, suggestions_to_tree
 from marey_motion.evaluation.similarity import accepted_distance
 from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.formats import read_motion
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
-from marey_motion.matching.database import SourceClip
+from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.rigs import map_joints
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.improvement import SuggestionOptions
 
 
 @pytest.fixture(scope="module")
-def database():
+def database() -> MatchingDatabase:
     tracks = wandering_tracks()
     return synthetic_database([*tracks, tracks[0]._replace(uid="copy_of_clip_000")])
 
 
 @pytest.fixture(scope="module")
-def outside():
+def outside() -> MatchingDatabase:
     return synthetic_database(named([arc_track(1.0, 50.0, 5.0), arc_track(2.0, -50.0, 5.0)], "turn"))
 
 
 @pytest.fixture(scope="module")
-def found(database, outside):
+def found(database: MatchingDatabase, outside: MatchingDatabase) -> Suggestions:
     options = SuggestionOptions(removals=3, blendable_m=3.0)
     return suggest(database, evaluated(database), collections={"turns": outside}, options=options)
 
 
-def test_every_kind_of_suggestion_is_made(found):
+def test_every_kind_of_suggestion_is_made(found: Suggestions) -> None:
     assert set(UNWANTED) <= {clip.source for clip in found.unused.clips}
     assert found.unused.ranges
     assert len(found.plan) == 3
@@ -64,14 +65,14 @@ def test_every_kind_of_suggestion_is_made(found):
     assert found.similarity.threshold_m == 3.0
 
 
-def test_the_threshold_is_the_suites_own_when_none_is_given(database):
+def test_the_threshold_is_the_suites_own_when_none_is_given(database: MatchingDatabase) -> None:
     result = evaluated(database)
     found = suggest(database, result, options=SuggestionOptions(removals=0, consider=0))
     assert found.similarity.threshold_m == accepted_distance(result.records)
     assert (found.plan, found.redundant, found.fillings) == ((), (), ())
 
 
-def test_the_document_holds_everything_with_a_reason_and_travels(found):
+def test_the_document_holds_everything_with_a_reason_and_travels(found: Suggestions) -> None:
     tree = suggestions_to_tree(found)
     listed = json.loads(json.dumps(tree, default=np.ndarray.tolist, allow_nan=False))
     assert listed["schema"] == "marey/suggestions@1"
@@ -92,7 +93,7 @@ def test_the_document_holds_everything_with_a_reason_and_travels(found):
     assert listed["redundant"]["plan"][0]["metrics"] == found.plan[0].metrics
 
 
-def test_reasons_name_the_clip_and_what_it_does(found):
+def test_reasons_name_the_clip_and_what_it_does(found: Suggestions) -> None:
     tree = suggestions_to_tree(found)
     unused = {clip["source"]: clip["reason"] for clip in tree["unused"]["clips"]}
     assert "“fast_000”: without its 4.0 s every trial stays exactly the same" in unused["fast_000"]
@@ -111,7 +112,7 @@ def test_reasons_name_the_clip_and_what_it_does(found):
         (0.0004, "the mean distance from the path stays the same to the millimetre."),
     ],
 )
-def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(change_m, said):
+def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(change_m: float, said: str) -> None:
     removal = Removal("walk@1", "walk", 2.0, 3, {"offset_mean": change_m}, 0.0, 0.0)
     assert why_redundant(removal, 9) == f"Without “walk” (2.0 s, needed in 3 of 9 trials) {said}"
 
@@ -120,7 +121,7 @@ def test_the_reason_for_a_removal_says_which_way_the_distance_goes_and_how_far(c
     ("turn_rate_deg_s", "where"),
     [(50.0, "turning left at 50°/s"), (-25.0, "turning right at 25°/s"), (0.0, "straight ahead")],
 )
-def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg_s, where):
+def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg_s: float, where: str) -> None:
     cells = (FilledCell(1.5, turn_rate_deg_s, 0.9, 1.0), FilledCell(1.0, 0.0, 0.1, 0.5))
     filling = Filling("runs", "a@1", "a", 4.0, cells, 1.0, 0.25, 40, False, 0.25, 0.5)
     assert why_filling(filling) == (
@@ -129,7 +130,9 @@ def test_the_reason_for_a_filling_says_where_most_of_it_is_missing(turn_rate_deg
     )
 
 
-def test_suggesting_twice_says_the_same(database, outside, found):
+def test_suggesting_twice_says_the_same(
+    database: MatchingDatabase, outside: MatchingDatabase, found: Suggestions
+) -> None:
     again = suggest(database, evaluated(database), collections={"turns": outside}, options=found.options, threads=1)
     first, second = (
         json.dumps(suggestions_to_tree(one), default=np.ndarray.tolist, sort_keys=True) for one in (found, again)
@@ -137,7 +140,7 @@ def test_suggesting_twice_says_the_same(database, outside, found):
     assert first == second
 
 
-def test_a_comparison_travels(database):
+def test_a_comparison_travels(database: MatchingDatabase) -> None:
     before, after = evaluated(database), evaluated(without_sources(database, ["clip_001"]))
     tree = comparison_to_tree(compare_results(before, after))
     listed = json.loads(json.dumps(tree, default=np.ndarray.tolist, allow_nan=False))
@@ -145,7 +148,7 @@ def test_a_comparison_travels(database):
     assert {change["metric"] for change in listed["metrics"]} >= {"offset_mean", "abs_se_v"}
 
 
-def test_an_evaluation_of_another_set_is_refused(database):
+def test_an_evaluation_of_another_set_is_refused(database: MatchingDatabase) -> None:
     result = evaluated(database)
     with pytest.raises(MotionError, match="dataset"):
         suggest(without_sources(database, ["clip_001"]), result)
@@ -153,7 +156,7 @@ def test_an_evaluation_of_another_set_is_refused(database):
         suggest(database, replace(result, records=()))
 
 
-def test_progress_only_rises_and_the_work_can_be_stopped(database):
+def test_progress_only_rises_and_the_work_can_be_stopped(database: MatchingDatabase) -> None:
     told, result = [], evaluated(database)
     options = SuggestionOptions(removals=2)
     suggest(database, result, options=options, progress=lambda *step: told.append(step))
@@ -167,7 +170,7 @@ REAL = EvaluationOptions(duration_s=15.0, families=("circle",))
 
 
 @pytest.fixture(scope="module")
-def bandai(mocap):
+def bandai(mocap: Path) -> tuple[MatchingDatabase, MatchingDatabase]:
     """Walks, runs and others that hardly turn; and turns of another collection, on the body of the first."""
     straight, turns = (
         [SourceClip(path.stem, path.stem, read_motion(path.read_bytes(), path.name).clip) for path in paths]
@@ -182,12 +185,14 @@ def bandai(mocap):
 
 
 @pytest.fixture(scope="module")
-def real(bandai):
+def real(bandai: tuple[MatchingDatabase, MatchingDatabase]) -> Suggestions:
     options = SuggestionOptions(removals=10, consider=12)
     return suggest(bandai[0], evaluated(bandai[0], REAL), collections={"turns": bandai[1]}, options=options)
 
 
-def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(bandai, real):
+def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(
+    bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
+) -> None:
     database = bandai[0]
     assert len(real.unused.clips) > 5
     assert real.unused.ranges
@@ -195,14 +200,18 @@ def test_on_real_clips_all_safe_removals_leave_every_record_bit_identical(bandai
     assert same_to_the_bit(database, real.result.records, less, simulated(less, REAL))
 
 
-def test_on_real_clips_ten_removals_do_what_was_predicted(bandai, real):
+def test_on_real_clips_ten_removals_do_what_was_predicted(
+    bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
+) -> None:
     assert len(real.plan) == 10
     gone = {clip.source for clip in real.unused.clips} | {step.removal.source for step in real.plan}
     again = evaluated(without_sources(bandai[0], gone), REAL)
     assert real.plan[-1].metrics == headline_means(again.trials)
 
 
-def test_on_real_clips_turns_are_found_for_a_set_that_hardly_turns_and_help_where_predicted(bandai, real):
+def test_on_real_clips_turns_are_found_for_a_set_that_hardly_turns_and_help_where_predicted(
+    bandai: tuple[MatchingDatabase, MatchingDatabase], real: Suggestions
+) -> None:
     database, turns = bandai
     assert all("turn" in filling.source for filling in real.fillings[:10])
     chosen = [step.filling.source for step in real.additions]

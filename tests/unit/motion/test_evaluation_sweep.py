@@ -1,6 +1,7 @@
 """Other weights give what a database built with them gives, and groups are ranked by what they do."""
 
 from math import radians
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,13 +22,13 @@ from marey_motion.evaluation.suite import EvaluationCancelled
 from marey_motion.gait import generate_gait
 from marey_motion.matching.body import MatchingBody
 from marey_motion.matching.building import build_database
-from marey_motion.matching.database import SourceClip
+from marey_motion.matching.database import MatchingDatabase, SourceClip
 from marey_motion.rigs import map_joints
 from marey_schemas.options.improvement import ObjectiveOptions
 from marey_schemas.options.matching import DatabaseOptions, FeatureWeights
 
 
-def walks(weights=None):
+def walks(weights: FeatureWeights | None = None) -> MatchingDatabase:
     clips = [
         SourceClip(f"walk_{speed}_{turn}", "walk", generate_gait(speed, radians(turn), 3.0))
         for speed in (1.0, 2.0)
@@ -39,21 +40,21 @@ def walks(weights=None):
 
 
 @pytest.fixture(scope="module")
-def database():
+def database() -> MatchingDatabase:
     return walks()
 
 
 OTHER = FeatureWeights(trajectory_directions=0.3, hip_velocity=2.0, left_foot_position=1.1)
 
 
-def test_other_weights_are_those_of_a_database_built_with_them(database):
+def test_other_weights_are_those_of_a_database_built_with_them(database: MatchingDatabase) -> None:
     built, changed = walks(OTHER), reweighted(database, OTHER)
     assert np.allclose(changed.normaliser.scale, built.normaliser.scale, rtol=1e-14)
     assert np.array_equal(changed.features, built.features)
     assert changed.options == built.options
 
 
-def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(database):
+def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(database: MatchingDatabase) -> None:
     silent = reweighted(database, FeatureWeights(hip_velocity=0.0))
     own = next(group for group in silent.layout.groups if group.name == "hip_velocity")
     assert np.abs(silent.normaliser.apply(silent.features)[:, own.start : own.stop]).max() < 1e-12
@@ -61,7 +62,7 @@ def test_a_group_without_weight_plays_no_part_and_cannot_be_brought_back(databas
         reweighted(silent, FeatureWeights())
 
 
-def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
+def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database: MatchingDatabase) -> None:
     rows = sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER])
     for row in rows:
         result = evaluated(reweighted(database, row.weights))
@@ -70,7 +71,7 @@ def test_each_row_of_a_sweep_is_an_evaluation_with_these_weights(database):
     assert rows[0].objective != rows[1].objective
 
 
-def test_each_group_is_varied_alone():
+def test_each_group_is_varied_alone() -> None:
     settings = vary_each_group(DatabaseOptions(), (0.5, 4.0))
     assert len(settings) == 1 + 2 * (len(GROUPS) - 1)
     assert {setting.extra_joints for setting in settings} == {1.0}
@@ -81,10 +82,10 @@ def test_each_group_is_varied_alone():
         assert len(different) == 1
 
 
-def test_the_group_whose_weight_changes_most_is_the_most_influential():
+def test_the_group_whose_weight_changes_most_is_the_most_influential() -> None:
     base = FeatureWeights()
 
-    def row(objective, **weights):
+    def row(objective: float, **weights: Any) -> SweepRow:
         return SweepRow(base.replace(**weights), {}, {}, objective)
 
     found = group_influences(
@@ -103,7 +104,7 @@ def test_the_group_whose_weight_changes_most_is_the_most_influential():
     assert found[0].gain == 0.0
 
 
-def test_a_sweep_tells_its_progress_and_can_be_stopped(database):
+def test_a_sweep_tells_its_progress_and_can_be_stopped(database: MatchingDatabase) -> None:
     told = []
     sweep_weights(database, OPTIONS, [FeatureWeights(), OTHER], progress=lambda *step: told.append(step[:2]))
     assert told[-1] == (12, 12)

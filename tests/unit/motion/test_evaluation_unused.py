@@ -18,11 +18,13 @@ from tests.support.suggestion_cases import (
 from tests.support.synthetic_databases import arc_track, synthetic_database
 
 from marey_motion.evaluation.improvement.resimulation import needed_rows
-from marey_motion.evaluation.improvement.unused import find_unused
+from marey_motion.evaluation.improvement.unused import Unused, find_unused
 from marey_motion.evaluation.scenario import suite_trials
 from marey_motion.evaluation.suite import run_suite
-from marey_motion.matching.record import Status
+from marey_motion.matching.database import MatchingDatabase
+from marey_motion.matching.record import Status, TrialRecord
 from marey_motion.matching.search import build_index
+from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.options.matching import DatabaseOptions
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -34,13 +36,13 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def unused_of(database, options=OPTIONS):
+def unused_of(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) -> tuple[list[TrialRecord], Unused]:
     records = simulated(database, options)
     return records, find_unused(database, suite_trials(options), records, options)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant):
+def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant: str) -> None:
     options = OPTIONS.replace(controller=OPTIONS.controller.replace(**VARIANTS[variant]))
     database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database, options)
@@ -51,7 +53,7 @@ def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant):
     assert same_to_the_bit(database, records, less, simulated(less, options))
 
 
-def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_that_bars_them():
+def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_that_bars_them() -> None:
     """A clip that repeats itself every 110 frames, played by turns about its frames 100 and 310.
 
     From 306 on the frames from 186 are barred. Without those from 226 to 266 the ones before would be another clip's,
@@ -77,7 +79,7 @@ def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_tha
     assert same_to_the_bit(database, records, less, simulated(less, options))
 
 
-def test_clips_that_no_trial_displays_are_told_with_their_length():
+def test_clips_that_no_trial_displays_are_told_with_their_length() -> None:
     database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database)
     assert {clip.source for clip in unused.clips} >= set(UNWANTED)
@@ -89,7 +91,7 @@ def test_clips_that_no_trial_displays_are_told_with_their_length():
     assert same_to_the_bit(database, records, less, simulated(less))
 
 
-def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
+def test_ranges_keep_their_distance_from_every_frame_that_is_needed() -> None:
     database = synthetic_database(wandering_tracks())
     records, unused = unused_of(database)
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
@@ -113,7 +115,7 @@ def test_ranges_keep_their_distance_from_every_frame_that_is_needed():
     )
 
 
-def test_the_times_of_a_range_are_those_of_the_recording_and_not_of_its_first_row():
+def test_the_times_of_a_range_are_those_of_the_recording_and_not_of_its_first_row() -> None:
     database = synthetic_database(wandering_tracks())
     later = replace(database, clips=tuple(replace(clip, first_s=2.5) for clip in database.clips))
     parts, moved = (
@@ -126,7 +128,7 @@ def test_the_times_of_a_range_are_those_of_the_recording_and_not_of_its_first_ro
         assert other.seconds == pytest.approx(part.seconds)
 
 
-def test_a_clip_of_which_only_the_mirrored_twin_is_used_stays_with_it():
+def test_a_clip_of_which_only_the_mirrored_twin_is_used_stays_with_it() -> None:
     database = with_mirrored(wandering_tracks(3))
     records, unused = unused_of(database)
     shown = {uid for record in records for uid, _ in places_of(database, record)}
@@ -136,11 +138,11 @@ def test_a_clip_of_which_only_the_mirrored_twin_is_used_stays_with_it():
     assert same_to_the_bit(database, records, less, simulated(less))
 
 
-def places_of(database, record):
+def places_of(database: MatchingDatabase, record: TrialRecord) -> set[tuple[str, int]]:
     return {(database.clips[index].uid, 0) for index in np.unique(database.clip_of_row[record.rows])}
 
 
-def test_a_loop_that_wraps_is_never_cut():
+def test_a_loop_that_wraps_is_never_cut() -> None:
     tracks = [arc_track(1.5, 0.0, 12.0, loop=True), arc_track(1.5, 50.0, 12.0, loop=True), arc_track(2.0, 0.0, 8.0)]
     database = synthetic_database(named(tracks), DatabaseOptions(end_policy="loop"))
     records, unused = unused_of(database)
@@ -150,7 +152,7 @@ def test_a_loop_that_wraps_is_never_cut():
         assert same_to_the_bit(database, records, less, simulated(less))
 
 
-def test_what_only_the_last_search_chose_is_needed_too():
+def test_what_only_the_last_search_chose_is_needed_too() -> None:
     """A trial that ends with a switch never displays what was chosen, but its cost is recorded."""
     database = synthetic_database(wandering_tracks())
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -7,20 +8,20 @@ import pytest
 from tests.support.evaluation_cases import clips_of, walked_record
 
 from marey_motion.evaluation.relevance import count_switches, measure_usage
-from marey_motion.evaluation.walk_graph import clip_graph, graph_to_graphml, graph_to_tree, walk_graph
+from marey_motion.evaluation.walk_graph import ClipGraph, clip_graph, graph_to_graphml, graph_to_tree, walk_graph
 
 CLIPS = clips_of(10, 20, 5)
 NAMESPACE = {"g": "http://graphml.graphdrawing.org/xmlns"}
 WALK = [3, 4, 5, 15, 16, 17, 4, 5, 15]
 
 
-def clip_graph_of(clips, *walks):
+def clip_graph_of(clips: tuple[Any, ...], *walks: Any) -> ClipGraph:
     records = [walked_record(rows) for rows in walks]
     used = [own.clip for own in measure_usage(clips, records) if own.ticks]
     return clip_graph(clips, count_switches(clips, records), used)
 
 
-def test_nodes_are_the_displayed_frames_and_edges_the_jumps_between_them():
+def test_nodes_are_the_displayed_frames_and_edges_the_jumps_between_them() -> None:
     graph = walk_graph(CLIPS, [walked_record(WALK)])
 
     assert graph.rows.tolist() == [3, 4, 5, 15, 16, 17]
@@ -28,7 +29,7 @@ def test_nodes_are_the_displayed_frames_and_edges_the_jumps_between_them():
     assert graph.edges.tolist() == [[5, 15, 2], [17, 4, 1]]
 
 
-def test_the_walk_keeps_the_order_in_which_frames_were_displayed():
+def test_the_walk_keeps_the_order_in_which_frames_were_displayed() -> None:
     (walk,) = walk_graph(CLIPS, [walked_record(WALK)]).walks
 
     assert walk.tolist() == [[0, 3, 3], [3, 15, 3], [6, 4, 2], [8, 15, 1]]
@@ -36,13 +37,13 @@ def test_the_walk_keeps_the_order_in_which_frames_were_displayed():
     assert shown.tolist() == WALK
 
 
-def test_a_run_ends_where_a_clip_ends():
+def test_a_run_ends_where_a_clip_ends() -> None:
     (walk,) = walk_graph(CLIPS, [walked_record([8, 9, 10, 11])]).walks
 
     assert walk.tolist() == [[0, 8, 2], [2, 10, 2]]
 
 
-def test_the_tree_names_clips_and_frames_and_goes_through_json():
+def test_the_tree_names_clips_and_frames_and_goes_through_json() -> None:
     tree = json.loads(json.dumps(graph_to_tree(walk_graph(CLIPS, [walked_record(WALK)]))))
 
     assert tree["clips"][1] == {"uid": "b", "name": "clip 1", "frames": 20}
@@ -57,7 +58,7 @@ def test_the_tree_names_clips_and_frames_and_goes_through_json():
     }
 
 
-def test_graphml_holds_the_same_graph():
+def test_graphml_holds_the_same_graph() -> None:
     root = ElementTree.fromstring(graph_to_graphml(walk_graph(CLIPS, [walked_record(WALK), walked_record([30, 31])])))
     graph = root.find("g:graph", NAMESPACE)
     nodes = {node.get("id"): node for node in graph.findall("g:node", NAMESPACE)}
@@ -76,7 +77,7 @@ def test_graphml_holds_the_same_graph():
 
 
 @pytest.mark.parametrize("name", ['a<b>&"c"', "tab\tand\x00\x0bcontrols", "\ud800 lonely", "走る 🏃"])
-def test_graphml_can_be_read_whatever_clips_are_called(name):
+def test_graphml_can_be_read_whatever_clips_are_called(name: str) -> None:
     clips = (replace(CLIPS[0], name=name), *CLIPS[1:])
     root = ElementTree.fromstring(graph_to_graphml(walk_graph(clips, [walked_record([1, 2])])))
     names = [data.text for data in root.iter(f"{{{NAMESPACE['g']}}}data") if data.get("key") == "name"]
@@ -85,7 +86,7 @@ def test_graphml_can_be_read_whatever_clips_are_called(name):
     assert names == [readable, readable]
 
 
-def test_clips_that_lead_to_each_other_are_one_component():
+def test_clips_that_lead_to_each_other_are_one_component() -> None:
     graph = clip_graph_of(clips_of(10, 10, 10, 10), [1, 11, 2, 21, 3, 12, 13, 4])
 
     assert graph.components == ((0, 1, 2),)
@@ -93,14 +94,14 @@ def test_clips_that_lead_to_each_other_are_one_component():
     assert graph.counts == {(0, 1): 2, (0, 2): 1, (1, 0): 2, (2, 0): 1}
 
 
-def test_clips_that_are_entered_and_not_left_again_are_a_dead_end():
+def test_clips_that_are_entered_and_not_left_again_are_a_dead_end() -> None:
     graph = clip_graph_of(clips_of(10, 10, 10, 10), [1, 11, 2, 21, 31, 22], [3, 12])
 
     assert graph.components == ((0, 1), (2, 3))
     assert graph.dead_ends == ((2, 3),)
 
 
-def test_a_clip_that_is_all_a_walk_needs_is_no_dead_end():
+def test_a_clip_that_is_all_a_walk_needs_is_no_dead_end() -> None:
     graph = clip_graph_of(CLIPS, [1, 2, 7, 8, 3])
 
     assert graph.components == ((0,),)
@@ -108,7 +109,7 @@ def test_a_clip_that_is_all_a_walk_needs_is_no_dead_end():
     assert graph.counts == {(0, 0): 2}
 
 
-def test_components_agree_with_reachability_by_brute_force():
+def test_components_agree_with_reachability_by_brute_force() -> None:
     generator = np.random.default_rng(5)
     for _ in range(50):
         count = int(generator.integers(2, 9))

@@ -41,7 +41,7 @@ def explained(made: tuple[ControllerOptions, TrialRecord], tick: int, **asked: A
     ],
     ids=str,
 )
-def test_every_decision_of_a_trial_is_explained_as_it_was_made(options):
+def test_every_decision_of_a_trial_is_explained_as_it_was_made(options: dict[str, Any]) -> None:
     made = played(**options)
     record = made[1]
     for tick in range(0, 600, 6):
@@ -59,7 +59,7 @@ def test_every_decision_of_a_trial_is_explained_as_it_was_made(options):
                 np.testing.assert_allclose(explanation.candidates[0].cost, record.match_cost[tick], rtol=1e-12)
 
 
-def test_candidates_are_the_cheapest_rows_in_order_with_what_each_group_costs():
+def test_candidates_are_the_cheapest_rows_in_order_with_what_each_group_costs() -> None:
     explanation = explained(played(), 60, count=8)
 
     costs = [candidate.cost for candidate in explanation.candidates]
@@ -73,21 +73,21 @@ def test_candidates_are_the_cheapest_rows_in_order_with_what_each_group_costs():
         np.testing.assert_allclose(sum(candidate.groups.values()), candidate.cost, rtol=1e-12)
 
 
-def test_going_on_costs_its_trajectory_only():
+def test_going_on_costs_its_trajectory_only() -> None:
     groups = explained(played(), 60).going_on.groups
 
     assert all(cost == 0.0 for name, cost in groups.items() if not name.startswith("trajectory"))
     assert groups["trajectory_positions"] > 0.0
 
 
-def test_by_pose_distance_the_metres_are_a_group_of_their_own():
+def test_by_pose_distance_the_metres_are_a_group_of_their_own() -> None:
     explanation = explained(played(selection="pose_distance"), 60)
 
     assert list(explanation.candidates[0].groups) == ["pose_distance", "trajectory_positions", "trajectory_directions"]
     assert explanation.going_on.groups["pose_distance"] == 0.0
 
 
-def test_the_start_is_explained_by_the_trajectory_alone():
+def test_the_start_is_explained_by_the_trajectory_alone() -> None:
     made = played()
 
     start = explained(made, 0)
@@ -99,7 +99,7 @@ def test_the_start_is_explained_by_the_trajectory_alone():
     assert "started" in start.sentence
 
 
-def test_between_searches_the_clip_just_goes_on():
+def test_between_searches_the_clip_just_goes_on() -> None:
     explanation = explained(played(), 61)
 
     assert explanation.reason == "not_searched"
@@ -107,7 +107,7 @@ def test_between_searches_the_clip_just_goes_on():
     assert len(explanation.candidates) == 10
 
 
-def test_the_end_of_a_clip_leaves_nothing_to_go_on():
+def test_the_end_of_a_clip_leaves_nothing_to_go_on() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 5.0)])
     options = ControllerOptions(continuing_bias=-1000.0)
     path = reference(Trial("circle", 2.0, 0.0))
@@ -121,7 +121,7 @@ def test_the_end_of_a_clip_leaves_nothing_to_go_on():
     assert "ended" in explanation.sentence
 
 
-def test_the_sentence_has_the_numbers_that_decided():
+def test_the_sentence_has_the_numbers_that_decided() -> None:
     made = played(continuing_bias=-0.25, switch_margin=0.01)
     record = made[1]
     tick = int(np.flatnonzero(record.status == Status.REPLACING)[0]) - 1
@@ -134,7 +134,7 @@ def test_the_sentence_has_the_numbers_that_decided():
     assert "margin of 0.01" in sentence
 
 
-def test_rows_one_asks_about_are_listed_with_why_they_could_not_be_chosen():
+def test_rows_one_asks_about_are_listed_with_why_they_could_not_be_chosen() -> None:
     made = played(reselect_window_s=1 / 3)
     tick = 60
     row = int(made[1].rows[tick])
@@ -146,7 +146,7 @@ def test_rows_one_asks_about_are_listed_with_why_they_could_not_be_chosen():
     assert [candidate.barred for candidate in asked] == ["too near", "not selectable", None]
 
 
-def test_ticks_and_rows_that_there_are_not_are_refused():
+def test_ticks_and_rows_that_there_are_not_are_refused() -> None:
     made = played()
 
     with pytest.raises(MotionError, match="the trial has 780 ticks and no tick 780"):
@@ -155,7 +155,7 @@ def test_ticks_and_rows_that_there_are_not_are_refused():
         explained(made, 0, others=(-1,))
 
 
-def test_a_record_of_another_database_is_refused():
+def test_a_record_of_another_database_is_refused() -> None:
     options, record = played()
     smaller = synthetic_database(random_tracks(1, seed=1))
     far = replace(record, rows=record.rows + 10_000)

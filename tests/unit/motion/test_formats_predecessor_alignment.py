@@ -1,6 +1,8 @@
 """The predecessor's documents for aligned clips."""
 
 import json
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.alignment import (
+    PredecessorAlignment,
     as_increasing,
     read_predecessor_alignment,
     write_predecessor_alignment,
@@ -17,25 +20,25 @@ from marey_motion.formats.predecessor.alignment import (
 FRAMES = [0, 0, 1, 3, 3, 3, 4, 7, 8, 9]
 
 
-def read(document):
+def read(document: dict[str, Any]) -> PredecessorAlignment:
     return read_predecessor_alignment(json.dumps(document).encode(), "a.json")
 
 
 @pytest.mark.parametrize("wrap", [lambda one: one, json.dumps, lambda one: json.dumps(json.dumps(one))])
-def test_a_time_function_is_read_as_a_list_or_as_text_of_one(wrap):
+def test_a_time_function_is_read_as_a_list_or_as_text_of_one(wrap: Callable[..., Any]) -> None:
     found = read({"time_function": wrap(FRAMES), "sections": [{"start_idx": 0, "end_idx": 4}]})
     np.testing.assert_array_equal(found.frames, FRAMES)
     assert found.sections == ((0, 4),)
 
 
-def test_what_is_written_is_read_again_and_written_the_same():
+def test_what_is_written_is_read_again_and_written_the_same() -> None:
     written = write_predecessor_alignment(np.array(FRAMES, dtype=float), [(0, 4), (4, 10)])
     found = read_predecessor_alignment(written, "a.json")
     assert write_predecessor_alignment(found.frames.astype(float), found.sections) == written
 
 
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=60), st.integers(0, 10))
-def test_a_stair_of_frames_becomes_a_function_that_rises_strictly_and_stays_near(steps, rest):
+def test_a_stair_of_frames_becomes_a_function_that_rises_strictly_and_stays_near(steps: list[int], rest: int) -> None:
     frames = np.concatenate(([0], np.cumsum(steps)))
     source_frames = int(frames[-1]) + 1 + rest
     assume(len(frames) > 1 and source_frames - 1 > 0.01 * len(frames))
@@ -45,7 +48,7 @@ def test_a_stair_of_frames_becomes_a_function_that_rises_strictly_and_stays_near
     assert (np.diff(times) > 0).all()
 
 
-def test_where_the_stair_stands_time_goes_on_evenly():
+def test_where_the_stair_stands_time_goes_on_evenly() -> None:
     times = as_increasing(np.array([0, 1, 1, 1, 2, 3]), 4)
     np.testing.assert_allclose(times, [0.0, 0.5, 1.0, 1.5, 2.0, 3.0])
 
@@ -64,11 +67,11 @@ def test_where_the_stair_stands_time_goes_on_evenly():
         ),
     ],
 )
-def test_damaged_alignments_are_refused_by_the_field(document, told):
+def test_damaged_alignments_are_refused_by_the_field(document: dict[str, Any], told: str) -> None:
     with pytest.raises(FormatError, match=told):
         read(document)
 
 
-def test_a_time_function_beyond_its_source_is_refused():
+def test_a_time_function_beyond_its_source_is_refused() -> None:
     with pytest.raises(FormatError, match="names frame 9 of a source of 9"):
         as_increasing(np.array(FRAMES), 9)

@@ -10,7 +10,7 @@ from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.graph import graph_of_document, is_graph, write_predecessor_graph
 
 
-def transition(action, name, model_id):
+def transition(action: str, name: str, model_id: int) -> dict[str, dict[str, Any]]:
     return {f"{action}:{name}": {"action_name": action, "model_name": name, "model_id": model_id}}
 
 
@@ -31,7 +31,7 @@ DOCUMENT = {
 }  # fmt: skip
 
 
-def test_nodes_are_known_by_action_and_name_with_what_follows_them():
+def test_nodes_are_known_by_action_and_name_with_what_follows_them() -> None:
     graph = graph_of_document(DOCUMENT, "g.json")
     assert graph.start == ("idle", "stand")
     assert graph.nodes["idle", "stand"].transitions == (("idle", "stand"), ("walk", "begin"))
@@ -40,13 +40,13 @@ def test_nodes_are_known_by_action_and_name_with_what_follows_them():
 
 @pytest.mark.parametrize("start", [["idle", "11"], ["idle", 11], ["idle", "stand"]])
 @pytest.mark.parametrize("field", ["start_node", "startNode"])
-def test_the_start_stands_under_either_name_and_names_a_model_by_id_or_name(field, start):
+def test_the_start_stands_under_either_name_and_names_a_model_by_id_or_name(field: str, start: list[Any]) -> None:
     document = {"nodes": DOCUMENT["nodes"], field: start}
     assert is_graph(document)
     assert graph_of_document(document, "g.json").start == ("idle", "stand")
 
 
-def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_names():
+def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_names() -> None:
     graph = graph_of_document(DOCUMENT, "g.json")
     written = json.loads(write_predecessor_graph(graph))
     assert graph_of_document(written, "again.json") == graph
@@ -54,7 +54,7 @@ def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_name
     assert json.loads(write_predecessor_graph(graph_of_document(written, "again.json"))) == written
 
 
-def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing():
+def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing() -> None:
     with pytest.raises(FormatError, match="'start_node' is missing") as refused:
         graph_of_document({"nodes": DOCUMENT["nodes"]}, "g.json")
     assert refused.value.file == "g.json"
@@ -74,7 +74,7 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing():
         (["start_node"], ["idle", "99"], "there is no node"),
     ],
 )
-def test_damaged_graphs_are_refused_by_the_node(path, value, told):
+def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: Any, told: str) -> None:
     document = copy.deepcopy(DOCUMENT)
     *above, last = path
     place: Any = document

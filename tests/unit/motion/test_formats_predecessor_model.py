@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from scipy.interpolate import BSpline
 from tests.support import model_examples
 from tests.support import predecessor_models as models
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor.encoding import encode_document
-from marey_motion.formats.predecessor.model import read_predecessor_model
+from marey_motion.formats.predecessor.encoding import Encoding, encode_document
+from marey_motion.formats.predecessor.model import PredecessorModel, read_predecessor_model
 from marey_motion.formats.predecessor.model_writer import write_predecessor_model
 from marey_motion.formats.predecessor.time_functions import PredecessorTime, as_log_slopes
 from marey_motion.modelling.splines import SplineBasis
@@ -24,11 +26,11 @@ QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 SCORES = np.random.default_rng(3).normal(scale=0.3, size=(20, models.SPATIAL + models.TEMPORAL))
 
 
-def read(document, encoding="json", **options):
+def read(document: dict[str, Any], encoding: Encoding = "json", **options: Any) -> PredecessorModel:
     return read_predecessor_model(encode_document(document, encoding), "model.json", **options)
 
 
-def their_poses(document, scores):
+def their_poses(document: dict[str, Any], scores: Floats) -> tuple[Floats, Floats]:
     """Root positions in metres and rotations (w, x, y, z) as the predecessor evaluates them, frame by frame."""
     flat = "mean_spatial_vector" in document
     mean, vectors = (
@@ -46,7 +48,9 @@ def their_poses(document, scores):
 
 @pytest.mark.parametrize("encoding", ["json", "bson", "bson.bz2"])
 @pytest.mark.parametrize("layout", ["3", "2", "2 later", "1"])
-def test_poses_are_those_of_the_document_in_metres_and_joints_that_are_not_animated_rest(layout, encoding):
+def test_poses_are_those_of_the_document_in_metres_and_joints_that_are_not_animated_rest(
+    layout: str, encoding: Encoding
+) -> None:
     document = models.LAYOUTS[layout]()
     found = read(document, encoding)
     assert found.layout == layout[0]
@@ -59,7 +63,7 @@ def test_poses_are_those_of_the_document_in_metres_and_joints_that_are_not_anima
     np.testing.assert_allclose(ours[:, :, len(models.ANIMATED) :], resting[:, :, len(models.ANIMATED) :], atol=1e-12)
 
 
-def test_the_time_of_layout_3_is_a_spline_whose_coefficients_are_added_up_exponentials():
+def test_the_time_of_layout_3_is_a_spline_whose_coefficients_are_added_up_exponentials() -> None:
     document = models.layout_3()
     found = read(document)
     latents = found.primitive.sample(50, 1)
@@ -75,7 +79,7 @@ def test_the_time_of_layout_3_is_a_spline_whose_coefficients_are_added_up_expone
     assert found.primitive.keyframes == {"contact0": 20}
 
 
-def test_time_parameters_of_layout_2_are_read_whichever_trainer_wrote_them():
+def test_time_parameters_of_layout_2_are_read_whichever_trainer_wrote_them() -> None:
     by_columns, by_rows = read(models.layout_2()), read(models.layout_2(by_columns=False))
     assert (by_columns.time_form, by_rows.time_form) == ("increments", "coefficients")
     assert by_columns.time_error_frames < 1e-9
@@ -87,13 +91,13 @@ def test_time_parameters_of_layout_2_are_read_whichever_trainer_wrote_them():
     np.testing.assert_allclose(np.diff(ours, axis=1), steps, rtol=1e-9)
 
 
-def test_layout_1_tells_time_as_layout_3_does():
+def test_layout_1_tells_time_as_layout_3_does() -> None:
     found = read(models.layout_1())
     assert found.time_form == "coefficients"
     assert found.primitive.temporal.count == models.TEMPORAL
 
 
-def test_a_static_primitive_is_always_the_same_motion_at_constant_speed():
+def test_a_static_primitive_is_always_the_same_motion_at_constant_speed() -> None:
     found = read(models.static())
     assert found.primitive.dimensions == 0
     first, second = found.primitive.motions(found.primitive.sample(2, 5))
@@ -102,7 +106,7 @@ def test_a_static_primitive_is_always_the_same_motion_at_constant_speed():
     assert found.time_form is None
 
 
-def test_a_mixture_of_space_alone_leaves_time_at_its_mean():
+def test_a_mixture_of_space_alone_leaves_time_at_its_mean() -> None:
     document = models.layout_3()
     weights, means, covariances = models.mixture(np.random.default_rng(1), models.SPATIAL)
     document["gmm"] = {"weights": weights, "means": means, "covars": covariances}
@@ -112,7 +116,7 @@ def test_a_mixture_of_space_alone_leaves_time_at_its_mean():
     assert np.ptp(durations) == 0.0
 
 
-def test_a_model_without_time_runs_at_constant_speed():
+def test_a_model_without_time_runs_at_constant_speed() -> None:
     document = models.layout_3()
     weights, means, covariances = models.mixture(np.random.default_rng(1), models.SPATIAL)
     document |= {"tspm": {}, "gmm": {"weights": weights, "means": means, "covars": covariances}}
@@ -120,7 +124,7 @@ def test_a_model_without_time_runs_at_constant_speed():
     np.testing.assert_allclose(times, np.broadcast_to(np.arange(models.FRAMES), times.shape), atol=1e-9)
 
 
-def test_a_model_without_its_skeleton_needs_one():
+def test_a_model_without_its_skeleton_needs_one() -> None:
     document = models.layout_2()
     del document["skeleton"]
     with pytest.raises(FormatError) as refused:
@@ -130,7 +134,7 @@ def test_a_model_without_its_skeleton_needs_one():
     np.testing.assert_array_equal(given.primitive.spatial.mean, read(models.layout_2()).primitive.spatial.mean)
 
 
-def test_the_oldest_models_tell_how_many_coefficients_there_are_in_place_of_knots():
+def test_the_oldest_models_tell_how_many_coefficients_there_are_in_place_of_knots() -> None:
     document = models.layout_2()
     without = {name: value for name, value in document.items() if "knots" not in name}
     np.testing.assert_array_equal(
@@ -139,7 +143,7 @@ def test_the_oldest_models_tell_how_many_coefficients_there_are_in_place_of_knot
 
 
 @pytest.mark.parametrize("layout", ["3", "2"])
-def test_what_is_written_in_a_layout_is_read_as_the_same_model(layout):
+def test_what_is_written_in_a_layout_is_read_as_the_same_model(layout: Literal["2", "3"]) -> None:
     primitive = read(models.layout_3()).primitive
     again = read_predecessor_model(write_predecessor_model(primitive, layout=layout), "again.json")
     assert again.layout == layout
@@ -153,7 +157,7 @@ def test_what_is_written_in_a_layout_is_read_as_the_same_model(layout):
 
 
 @pytest.mark.parametrize(("layout", "most_frames"), [("3", 0.3), ("2", 1e-3)])
-def test_time_varies_as_much_after_writing(layout, most_frames):
+def test_time_varies_as_much_after_writing(layout: Literal["2", "3"], most_frames: float) -> None:
     trained = train_primitive(model_examples.walks(24), QUICK).primitive
     again = read_predecessor_model(write_predecessor_model(trained, layout=layout), "again.json").primitive
     latents = trained.sample(50, 4)
@@ -164,7 +168,7 @@ def test_time_varies_as_much_after_writing(layout, most_frames):
     assert np.abs(after - before).max() < most_frames
 
 
-def test_layout_3_is_written_with_the_numbers_that_were_read():
+def test_layout_3_is_written_with_the_numbers_that_were_read() -> None:
     document = models.layout_3()
     found = read(document)
     written = json.loads(write_predecessor_model(found.primitive, animated_joints=found.animated_joints))
@@ -181,7 +185,7 @@ def test_layout_3_is_written_with_the_numbers_that_were_read():
 
 
 @pytest.mark.parametrize("layout", ["3", "2"])
-def test_a_model_that_only_repeats_one_motion_is_written_and_read_again(layout):
+def test_a_model_that_only_repeats_one_motion_is_written_and_read_again(layout: Literal["2", "3"]) -> None:
     primitive = read(models.static()).primitive
     again = read_predecessor_model(write_predecessor_model(primitive, layout=layout), "again.json").primitive
     assert again.dimensions == 0
@@ -189,7 +193,7 @@ def test_a_model_that_only_repeats_one_motion_is_written_and_read_again(layout):
 
 
 @pytest.mark.parametrize("frames", [3, 4, 5, 6, 48, 400])
-def test_a_time_function_is_taken_over_as_it_is_however_long(frames):
+def test_a_time_function_is_taken_over_as_it_is_however_long(frames: int) -> None:
     basis = SplineBasis.clamped(frames, min(frames, 8), min(3, frames - 1))
     time = PredecessorTime("increments", basis, np.linspace(-1.0, 1.0, basis.count) ** 2, np.zeros((0, basis.count)))
     found, error = as_log_slopes(time, np.zeros((1, 0)), np.zeros(0), "model.json")
@@ -198,7 +202,7 @@ def test_a_time_function_is_taken_over_as_it_is_however_long(frames):
     assert error < 1e-10 * frames
 
 
-def test_a_long_time_function_is_taken_over_without_a_coefficient_for_each_frame():
+def test_a_long_time_function_is_taken_over_without_a_coefficient_for_each_frame() -> None:
     document = models.static()
     document["knots"] = SplineBasis.clamped(6000, models.COEFFICIENTS).knots.tolist()
     found = read(document)
@@ -207,7 +211,7 @@ def test_a_long_time_function_is_taken_over_without_a_coefficient_for_each_frame
     np.testing.assert_allclose(times, np.arange(6000), atol=1e-6)
 
 
-def changed(path, value):
+def changed(path: list[str], value: Any) -> dict[str, Any]:
     document = copy.deepcopy(models.layout_3())
     *above, last = path
     place = document
@@ -247,7 +251,7 @@ def changed(path, value):
         (changed(["sspm", "knots"], [0.0] * 4 + [5.0] * 2000 + [19_999.0] * 4), "2004 coefficients over 20000 frames"),
     ],
 )
-def test_damaged_models_are_refused_by_what_is_wrong(document, told):
+def test_damaged_models_are_refused_by_what_is_wrong(document: dict[str, Any], told: str) -> None:
     data = json.dumps(document).encode()
     with pytest.raises(FormatError, match=told) as refused:
         read_predecessor_model(data, "model.json")

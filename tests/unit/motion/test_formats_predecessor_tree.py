@@ -2,6 +2,8 @@
 
 import copy
 import json
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,19 +11,20 @@ from tests.support import predecessor_models as models
 
 from marey_motion.errors import FormatError
 from marey_motion.formats.predecessor.tree import is_tree, read_predecessor_tree, write_predecessor_tree
+from marey_motion.modelling.search.tree import SampleTree
 
 
-def read(document):
+def read(document: dict[str, Any]) -> SampleTree:
     return read_predecessor_tree(json.dumps(document).encode(), "tree.json")
 
 
-def walk(node):
+def walk(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
     yield node
     for child in node["children"]:
         yield from walk(child)
 
 
-def test_each_node_holds_the_samples_and_the_mean_that_it_had():
+def test_each_node_holds_the_samples_and_the_mean_that_it_had() -> None:
     document = models.tree()
     found = read(document)
     data = np.array(document["data"])
@@ -39,7 +42,7 @@ def test_each_node_holds_the_samples_and_the_mean_that_it_had():
         np.testing.assert_allclose(mean, node["mean"], atol=1e-6)
 
 
-def test_a_tree_that_was_written_is_read_again_and_written_the_same():
+def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
     found = read(models.tree())
     written = write_predecessor_tree(found, models.SPATIAL, 4)
     again = read_predecessor_tree(written, "again.json")
@@ -66,7 +69,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same():
         (["root", "children", 0, "children", 0], 3, r"root\.0\.0: a node has a list"),
     ],
 )
-def test_damaged_trees_are_refused_by_the_node(path, value, told):
+def test_damaged_trees_are_refused_by_the_node(path: list[Any], value: Any, told: str) -> None:
     document = copy.deepcopy(models.tree())
     *above, last = path
     place = document
@@ -78,7 +81,7 @@ def test_damaged_trees_are_refused_by_the_node(path, value, told):
     assert refused.value.file == "tree.json"
 
 
-def test_a_node_that_holds_other_samples_than_those_below_it_is_refused():
+def test_a_node_that_holds_other_samples_than_those_below_it_is_refused() -> None:
     document = models.tree()
     first, second = document["root"]["children"][0]["children"][:2]
     first["indices"] = second["indices"]
@@ -86,7 +89,7 @@ def test_a_node_that_holds_other_samples_than_those_below_it_is_refused():
         read(document)
 
 
-def test_ends_that_hold_a_sample_twice_are_refused():
+def test_ends_that_hold_a_sample_twice_are_refused() -> None:
     document = models.tree()
     first, second = document["root"]["children"][0]["children"][:2]
     first |= copy.deepcopy(second)

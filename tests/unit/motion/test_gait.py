@@ -1,11 +1,14 @@
 """Generated gaits: exact roots, feet that stand, bodies that hold together."""
 
 from math import pi, radians
+from typing import Any
 
 import numpy as np
 import pytest
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
+from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import (
     GaitStyle,
@@ -52,17 +55,19 @@ PATHS = {
 every_path = pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
 
 
-def times_of(clip):
+def times_of(clip: Clip) -> Floats:
     return np.arange(clip.frame_count) / clip.frame_rate_hz
 
 
-def heading_of(clip):
+def heading_of(clip: Clip) -> Floats:
     forward = quaternions.rotate_vectors(clip.rotations[:, 0].astype(np.float64), (0.0, 0.0, 1.0))
     return np.unwrap(np.arctan2(forward[:, 0], forward[:, 2]))
 
 
 @pytest.mark.parametrize(("speed", "turn_deg", "travel_deg"), GAITS.values(), ids=GAITS)
-def test_the_root_follows_the_arc_of_its_speed_and_turn_rate_exactly(speed, turn_deg, travel_deg):
+def test_the_root_follows_the_arc_of_its_speed_and_turn_rate_exactly(
+    speed: float, turn_deg: float, travel_deg: float
+) -> None:
     omega, travel = radians(turn_deg), radians(travel_deg)
     clip = generate_gait(speed, omega, 10.0, RATE_HZ, travel_angle_rad=travel)
 
@@ -78,14 +83,14 @@ def test_the_root_follows_the_arc_of_its_speed_and_turn_rate_exactly(speed, turn
     assert np.abs(heading_of(clip) - omega * t).max() < 1e-6
 
 
-def test_a_turn_to_the_left_goes_to_positive_x():
+def test_a_turn_to_the_left_goes_to_positive_x() -> None:
     clip = generate_gait(1.0, radians(30), 3.0)
 
     assert clip.root_translations[-1, 0] > 1.0
     assert heading_of(clip)[-1] > radians(88)
 
 
-def test_the_axis_through_both_hips_is_square_to_the_heading():
+def test_the_axis_through_both_hips_is_square_to_the_heading() -> None:
     clip = generate_gait(1.5, radians(40), 4.0)
     skeleton = clip.skeleton
     positions = kinematics.global_positions(clip)
@@ -97,7 +102,7 @@ def test_the_axis_through_both_hips_is_square_to_the_heading():
 
 
 @every_path
-def test_the_root_is_where_its_path_says(path):
+def test_the_root_is_where_its_path_says(path: RootPath) -> None:
     clip = generate_along(path)
 
     state = path.at(times_of(clip))
@@ -107,7 +112,7 @@ def test_the_root_is_where_its_path_says(path):
 
 
 @every_path
-def test_a_path_is_the_integral_of_its_velocity(path):
+def test_a_path_is_the_integral_of_its_velocity(path: RootPath) -> None:
     t = np.linspace(-1.0, path.duration_s + 1.0, 200_001)
     state = path.at(t)
 
@@ -118,7 +123,7 @@ def test_a_path_is_the_integral_of_its_velocity(path):
     assert np.abs(state.headings[1:] - state.headings[0] - turned).max() < 1e-4
 
 
-def test_a_hardly_noticeable_turn_is_the_limit_of_going_straight():
+def test_a_hardly_noticeable_turn_is_the_limit_of_going_straight() -> None:
     t = np.linspace(0.0, 30.0, 301)
     ramp = {"end_speed_m_s": 3.0}
 
@@ -127,7 +132,7 @@ def test_a_hardly_noticeable_turn_is_the_limit_of_going_straight():
     assert np.abs(bent - straight).max() < 2e-6
 
 
-def test_the_upper_body_rides_rigidly_on_the_root_when_its_motions_are_switched_off():
+def test_the_upper_body_rides_rigidly_on_the_root_when_its_motions_are_switched_off() -> None:
     style = GaitStyle(bounce=0.0, lean=0.0, sway=0.0, arm_swing=0.0)
     clip = generate_gait(1.35, radians(50), 4.0, style=style)
 
@@ -139,7 +144,7 @@ def test_the_upper_body_rides_rigidly_on_the_root_when_its_motions_are_switched_
 
 
 @every_path
-def test_planted_feet_do_not_slide(path):
+def test_planted_feet_do_not_slide(path: RootPath) -> None:
     clip = generate_along(path)
     skeleton = clip.skeleton
     truth = foot_motions(path, times_of(clip))
@@ -159,7 +164,7 @@ def test_planted_feet_do_not_slide(path):
 
 
 @every_path
-def test_a_foot_stays_within_a_millimetre_during_each_whole_stance(path):
+def test_a_foot_stays_within_a_millimetre_during_each_whole_stance(path: RootPath) -> None:
     clip = generate_along(path)
     truth = foot_motions(path, times_of(clip))
     positions = kinematics.global_positions(clip).astype(np.float64)
@@ -173,14 +178,14 @@ def test_a_foot_stays_within_a_millimetre_during_each_whole_stance(path):
 
 
 @every_path
-def test_nothing_is_below_the_floor(path):
+def test_nothing_is_below_the_floor(path: RootPath) -> None:
     clip = generate_along(path, style=GaitStyle.varied(3))
 
     assert kinematics.global_positions(clip, end_sites=True)[..., 1].min() > 0.0199
 
 
 @every_path
-def test_nothing_jumps_between_frames(path):
+def test_nothing_jumps_between_frames(path: RootPath) -> None:
     clip = generate_along(path, 240.0, style=GaitStyle.varied(5))
 
     positions = kinematics.global_positions(clip, end_sites=True).astype(np.float64)
@@ -193,7 +198,7 @@ def test_nothing_jumps_between_frames(path):
 
 
 @every_path
-def test_knees_bend_forward_only(path):
+def test_knees_bend_forward_only(path: RootPath) -> None:
     clip = generate_along(path)
 
     for side in ("Left", "Right"):
@@ -203,20 +208,20 @@ def test_knees_bend_forward_only(path):
         assert np.abs(angles[:, 1:]).max() < 1e-3
 
 
-def test_a_faster_gait_takes_longer_strides_and_runs_have_a_flight():
+def test_a_faster_gait_takes_longer_strides_and_runs_have_a_flight() -> None:
     for speed, flies in ((1.2, False), (3.5, True)):
         truth = foot_motions(straight_or_arc(speed, 0.0, 8.0), np.arange(480) / 60.0)
         in_air = ~np.any([foot.ball_planted | foot.heel_planted for foot in truth.values()], axis=0)
         assert in_air.any() == flies
 
 
-def test_someone_standing_still_keeps_both_feet_down():
+def test_someone_standing_still_keeps_both_feet_down() -> None:
     truth = foot_motions(straight_or_arc(0.0, 0.0, 4.0), np.arange(240) / 60.0)
 
     assert all(foot.ball_planted.all() and foot.heel_planted.all() for foot in truth.values())
 
 
-def test_a_smaller_body_walks_the_same_path():
+def test_a_smaller_body_walks_the_same_path() -> None:
     path = PATHS["walk in a circle"]
     small = generate_along(path, stature_m=1.2)
 
@@ -229,22 +234,22 @@ def test_a_smaller_body_walks_the_same_path():
     assert kinematics.global_positions(small, end_sites=True)[..., 1].min() > 0.0134
 
 
-def test_the_same_arguments_give_the_same_bytes_and_other_styles_others():
-    def bytes_of(seed):
+def test_the_same_arguments_give_the_same_bytes_and_other_styles_others() -> None:
+    def bytes_of(seed: int) -> bytes:
         return generate_gait(1.4, 0.3, 3.0, style=GaitStyle.varied(seed)).poses.tobytes()
 
     assert bytes_of(7) == bytes_of(7)
     assert bytes_of(7) != bytes_of(8)
 
 
-def test_style_changes_the_body_but_never_the_root():
+def test_style_changes_the_body_but_never_the_root() -> None:
     plain, styled = (generate_gait(1.4, 0.3, 3.0, style=style) for style in (None, GaitStyle.varied(11)))
 
     assert np.array_equal(plain.root_translations[:, ::2], styled.root_translations[:, ::2])
     assert np.abs(plain.rotations - styled.rotations).max() > 0.01
 
 
-def test_the_dataset_holds_two_dozen_named_takes_of_many_kinds():
+def test_the_dataset_holds_two_dozen_named_takes_of_many_kinds() -> None:
     takes = generate_dataset(seed=1)
 
     assert len(takes) == 24
@@ -267,23 +272,23 @@ def test_the_dataset_holds_two_dozen_named_takes_of_many_kinds():
         ((60.0, 0.0, 2.0), "speed_m_s"),
     ],
 )
-def test_an_impossible_gait_is_refused_by_the_name_of_its_parameter(arguments, place):
+def test_an_impossible_gait_is_refused_by_the_name_of_its_parameter(arguments: tuple[Any, ...], place: str) -> None:
     with pytest.raises(MotionError) as error:
         generate_gait(*arguments)
     assert error.value.where == place
 
 
-def test_a_single_frame_and_a_slow_frame_rate_are_possible():
+def test_a_single_frame_and_a_slow_frame_rate_are_possible() -> None:
     assert generate_gait(1.0, 0.0, 1.0, 1.0).frame_count == 1
     assert generate_gait(1.0, 0.0, 10.0, 0.5).frame_count == 5
 
 
-def test_a_stature_must_be_positive():
+def test_a_stature_must_be_positive() -> None:
     with pytest.raises(MotionError, match="positive"):
         generate_gait(1.0, 0.0, 1.0, stature_m=0.0)
 
 
-def test_the_game_skeleton_is_a_mirror_image_of_itself_and_stands_on_the_floor():
+def test_the_game_skeleton_is_a_mirror_image_of_itself_and_stands_on_the_floor() -> None:
     skeleton = game_skeleton()
     positions = skeleton.rest_global_positions
 

@@ -2,19 +2,23 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.kinematics_kernels import BLOCK
 from marey_motion.skeleton import EndSite, Skeleton
 
 
-def reference(clip):
+def reference(clip: Clip) -> tuple[Floats, Floats]:
     """Positions and rotations one frame and joint at a time, with another library's rotations."""
     skeleton = clip.skeleton
     sites = skeleton.end_sites
@@ -42,7 +46,9 @@ def reference(clip):
 
 @pytest.mark.parametrize("frames", [1, BLOCK - 1, BLOCK, BLOCK + 1])
 @pytest.mark.parametrize("translated", [(), (3, 9, 21), tuple(range(1, 22))])
-def test_positions_and_rotations_agree_with_a_plain_reference(body, tumbling, frames, translated):
+def test_positions_and_rotations_agree_with_a_plain_reference(
+    body: Skeleton, tumbling: Callable[..., Any], frames: int, translated: tuple[Any, ...]
+) -> None:
     clip = tumbling(body, frames, translated)
     positions, rotations = reference(clip)
 
@@ -51,7 +57,7 @@ def test_positions_and_rotations_agree_with_a_plain_reference(body, tumbling, fr
     assert np.max(quaternions.angle_between(kinematics.global_rotations(clip), rotations)) < 2e-5
 
 
-def test_double_precision_poses_give_double_precision_positions(body, tumbling):
+def test_double_precision_poses_give_double_precision_positions(body: Skeleton, tumbling: Callable[..., Any]) -> None:
     clip = tumbling(body)
     positions, _ = reference(clip)
     poses = clip.poses.astype(np.float64)
@@ -63,7 +69,7 @@ def test_double_precision_poses_give_double_precision_positions(body, tumbling):
     np.testing.assert_allclose(result, positions[:, :22], atol=1e-13)
 
 
-def test_a_bent_chain_lies_where_a_pencil_would_draw_it():
+def test_a_bent_chain_lies_where_a_pencil_would_draw_it() -> None:
     offsets = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     parents = np.array([-1, 0], np.int32)
     arm = Skeleton(("upper", "fore"), parents, offsets, quaternions.identity(2), (EndSite(1, offsets[1]),))
@@ -74,52 +80,54 @@ def test_a_bent_chain_lies_where_a_pencil_would_draw_it():
     np.testing.assert_allclose(positions[0], [[5, 0, 0], [5, 1, 0], [4, 1, 0]], atol=1e-6)
 
 
-def test_a_clip_in_its_rest_pose_stands_where_the_skeleton_rests(body):
+def test_a_clip_in_its_rest_pose_stands_where_the_skeleton_rests(body: Skeleton) -> None:
     poses = np.concatenate((body.offsets[0], body.rest_rotations.ravel())).astype(np.float32)[None]
     np.testing.assert_allclose(
         kinematics.global_positions(Clip(body, 30.0, poses))[0], body.rest_global_positions, atol=1e-6
     )
 
 
-def test_the_same_frames_give_the_same_bytes_wherever_they_stand_in_a_clip(body, tumbling):
+def test_the_same_frames_give_the_same_bytes_wherever_they_stand_in_a_clip(
+    body: Skeleton, tumbling: Callable[..., Any]
+) -> None:
     clip = tumbling(body, 3 * BLOCK)
     whole = kinematics.global_positions(clip)
 
     assert kinematics.global_positions(clip.sliced(17, 2 * BLOCK + 5)).tobytes() == whole[17 : 2 * BLOCK + 5].tobytes()
 
 
-def test_local_rotations_come_back_from_global_ones(body, tumbling):
+def test_local_rotations_come_back_from_global_ones(body: Skeleton, tumbling: Callable[..., Any]) -> None:
     clip = tumbling(body)
     back = kinematics.as_local_rotations(body, kinematics.global_rotations(clip))
     assert np.max(quaternions.angle_between(back, clip.rotations)) < 1e-5
 
 
-def test_arrays_that_do_not_fit_the_skeleton_are_refused(body):
+def test_arrays_that_do_not_fit_the_skeleton_are_refused(body: Skeleton) -> None:
     with pytest.raises(MotionError, match="91"):
         kinematics.forward_kinematics(body, np.zeros((2, 90)))
     with pytest.raises(MotionError, match="22, 4"):
         kinematics.as_global_rotations(body, np.zeros((2, 21, 4)))
 
 
-def test_a_falling_body_has_its_velocity_in_every_frame():
+def test_a_falling_body_has_its_velocity_in_every_frame() -> None:
     times = np.arange(8) / 60.0
     height = 2.0 - 0.5 * 9.81 * times**2
 
     np.testing.assert_allclose(kinematics.velocities(height, 60.0), -9.81 * times, atol=1e-9)
 
 
-def facing(heading, tilt=0.0):
+def facing(heading: Floats, tilt: float = 0.0) -> Floats:
     """Left and right hip of a body that faces `heading`, leaning to its side."""
     left = np.stack((np.cos(heading) * np.cos(tilt), np.full_like(heading, np.sin(tilt)), -np.sin(heading)), axis=1)
     return np.stack((0.1 * left, -0.1 * left), axis=1)
 
 
-def test_a_body_with_its_left_at_plus_x_faces_plus_z():
+def test_a_body_with_its_left_at_plus_x_faces_plus_z() -> None:
     direction = kinematics.forward_directions(facing(np.zeros(1)), [0], [1])
     np.testing.assert_allclose(direction, [[0.0, 1.0]])
 
 
-def test_a_left_turn_is_counter_clockwise_from_above_and_positive():
+def test_a_left_turn_is_counter_clockwise_from_above_and_positive() -> None:
     heading = np.linspace(0.0, 3 * np.pi, 181)
     measured = kinematics.headings(kinematics.forward_directions(facing(heading), [0], [1]))
 
@@ -129,7 +137,7 @@ def test_a_left_turn_is_counter_clockwise_from_above_and_positive():
     np.testing.assert_allclose(quarter, [[1.0, 0.0]], atol=1e-12)
 
 
-def test_while_lying_on_the_side_the_last_heading_is_kept():
+def test_while_lying_on_the_side_the_last_heading_is_kept() -> None:
     positions = facing(np.array([0.5, 0.6, 0.7, 0.8, 0.9]))
     positions[[0, 2, 3]] = [[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]
     measured = kinematics.headings(kinematics.forward_directions(positions, [0], [1]))
@@ -137,7 +145,7 @@ def test_while_lying_on_the_side_the_last_heading_is_kept():
     np.testing.assert_allclose(measured, [0.6, 0.6, 0.6, 0.6, 0.9])
 
 
-def test_a_heading_that_nothing_defines_is_an_error():
+def test_a_heading_that_nothing_defines_is_an_error() -> None:
     lying = np.array([[[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]]])
     for positions, left, right in ((lying, [0], [1]), (lying, [], []), (lying, [0], [0, 1])):
         with pytest.raises(MotionError) as caught:
@@ -145,7 +153,7 @@ def test_a_heading_that_nothing_defines_is_an_error():
         assert caught.value.code == "heading-undefined"
 
 
-def test_feet_stand_while_they_are_slow_and_single_frames_do_not_flicker():
+def test_feet_stand_while_they_are_slow_and_single_frames_do_not_flicker() -> None:
     rate = 60.0
     speed = np.zeros(60)
     speed[20:40] = 1.0
@@ -163,11 +171,11 @@ def test_feet_stand_while_they_are_slow_and_single_frames_do_not_flicker():
     assert not standing[24:36, 0].any()
 
 
-def test_the_ground_is_x_and_z():
+def test_the_ground_is_x_and_z() -> None:
     np.testing.assert_array_equal(kinematics.ground_projection(np.array([[1.0, 2.0, 3.0]])), [[1.0, 3.0]])
 
 
-def test_positions_of_real_motion_agree_with_the_reference(mocap):
+def test_positions_of_real_motion_agree_with_the_reference(mocap: Path) -> None:
     from marey_motion.formats import read_motion
 
     path = mocap / "cmu-bvh" / "01_01.bvh"
@@ -176,7 +184,7 @@ def test_positions_of_real_motion_agree_with_the_reference(mocap):
     np.testing.assert_allclose(kinematics.global_positions(clip), positions[:, : clip.skeleton.joint_count], atol=1e-5)
 
 
-def test_importing_the_package_and_its_core_types_loads_no_compiler():
+def test_importing_the_package_and_its_core_types_loads_no_compiler() -> None:
     code = (
         "import sys, marey_motion, marey_motion.skeleton, marey_motion.clip, marey_motion.errors;"
         "marey_motion.Clip, marey_motion.map_joints, marey_motion.global_positions;"
@@ -185,7 +193,7 @@ def test_importing_the_package_and_its_core_types_loads_no_compiler():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_the_package_has_no_other_names_than_its_own():
+def test_the_package_has_no_other_names_than_its_own() -> None:
     import marey_motion
 
     with pytest.raises(AttributeError, match="nonsense"):

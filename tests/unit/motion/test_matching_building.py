@@ -211,7 +211,7 @@ class TestMirroring:
 
 class TestFrames:
     @pytest.mark.parametrize(("policy", "left_out"), [("clamp", 20), ("trim", 60), ("loop", 20)])
-    def test_the_end_of_a_clip_cannot_be_chosen(self, policy, left_out) -> None:
+    def test_the_end_of_a_clip_cannot_be_chosen(self, policy: str, left_out: int) -> None:
         selectable = built(WALK, DatabaseOptions(end_policy=policy)).selectable
         assert np.array_equal(selectable, np.arange(180) < 180 - left_out)
 

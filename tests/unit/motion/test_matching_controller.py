@@ -1,6 +1,7 @@
 """The controller's rules, on databases made of exact roots."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ from marey_schemas.options.matching import ControllerOptions, DatabaseOptions
     ],
     ids=["default", "biased", "eager"],
 )
-def test_the_compiled_loop_does_what_a_plain_one_does(options, follow):
+def test_the_compiled_loop_does_what_a_plain_one_does(options: ControllerOptions, follow: str) -> None:
     database = synthetic_database(random_tracks(12, seed=5))
     options = options.replace(follow=follow)
     for trial in (circle(2.2, 60.0), Trial("switching", 1.5, -0.4, approach_s=1.05, switch_every_s=1.35)):
@@ -58,7 +59,7 @@ def test_the_compiled_loop_does_what_a_plain_one_does(options, follow):
         assert np.flatnonzero(np.isfinite(record.match_cost[1:420])).tolist() == [tick - 1 for tick in plain.searches]
 
 
-def test_loops_and_ends_are_played_as_a_plain_loop_plays_them():
+def test_loops_and_ends_are_played_as_a_plain_loop_plays_them() -> None:
     tracks = [track._replace(loop=number % 2 == 0) for number, track in enumerate(random_tracks(5, seed=8))]
     database = synthetic_database(tracks, DatabaseOptions(end_policy="loop"))
     options = ControllerOptions(continuing_bias=-50.0)
@@ -83,7 +84,7 @@ def searched(record: TrialRecord) -> list[int]:
     return np.flatnonzero(np.isfinite(record.match_cost)).tolist()
 
 
-def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose():
+def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose() -> None:
     slow, fast = arc_track(1.0, 0.0, 10.0), arc_track(3.0, 0.0, 10.0)
     database = synthetic_database([slow, fast._replace(pose=fast.pose + 100.0)])
 
@@ -94,7 +95,7 @@ def test_a_trial_starts_on_the_row_whose_trajectory_fits_whatever_its_pose():
     np.testing.assert_allclose(record.match_cost[0], 0.0, atol=1e-20)
 
 
-def test_searches_come_at_multiples_of_the_period():
+def test_searches_come_at_multiples_of_the_period() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 60.0)])
 
     record = play(database, circle(2.0, 0.0, duration_s=2.0), EXACT.replace(search_every_s=0.25))
@@ -103,7 +104,7 @@ def test_searches_come_at_multiples_of_the_period():
     assert np.all(np.isnan(record.continuing_cost) == np.isin(np.arange(300), searched(record)[1:], invert=True))
 
 
-def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
+def test_a_jump_of_the_wished_speed_is_searched_for_at_once() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=1.25)
 
@@ -115,7 +116,9 @@ def test_a_jump_of_the_wished_speed_is_searched_for_at_once():
 
 
 @pytest.mark.parametrize(("turn_deg", "at_once"), [(29.0, []), (31.0, [100])])
-def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(turn_deg, at_once):
+def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(
+    turn_deg: float, at_once: list[int]
+) -> None:
     database = synthetic_database([arc_track(0.3, 0.0, 60.0)])
     path = reference(circle(0.3, 0.0, duration_s=1.0))
     turned = path.headings + np.where(np.arange(len(path.headings)) >= 100, np.radians(turn_deg), 0.0)
@@ -125,7 +128,7 @@ def test_a_jump_of_the_wished_direction_is_searched_for_at_once_however_slow(tur
     assert searched(record) == sorted([*range(0, 240, 30), *at_once])
 
 
-def test_jumps_are_searched_for_at_most_once_in_a_period():
+def test_jumps_are_searched_for_at_most_once_in_a_period() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=1.0, switch_every_s=5 / 60)
 
@@ -135,7 +138,7 @@ def test_jumps_are_searched_for_at_most_once_in_a_period():
     assert searched(record) == [0, 30, 60, 65, 90, 95]
 
 
-def test_at_the_end_of_a_clip_another_row_must_be_chosen():
+def test_at_the_end_of_a_clip_another_row_must_be_chosen() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 5.05)])
     options = EXACT.replace(search_every_s=0.5, continuing_bias=-1000.0)
 
@@ -149,7 +152,7 @@ def test_at_the_end_of_a_clip_another_row_must_be_chosen():
     assert record.status[302] == Status.KEPT
 
 
-def test_a_loop_goes_round_without_being_forced_to_search():
+def test_a_loop_goes_round_without_being_forced_to_search() -> None:
     track = arc_track(1.0, 90.0, 4.0, loop=True)
     database = synthetic_database([track], DatabaseOptions(end_policy="loop"))
     options = EXACT.replace(follow="open_loop", continuing_bias=-1000.0)
@@ -163,7 +166,7 @@ def test_a_loop_goes_round_without_being_forced_to_search():
     assert offsets(record, trial).max() < 1e-9
 
 
-def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round():
+def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round() -> None:
     database = synthetic_database([arc_track(1.0, 90.0, 4.0)], DatabaseOptions(end_policy="loop"))
 
     record = play(database, circle(1.0, 90.0, approach_s=0.0), EXACT.replace(continuing_bias=-1000.0))
@@ -172,7 +175,7 @@ def test_a_clip_not_marked_as_a_loop_ends_even_where_loops_go_round():
     assert record.status[240] == Status.FORCED
 
 
-def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin():
+def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 60.0), arc_track(2.0, 50.0, 60.0)])
     trial = circle(2.0, 50.0)
     eager = play(database, trial, EXACT.replace(follow="open_loop"))
@@ -189,7 +192,7 @@ def test_going_on_wins_unless_a_switch_is_cheaper_by_more_than_the_margin():
     assert too_much.match_cost[first] == too_much.continuing_cost[first]
 
 
-def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless():
+def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless() -> None:
     database = synthetic_database(random_tracks(20, seed=7))
     trial = circle(2.0, 60.0)
 
@@ -201,7 +204,7 @@ def test_a_bias_towards_going_on_is_a_margin_and_its_opposite_makes_restless():
     assert switches(margin) < switches(play(database, trial)) <= switches(restless)
 
 
-def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
+def test_rows_near_the_current_one_are_left_out_of_the_search_on_request() -> None:
     database = synthetic_database(random_tracks(12, seed=9))
     trial = circle(2.0, 60.0)
 
@@ -222,7 +225,9 @@ def test_rows_near_the_current_one_are_left_out_of_the_search_on_request():
     [((195, 196, 216, 217), 195), ((196, 216, 217), 217), ((196, 197, 401), 401), ((196, 217), 196)],
     ids=["before", "after", "far away", "in the clip before"],
 )
-def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(choosable, chosen):
+def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(
+    choosable: tuple[Any, ...], chosen: int
+) -> None:
     """Ten frames are barred about the row 206. All rows are alike: of those not barred the lowest is chosen."""
     first = 199 if chosen == 196 else 190
     database = synthetic_database([arc_track(2.0, 0.0, frames / 60) for frames in (first, 600 - first)])
@@ -236,7 +241,7 @@ def test_the_window_bars_as_many_frames_on_either_side_and_none_of_another_clip(
     assert record.rows[:8].tolist() == [*range(200, 207), chosen + 1]
 
 
-def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():
+def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 4.0)])
 
     record = play(database, circle(2.0, 0.0), EXACT.replace(reselect_window_s=10.0))
@@ -245,7 +250,7 @@ def test_a_window_wider_than_the_whole_dataset_still_leaves_a_way_on():
     assert record.status[240] == Status.FORCED
 
 
-def test_among_equal_rows_the_lowest_is_chosen():
+def test_among_equal_rows_the_lowest_is_chosen() -> None:
     database = synthetic_database([arc_track(2.0, 0.0, 10.0, uid=uid) for uid in ("b", "a", "c")])
 
     assert play(database, circle(2.0, 0.0)).rows[0] == 0
@@ -254,7 +259,7 @@ def test_among_equal_rows_the_lowest_is_chosen():
 # The paper's literal cost
 
 
-def test_by_pose_distance_the_cost_is_metres_over_the_pose_joints_beside_the_trajectory():
+def test_by_pose_distance_the_cost_is_metres_over_the_pose_joints_beside_the_trajectory() -> None:
     database = synthetic_database(random_tracks(12, seed=11))
     trial = circle(2.0, 60.0, duration_s=4.0)
 
@@ -283,7 +288,7 @@ def trajectory_costs(database: MatchingDatabase, record: TrialRecord, path: Refe
 # The root
 
 
-def test_blended_root_velocity_does_not_jump_at_a_switch():
+def test_blended_root_velocity_does_not_jump_at_a_switch() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 60.0), arc_track(4.0, 0.0, 60.0)])
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=2.0)
 
@@ -302,7 +307,7 @@ def test_blended_root_velocity_does_not_jump_at_a_switch():
     np.testing.assert_allclose(speeds(blended)[tick - 1 : tick + 59], expected, atol=1e-9)
 
 
-def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
+def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 60.0)])
     trial = circle(1.0, 50.0)
 
@@ -315,7 +320,7 @@ def test_a_pull_towards_the_reference_and_a_clamp_keep_the_character_near():
     assert abs(clamped - 0.25) < 1e-9
 
 
-def test_a_pull_turns_the_character_the_short_way_round():
+def test_a_pull_turns_the_character_the_short_way_round() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 60.0)])
     path = reference(circle(1.0, 50.0))
     rounds = replace(path, headings=path.headings + np.where(np.arange(len(path.headings)) > 0, 4 * np.pi, 0.0))
@@ -330,7 +335,7 @@ def test_a_pull_turns_the_character_the_short_way_round():
 # Following a path
 
 
-def test_following_the_path_a_slow_character_is_not_hurried_along():
+def test_following_the_path_a_slow_character_is_not_hurried_along() -> None:
     database = synthetic_database([arc_track(1.0, w, 60.0) for w in (-60.0, -30.0, 0.0, 30.0, 60.0)])
     trial = circle(2.0, 30.0)
 
@@ -345,7 +350,7 @@ def test_following_the_path_a_slow_character_is_not_hurried_along():
     assert distance_to_path(by_time) > 3.0
 
 
-def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks():
+def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_between_two_ticks() -> None:
     """At 0.9 m/s beside a straight path that is asked for at 2 m/s: every tick wishes for the same way ahead."""
     database = synthetic_database([arc_track(0.9, 0.0, 60.0)])
     path = reference(circle(2.0, 0.0, duration_s=1.0))
@@ -361,7 +366,7 @@ def test_the_path_is_looked_at_from_the_nearest_point_also_where_that_lies_betwe
     np.testing.assert_allclose(record.continuing_cost[30:], expected, rtol=1e-9)
 
 
-def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end():
+def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end() -> None:
     database = synthetic_database([arc_track(3.0, w, 60.0) for w in (0.0, 45.0, 90.0, 135.0)])
     trial = circle(1.5, 45.0, duration_s=20.0)
 
@@ -388,33 +393,33 @@ def test_a_character_faster_than_the_path_goes_on_round_it_past_its_end():
         ({"continuing_bias": float("nan")}, "finite"),
     ],
 )
-def test_options_that_make_no_sense_are_named(options, where):
+def test_options_that_make_no_sense_are_named(options: dict[str, float], where: str) -> None:
     with pytest.raises(ValidationError, match=where):
         EXACT.replace(**options)
 
 
-def test_a_search_period_of_less_than_a_tick_is_refused():
+def test_a_search_period_of_less_than_a_tick_is_refused() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
     with pytest.raises(MotionError, match="search_every_s: the period of searches"):
         play(database, circle(1.0, 0.0), EXACT.replace(search_every_s=0.004))
 
 
-def test_a_trajectory_of_another_rate_is_refused():
+def test_a_trajectory_of_another_rate_is_refused() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
     with pytest.raises(MotionError, match="30 ticks per second, the database 60"):
         play(database, reference(circle(1.0, 0.0), rate_hz=30.0))
 
 
-def test_an_index_of_other_rows_is_refused():
+def test_an_index_of_other_rows_is_refused() -> None:
     database, other = synthetic_database([arc_track(1.0, 0.0, 5.0)]), synthetic_database([arc_track(1.0, 0.0, 6.0)])
 
     with pytest.raises(MotionError, match="360 rows, the database 300"):
         run_trial(database, index_of(other), reference(circle(1.0, 0.0)), EXACT)
 
 
-def test_a_row_that_nothing_follows_may_not_be_choosable():
+def test_a_row_that_nothing_follows_may_not_be_choosable() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
     everything = replace(database, selectable=np.ones(300, dtype=bool))
 

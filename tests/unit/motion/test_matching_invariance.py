@@ -5,6 +5,7 @@ import pytest
 from tests.support.synthetic_databases import (
     EXACT,
     FOLLOWS,
+    Track,
     arc_track,
     circle,
     database_clips,
@@ -26,7 +27,9 @@ from marey_schemas.options.matching import ControllerOptions
 
 @pytest.mark.parametrize("follow", FOLLOWS)
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
-def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed, turn_rate_deg, follow):
+def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(
+    speed: float, turn_rate_deg: float, follow: str
+) -> None:
     trial = circle(speed, turn_rate_deg)
     record = play(synthetic_database([path_track(trial)]), trial, EXACT.replace(follow=follow))
 
@@ -45,7 +48,7 @@ def test_a_clip_that_is_the_trajectory_is_played_from_its_start_to_its_end(speed
 
 
 @pytest.mark.parametrize("follow", FOLLOWS)
-def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
+def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow: str) -> None:
     for speed, turn_rate_deg, bound in ((1.0, 25.0, 0.5), (2.0, 50.0, 1.0), (3.0, 100.0, 1.5)):
         database = synthetic_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
         trial = circle(speed, turn_rate_deg)
@@ -61,7 +64,7 @@ def test_a_straight_line_and_a_circle_give_the_wished_speeds(follow):
             assert offsets(record, trial).mean() < bound
 
 
-def test_a_circle_without_approach_is_followed_exactly():
+def test_a_circle_without_approach_is_followed_exactly() -> None:
     for speed, turn_rate_deg in ((1.0, 25.0), (2.0, 50.0), (3.0, 100.0)):
         database = synthetic_database([arc_track(speed, 0.0, 40.0), arc_track(speed, turn_rate_deg, 40.0)])
         trial = circle(speed, turn_rate_deg, approach_s=0.0, duration_s=30.0)
@@ -75,7 +78,9 @@ def grid() -> dict[tuple[float, float], object]:
     return {(v, w): arc_track(v, w, 10.0) for v in np.arange(1.0, 3.01, 0.25) for w in np.arange(-100.0, 100.1, 25.0)}
 
 
-def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(grid):
+def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
+    grid: dict[tuple[float, float], Track],
+) -> None:
     # Gaits of both sides in step, so that mirroring changes the roots alone.
     database = synthetic_database(list(grid.values()))
     for speed, turn_rate_deg in ((1.0, 25.0), (1.75, 75.0), (3.0, 100.0)):
@@ -84,7 +89,9 @@ def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(grid
         assert np.abs(difference).max() < 1e-12
 
 
-def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(grid):
+def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(
+    grid: dict[tuple[float, float], Track],
+) -> None:
     whole = synthetic_database(list(grid.values()))
     holed = synthetic_database([track for (_, w), track in grid.items() if abs(w) <= 70.0])
     for speed in (1.0, 2.0, 3.0):
@@ -100,7 +107,7 @@ def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not(grid
 # What must not change the result
 
 
-def test_the_mirrored_dataset_mirrors_the_result():
+def test_the_mirrored_dataset_mirrors_the_result() -> None:
     tracks = random_tracks(25, seed=1)
     database, mirrored = synthetic_database(tracks), synthetic_database([mirrored_track(track) for track in tracks])
     for number, follow in enumerate(FOLLOWS * 4):
@@ -115,7 +122,7 @@ def test_the_mirrored_dataset_mirrors_the_result():
 
 
 @pytest.mark.parametrize("selection", ["features", "pose_distance"])
-def test_removing_rows_that_are_never_shown_changes_no_bit(selection):
+def test_removing_rows_that_are_never_shown_changes_no_bit(selection: str) -> None:
     tracks = random_tracks(20, seed=2)
     database = synthetic_database(tracks)
     options = ControllerOptions(selection=selection)
@@ -135,7 +142,7 @@ def test_removing_rows_that_are_never_shown_changes_no_bit(selection):
             assert getattr(again, name).tobytes() == getattr(record, name).tobytes(), name
 
 
-def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used():
+def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used() -> None:
     tracks = random_tracks(8, seed=3)
     database = synthetic_database(tracks)
     doubled = synthetic_database([track for track in tracks for _ in range(2)], normaliser=database.normaliser)
@@ -147,7 +154,7 @@ def test_a_duplicated_clip_changes_no_trajectory_and_the_lower_uid_is_used():
         assert np.array_equal(clips, 2 * database_clips(database, record.rows))
 
 
-def test_duplicating_the_whole_dataset_leaves_even_a_fitted_normaliser():
+def test_duplicating_the_whole_dataset_leaves_even_a_fitted_normaliser() -> None:
     tracks = random_tracks(8, seed=3)
     database, doubled = synthetic_database(tracks), synthetic_database(tracks + tracks)
     trial = circle(1.5, 40.0)
@@ -156,7 +163,7 @@ def test_duplicating_the_whole_dataset_leaves_even_a_fitted_normaliser():
     np.testing.assert_allclose(play(doubled, trial).positions, play(database, trial).positions, atol=1e-9)
 
 
-def test_where_a_clip_was_recorded_does_not_matter():
+def test_where_a_clip_was_recorded_does_not_matter() -> None:
     tracks = random_tracks(10, seed=4)
     moved = []
     for number, track in enumerate(tracks):
@@ -173,7 +180,7 @@ def test_where_a_clip_was_recorded_does_not_matter():
     np.testing.assert_allclose(again.positions, record.positions, atol=1e-9)
 
 
-def test_a_turn_rate_near_zero_ends_up_next_to_zero():
+def test_a_turn_rate_near_zero_ends_up_next_to_zero() -> None:
     database = synthetic_database([arc_track(2.0, w, 40.0) for w in (-25.0, 0.0, 25.0)])
 
     straight, nearly = play(database, circle(2.0, 0.0)), play(database, circle(2.0, 1e-5))
@@ -181,7 +188,7 @@ def test_a_turn_rate_near_zero_ends_up_next_to_zero():
     assert np.linalg.norm(straight.positions - nearly.positions, axis=1).max() < 1e-3
 
 
-def test_the_same_trial_gives_the_same_bytes():
+def test_the_same_trial_gives_the_same_bytes() -> None:
     database = synthetic_database(random_tracks(6, seed=6))
     records = [play(database, circle(2.0, 60.0), ControllerOptions()) for _ in range(2)]
 

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,7 +81,7 @@ def test_a_normaliser_survives_being_kept_as_a_tree() -> None:
         ({"offset": "abc"}, "not a normaliser"),
     ],
 )
-def test_a_tree_that_is_no_normaliser_is_refused(change, message) -> None:
+def test_a_tree_that_is_no_normaliser_is_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(MotionError, match=message) as caught:
         Normaliser.from_tree({**database_of(1.0).normaliser.as_tree(), **change})
     assert caught.value.code == "normaliser-invalid"

@@ -76,7 +76,7 @@ def takes() -> list[SourceClip]:
 
 
 @pytest.fixture(scope="module")
-def dataset(takes) -> MatchingDatabase:
+def dataset(takes: list[SourceClip]) -> MatchingDatabase:
     return database_of(takes)
 
 
@@ -88,7 +88,7 @@ TRIALS = (circle(1.5, 40.0), circle(3.0, -30.0), Trial("switching", 1.0, 0.5, du
 
 @pytest.mark.parametrize("follow", ["time", "path"])
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
-def test_a_clip_asked_to_do_what_it_does_is_played_through(speed, turn_rate_deg, follow):
+def test_a_clip_asked_to_do_what_it_does_is_played_through(speed: float, turn_rate_deg: float, follow: str) -> None:
     database = database_of([take("clip", (3.0, speed, 0.0), (31.0, speed, turn_rate_deg))])
     steps = np.linalg.norm(np.diff(database.root_positions, axis=0, append=database.root_positions[-1:]), axis=1)
     own = Reference(
@@ -108,7 +108,7 @@ def test_a_clip_asked_to_do_what_it_does_is_played_through(speed, turn_rate_deg,
 
 
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
-def test_a_clip_made_for_the_trajectory_stays_within_centimetres_of_it(speed, turn_rate_deg):
+def test_a_clip_made_for_the_trajectory_stays_within_centimetres_of_it(speed: float, turn_rate_deg: float) -> None:
     trial = circle(speed, turn_rate_deg)
     database = database_of([take("clip", (3.0, speed, 0.0), (31.0, speed, turn_rate_deg))])
 
@@ -122,7 +122,7 @@ def test_a_clip_made_for_the_trajectory_stays_within_centimetres_of_it(speed, tu
 
 @pytest.mark.parametrize("follow", FOLLOWS)
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(1.0, 25.0), (2.0, 50.0), (3.0, 100.0)])
-def test_a_straight_walk_and_a_circle_give_the_wished_speeds(speed, turn_rate_deg, follow):
+def test_a_straight_walk_and_a_circle_give_the_wished_speeds(speed: float, turn_rate_deg: float, follow: str) -> None:
     trial = circle(speed, turn_rate_deg)
     database = database_of([take("a", (40.0, speed, 0.0)), take("b", (40.0, speed, turn_rate_deg))])
 
@@ -137,14 +137,14 @@ def test_a_straight_walk_and_a_circle_give_the_wished_speeds(speed, turn_rate_de
         assert offsets(record, trial).mean() < 0.1
 
 
-def test_a_circle_without_approach_is_followed_within_centimetres():
+def test_a_circle_without_approach_is_followed_within_centimetres() -> None:
     trial = circle(2.0, 50.0, approach_s=0.0)
     database = database_of([take("a", (40.0, 2.0, 0.0)), take("b", (40.0, 2.0, 50.0))])
 
     assert offsets(play(database, trial), trial).max() < 0.1
 
 
-def test_a_turn_rate_near_zero_ends_up_next_to_zero():
+def test_a_turn_rate_near_zero_ends_up_next_to_zero() -> None:
     database = database_of([take(f"clip {turn}", (40.0, 2.0, turn)) for turn in (-25.0, 0.0, 25.0)])
 
     straight, nearly = play(database, circle(2.0, 0.0)), play(database, circle(2.0, 1e-5))
@@ -152,7 +152,7 @@ def test_a_turn_rate_near_zero_ends_up_next_to_zero():
     assert np.linalg.norm(straight.positions - nearly.positions, axis=1).max() < 1e-3
 
 
-def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not():
+def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not() -> None:
     grid = {
         turn: [take(f"v={speed} w={turn}", (10.0, speed, turn)) for speed in (1.0, 2.0, 3.0)]
         for turn in np.arange(-100.0, 100.1, 25.0)
@@ -173,7 +173,9 @@ def test_without_tight_turns_tight_circles_are_missed_and_wide_ones_are_not():
 
 
 @pytest.mark.parametrize("follow", FOLLOWS)
-def test_the_mirrored_dataset_mirrors_the_result(takes, dataset, follow):
+def test_the_mirrored_dataset_mirrors_the_result(
+    takes: list[SourceClip], dataset: MatchingDatabase, follow: str
+) -> None:
     mirrored = database_of(takes, DatabaseOptions(mirroring="only"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, -60.0), (1.0, -100.0)):
@@ -195,7 +197,9 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 
 
 @pytest.mark.parametrize("follow", FOLLOWS)
-def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(takes, follow):
+def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
+    takes: list[SourceClip], follow: str
+) -> None:
     """From the circle on: on a straight approach both trials would begin on one and the same row, no mirror image."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
@@ -210,7 +214,7 @@ def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(take
 # What must not change the result
 
 
-def test_removing_clips_that_are_never_shown_changes_no_bit(takes, dataset):
+def test_removing_clips_that_are_never_shown_changes_no_bit(takes: list[SourceClip], dataset: MatchingDatabase) -> None:
     records = [play(dataset, trial, ControllerOptions()) for trial in TRIALS]
     used = np.unique(np.concatenate([dataset.clip_of_row[record.rows] for record in records]))
     assert 1 <= len(used) < len(takes)
@@ -224,7 +228,9 @@ def test_removing_clips_that_are_never_shown_changes_no_bit(takes, dataset):
             assert getattr(again, name).tobytes() == getattr(record, name).tobytes(), name
 
 
-def test_duplicated_clips_change_no_trajectory_and_the_lower_uid_is_used(takes, dataset):
+def test_duplicated_clips_change_no_trajectory_and_the_lower_uid_is_used(
+    takes: list[SourceClip], dataset: MatchingDatabase
+) -> None:
     twice = [*takes, *(replace(clip, uid=f"{clip.uid} again") for clip in takes)]
     doubled = database_of(twice, normaliser=dataset.normaliser)
     for trial in TRIALS:
@@ -234,7 +240,7 @@ def test_duplicated_clips_change_no_trajectory_and_the_lower_uid_is_used(takes, 
         assert places(doubled, again) == places(dataset, record)
 
 
-def test_boxes_and_scan_give_the_same_bytes(dataset):
+def test_boxes_and_scan_give_the_same_bytes(dataset: MatchingDatabase) -> None:
     normalised = dataset.normaliser.apply(dataset.features)
     indices = [
         build_index(normalised, dataset.starts, dataset.selectable, method=method) for method in ("boxes", "scan")
@@ -248,7 +254,7 @@ def test_boxes_and_scan_give_the_same_bytes(dataset):
 # Loops
 
 
-def test_a_loop_of_two_strides_walks_on_for_half_a_minute():
+def test_a_loop_of_two_strides_walks_on_for_half_a_minute() -> None:
     walk = take("walk", (20.0, 1.4, 0.0)).clip
     stride = best_stride(walk)
     looping = database_of(

@@ -1,14 +1,19 @@
 """Exact search, against going through all rows in float64 one dimension after the other."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from hypothesis.strategies import DataObject
+from numpy.random import Generator
 from tests.support.tiers import examples
 
+from marey_motion.arrays import Flags, Floats, Ints
 from marey_motion.errors import MotionError
 from marey_motion.matching.search import LARGEST, Method, build_index, find_best, find_nearest
 from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weighted
@@ -16,7 +21,7 @@ from marey_motion.matching.search_kernels import cost_of, nearest, nearest_weigh
 METHODS: tuple[Method, ...] = ("boxes", "scan", "auto")
 
 
-def true_costs(rows, query, weights=None):
+def true_costs(rows: Floats, query: Floats, weights: Floats | None = None) -> Floats:
     """(N,) squared distances, summed in the order of the dimensions."""
     costs = np.zeros(len(rows))
     for d in range(rows.shape[1]):
@@ -25,7 +30,9 @@ def true_costs(rows, query, weights=None):
     return costs
 
 
-def true_nearest(rows, selectable, query, weights=None, skip=(0, 0)):
+def true_nearest(
+    rows: Floats, selectable: Flags, query: Floats, weights: Floats | None = None, skip: Any = (0, 0)
+) -> tuple[int, float]:
     costs = true_costs(rows, query, weights)
     allowed = selectable.copy()
     allowed[skip[0] : skip[1]] = False
@@ -33,11 +40,11 @@ def true_nearest(rows, selectable, query, weights=None, skip=(0, 0)):
     return int(costs.argmin()), costs.min()
 
 
-def clips_of(rows, frames):
+def clips_of(rows: int, frames: int) -> Ints:
     return np.append(np.arange(0, rows, frames), rows)
 
 
-def gait_like(rows, dimensions, rng):
+def gait_like(rows: int, dimensions: int, rng: Generator) -> Floats:
     """Clips of 90 rows, each a few harmonics of its own stride about its own mean."""
     clips = -(-rows // 90)
     time = np.arange(90)[:, None, None] / 60
@@ -48,42 +55,42 @@ def gait_like(rows, dimensions, rng):
     return (waves + rng.normal(size=(clips, 1, dimensions))).reshape(-1, dimensions)[:rows]
 
 
-def quantised(rows, dimensions, rng):
+def quantised(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.integers(0, 2, (rows, dimensions)).astype(float)
 
 
-def denormal(rows, dimensions, rng):
+def denormal(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.normal(size=(rows, dimensions)) * 1e-310
 
 
-def tiny_squares(rows, dimensions, rng):
+def tiny_squares(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.normal(size=(rows, dimensions)) * 1e-21
 
 
-def far_away(rows, dimensions, rng):
+def far_away(rows: int, dimensions: int, rng: Generator) -> Floats:
     return 1e6 + 1e-3 * gait_like(rows, dimensions, rng)
 
 
-def huge(rows, dimensions, rng):
+def huge(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.uniform(-1, 1, (rows, dimensions)) * LARGEST
 
 
-def of_all_sizes(rows, dimensions, rng):
+def of_all_sizes(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.normal(size=(rows, dimensions)) * 10.0 ** rng.integers(-20, 15, (rows, dimensions))
 
 
-def constant(rows, dimensions, rng):
+def constant(rows: int, dimensions: int, rng: Generator) -> Floats:
     return np.full((rows, dimensions), 0.1)
 
 
-def gaussian(rows, dimensions, rng):
+def gaussian(rows: int, dimensions: int, rng: Generator) -> Floats:
     return rng.normal(size=(rows, dimensions))
 
 
 DATABASES = (gait_like, gaussian, quantised, constant, denormal, tiny_squares, far_away, huge, of_all_sizes)
 
 
-def queries_for(rows, count, rng):
+def queries_for(rows: Floats, count: int, rng: Generator) -> Floats:
     """Rows, rows moved by a little or by a float32 step, and mixtures of two."""
     first, second = rng.integers(0, len(rows), (2, count))
     queries = rows[first].copy()
@@ -96,7 +103,7 @@ def queries_for(rows, count, rng):
 
 @pytest.mark.parametrize("make", DATABASES)
 @pytest.mark.parametrize(("rows", "dimensions"), [(2500, 27), (700, 64), (40, 33), (1, 27)])
-def test_a_search_finds_what_going_through_all_rows_finds(make, rows, dimensions):
+def test_a_search_finds_what_going_through_all_rows_finds(make: Callable[..., Any], rows: int, dimensions: int) -> None:
     rng = np.random.default_rng([rows, dimensions])
     features = make(rows, dimensions, rng)
     selectable = rng.random(rows) < 0.8
@@ -111,7 +118,7 @@ def test_a_search_finds_what_going_through_all_rows_finds(make, rows, dimensions
             assert list(zip(*(part.tolist() for part in found), strict=True)) == truth
 
 
-def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly():
+def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly() -> None:
     rng = np.random.default_rng(7)
     features = gait_like(6000, 27, rng)
     selectable = np.arange(6000) % 90 < 70
@@ -124,7 +131,7 @@ def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly():
 
 @settings(max_examples=examples(150))
 @given(st.data())
-def test_differences_that_float32_cannot_show_still_decide(data):
+def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> None:
     """Rows that are all the same in float32, a few units in the last place of float64 apart."""
     dimensions = data.draw(st.integers(1, 40))
     base = data.draw(arrays.arrays(float, dimensions, elements=st.floats(-1e6, 1e6)))
@@ -139,7 +146,7 @@ def test_differences_that_float32_cannot_show_still_decide(data):
         assert (rows[0], costs[0]) == true_nearest(features, selectable, query)
 
 
-def test_distances_whose_squares_float32_barely_holds_still_decide():
+def test_distances_whose_squares_float32_barely_holds_still_decide() -> None:
     """Squares of some ten of float32's smallest steps: half of the rows are rounded up to 270, the others to 256."""
     rng = np.random.default_rng(2)
     step = 2.0**-149
@@ -155,7 +162,7 @@ def test_distances_whose_squares_float32_barely_holds_still_decide():
 
 @settings(max_examples=examples(100))
 @given(st.data())
-def test_any_numbers_in_range_are_searched_exactly(data):
+def test_any_numbers_in_range_are_searched_exactly(data: DataObject) -> None:
     shape = (data.draw(st.integers(1, 40)), data.draw(st.integers(1, 6)))
     numbers = st.floats(-LARGEST, LARGEST)
     features = data.draw(arrays.arrays(float, shape, elements=numbers))
@@ -169,7 +176,7 @@ def test_any_numbers_in_range_are_searched_exactly(data):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_lowest_of_equal_rows_wins_wherever_the_search_starts(method):
+def test_the_lowest_of_equal_rows_wins_wherever_the_search_starts(method: Method) -> None:
     rng = np.random.default_rng(3)
     features = np.tile(gait_like(360, 27, rng), (3, 1))
     selectable = np.ones(len(features), bool)
@@ -184,7 +191,7 @@ def test_the_lowest_of_equal_rows_wins_wherever_the_search_starts(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_skipped_rows_are_not_chosen(method):
+def test_skipped_rows_are_not_chosen(method: Method) -> None:
     rng = np.random.default_rng(4)
     features = gait_like(900, 27, rng)
     selectable = np.arange(900) % 90 < 70
@@ -197,7 +204,7 @@ def test_skipped_rows_are_not_chosen(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_where_all_rows_are_skipped_there_is_no_answer(method):
+def test_where_all_rows_are_skipped_there_is_no_answer(method: Method) -> None:
     features = np.random.default_rng(5).normal(size=(300, 27))
     index = build_index(features, clips_of(300, 90), np.ones(300, bool), method=method)
     rows, costs = find_nearest(index, features[:2], warm_rows=np.array([0, -1]), skips=np.array([[0, 300], [0, 300]]))
@@ -206,7 +213,7 @@ def test_where_all_rows_are_skipped_there_is_no_answer(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_weights_count_each_dimension_as_much_as_they_say(method):
+def test_weights_count_each_dimension_as_much_as_they_say(method: Method) -> None:
     rng = np.random.default_rng(6)
     features = gait_like(1500, 27, rng)
     selectable = np.ones(1500, bool)
@@ -220,7 +227,7 @@ def test_weights_count_each_dimension_as_much_as_they_say(method):
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 10_000])
-def test_the_best_rows_come_in_order_of_cost_then_row(count):
+def test_the_best_rows_come_in_order_of_cost_then_row(count: int) -> None:
     rng = np.random.default_rng(8)
     features = np.repeat(quantised(200, 5, rng), 3, axis=0)
     selectable = rng.random(600) < 0.7
@@ -234,7 +241,7 @@ def test_the_best_rows_come_in_order_of_cost_then_row(count):
     assert costs.tolist() == expected[order].tolist()
 
 
-def test_the_first_of_the_best_rows_is_the_nearest_bit_for_bit():
+def test_the_first_of_the_best_rows_is_the_nearest_bit_for_bit() -> None:
     rng = np.random.default_rng(9)
     features = gait_like(1200, 27, rng)
     weights = rng.uniform(0, 2, 27)
@@ -246,7 +253,7 @@ def test_the_first_of_the_best_rows_is_the_nearest_bit_for_bit():
         assert (best_rows[0], best_costs[0]) == (row, cost)
 
 
-def test_compiled_callers_get_the_same_as_python_does():
+def test_compiled_callers_get_the_same_as_python_does() -> None:
     rng = np.random.default_rng(10)
     features = gait_like(900, 27, rng)
     index = build_index(features, clips_of(900, 90), np.ones(900, bool))
@@ -259,7 +266,7 @@ def test_compiled_callers_get_the_same_as_python_does():
         assert cost_of(index, 17, query) == true_costs(features, query)[17]
 
 
-def test_threads_that_share_an_index_find_the_same():
+def test_threads_that_share_an_index_find_the_same() -> None:
     rng = np.random.default_rng(11)
     features = gait_like(3000, 27, rng)
     index = build_index(features, clips_of(3000, 90), np.ones(3000, bool))
@@ -272,7 +279,7 @@ def test_threads_that_share_an_index_find_the_same():
         assert costs.tobytes() == other_costs.tobytes()
 
 
-def test_smooth_motion_is_searched_by_boxes_and_noise_row_by_row_always_by_the_same_choice():
+def test_smooth_motion_is_searched_by_boxes_and_noise_row_by_row_always_by_the_same_choice() -> None:
     rng = np.random.default_rng(12)
     everything = np.ones(9000, bool)
     smooth, noise = gait_like(9000, 27, rng), gaussian(9000, 27, rng)
@@ -281,7 +288,7 @@ def test_smooth_motion_is_searched_by_boxes_and_noise_row_by_row_always_by_the_s
         assert not build_index(noise, clips_of(9000, 90), everything).boxed
 
 
-def test_clips_without_selectable_rows_and_empty_clips_are_passed_over():
+def test_clips_without_selectable_rows_and_empty_clips_are_passed_over() -> None:
     rng = np.random.default_rng(13)
     features = gaussian(60, 27, rng)
     selectable = np.zeros(60, bool)
@@ -293,14 +300,14 @@ def test_clips_without_selectable_rows_and_empty_clips_are_passed_over():
         assert rows.tolist() == [26, 59]
 
 
-def test_a_database_in_which_nothing_can_be_chosen_says_so():
+def test_a_database_in_which_nothing_can_be_chosen_says_so() -> None:
     with pytest.raises(MotionError, match="no row can be chosen") as caught:
         build_index(np.zeros((20, 27)), np.array([0, 20]), np.zeros(20, bool))
     assert caught.value.code == "nothing-selectable"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 2 * LARGEST])
-def test_a_value_that_cannot_be_searched_is_named(value):
+def test_a_value_that_cannot_be_searched_is_named(value: float) -> None:
     features = np.zeros((20, 27))
     features[3, 5] = value
     with pytest.raises(MotionError, match="row 3, dimension 5"):
@@ -308,7 +315,7 @@ def test_a_value_that_cannot_be_searched_is_named(value):
 
 
 @pytest.mark.parametrize("starts", [[0], [0, 10], [5, 20], [0, 15, 10, 20]])
-def test_clips_that_do_not_cover_the_rows_are_refused(starts):
+def test_clips_that_do_not_cover_the_rows_are_refused(starts: list[int]) -> None:
     with pytest.raises(MotionError, match="ascend from 0 to the number of rows, 20"):
         build_index(np.zeros((20, 27)), np.array(starts), np.ones(20, bool))
 
@@ -322,7 +329,7 @@ def test_clips_that_do_not_cover_the_rows_are_refused(starts):
         (np.zeros((1, 27)), np.full(27, -1.0), "27 numbers"),
     ],
 )
-def test_queries_and_weights_that_do_not_fit_are_refused(queries, weights, message):
+def test_queries_and_weights_that_do_not_fit_are_refused(queries: Floats, weights: Floats | None, message: str) -> None:
     index = build_index(np.zeros((20, 27)), np.array([0, 20]), np.ones(20, bool))
     with pytest.raises(MotionError, match=message):
         find_nearest(index, queries, weights=weights)

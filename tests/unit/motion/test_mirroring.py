@@ -1,4 +1,6 @@
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,7 +79,7 @@ def raised_arm() -> Skeleton:
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
-def test_all_joints_are_where_the_mirror_shows_their_partners(make) -> None:
+def test_all_joints_are_where_the_mirror_shows_their_partners(make: Callable[..., Any]) -> None:
     skeleton = make()
     clip, partners = wild(skeleton, 1), partners_of(studio_skeleton())
     mirrored = global_positions(mirror_clip(clip, partners))
@@ -98,7 +100,7 @@ def test_joints_whose_names_tell_no_side_are_found_by_what_they_carry() -> None:
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
-def test_mirroring_twice_is_the_motion_itself(make) -> None:
+def test_mirroring_twice_is_the_motion_itself(make: Callable[..., Any]) -> None:
     clip, partners = wild(make(), 2), partners_of(studio_skeleton())
     assert same_motion(mirror_clip(mirror_clip(clip, partners), partners), clip)
 
@@ -136,7 +138,7 @@ def test_what_hangs_from_a_joint_without_a_counterpart_keeps_its_place_and_turn_
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes, raised_arm], ids=["plain", "own axes", "asymmetric rest"])
-def test_tips_are_where_the_mirror_shows_those_of_their_partners(make) -> None:
+def test_tips_are_where_the_mirror_shows_those_of_their_partners(make: Callable[..., Any]) -> None:
     skeleton, partners = make(), partners_of(studio_skeleton())
     clip, joints = wild(skeleton, 8), [site.joint for site in skeleton.end_sites]
     mirrored, seen = (
@@ -148,7 +150,7 @@ def test_tips_are_where_the_mirror_shows_those_of_their_partners(make) -> None:
 
 
 @pytest.mark.parametrize("make", [studio_skeleton, own_axes], ids=["plain", "own axes"])
-def test_translations_are_mirrored_even_where_only_one_side_has_them(make) -> None:
+def test_translations_are_mirrored_even_where_only_one_side_has_them(make: Callable[..., Any]) -> None:
     skeleton = make()
     plain = studio_skeleton()
     partners = partners_of(plain)
@@ -175,7 +177,7 @@ def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
         ([1, 0, 2], "the root must be its own partner"),
     ],
 )
-def test_what_is_no_pairing_is_refused(partners, message) -> None:
+def test_what_is_no_pairing_is_refused(partners: list[int], message: str) -> None:
     skeleton = Skeleton(
         ("a", "b", "c"), np.array([-1, 0, 0], np.int32), np.zeros((3, 3)), np.tile([1.0, 0, 0, 0], (3, 1))
     )

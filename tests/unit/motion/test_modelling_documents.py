@@ -1,5 +1,7 @@
 """Models as documents: every number comes back as it was, whatever they travel as."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -11,7 +13,7 @@ from marey_motion.modelling.primitive_documents import (
     primitive_to_tree,
     trained_to_tree,
 )
-from marey_motion.modelling.training import train_primitive
+from marey_motion.modelling.training import TrainedPrimitive, train_primitive
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.models import MotionPrimitiveDocument
 from marey_schemas.encoding.canonical import document_digest
@@ -21,12 +23,12 @@ SKELETON = {"item": "skel_1", "revision": 2}
 
 
 @pytest.fixture(scope="module")
-def trained():
+def trained() -> TrainedPrimitive:
     return train_primitive(walks(12, 30), name="walk", seed=4)
 
 
 @pytest.mark.parametrize("media_type", MEDIA_TYPES)
-def test_a_model_comes_back_bit_by_bit(trained, media_type):
+def test_a_model_comes_back_bit_by_bit(trained: TrainedPrimitive, media_type: str) -> None:
     tree = trained_to_tree(trained, SKELETON, {"seed": 4})
     read = decode_tree(encode_tree(tree, media_type), media_type)
     assert document_digest(read) == document_digest(tree)
@@ -41,7 +43,7 @@ def test_a_model_comes_back_bit_by_bit(trained, media_type):
     assert np.array_equal(primitive.poses(drawn), trained.primitive.poses(drawn))
 
 
-def test_the_report_of_a_training_is_part_of_the_document(trained):
+def test_the_report_of_a_training_is_part_of_the_document(trained: TrainedPrimitive) -> None:
     written = trained_to_tree(trained, SKELETON, {})["training"]
     assert written["log_likelihood"] == trained.report.log_likelihood
     assert len(written["examples"]) == len(trained.report.examples)
@@ -51,7 +53,7 @@ def test_the_report_of_a_training_is_part_of_the_document(trained):
     assert "training" not in primitive_to_tree(trained.primitive, SKELETON)
 
 
-def test_a_model_without_components_travels_too():
+def test_a_model_without_components_travels_too() -> None:
     single = train_primitive(bending_chains(1))
     tree = trained_to_tree(single, SKELETON, {})
     for media_type in MEDIA_TYPES:
@@ -61,7 +63,9 @@ def test_a_model_without_components_travels_too():
         assert np.array_equal(primitive.poses(np.empty((1, 0))), single.primitive.poses(np.empty((1, 0))))
 
 
-def test_a_model_from_before_steps_were_cut_off_is_read_and_cuts_off_none_of_a_motion(trained):
+def test_a_model_from_before_steps_were_cut_off_is_read_and_cuts_off_none_of_a_motion(
+    trained: TrainedPrimitive,
+) -> None:
     tree = primitive_to_tree(trained.primitive, SKELETON)
     del tree["log_slope_range"]
     MotionPrimitiveDocument.model_validate(tree)
@@ -71,7 +75,7 @@ def test_a_model_from_before_steps_were_cut_off_is_read_and_cuts_off_none_of_a_m
     assert (np.diff(primitive.time_functions(extreme), axis=1) > 0.0).all()
 
 
-def test_a_range_of_steps_that_is_none_is_refused(trained):
+def test_a_range_of_steps_that_is_none_is_refused(trained: TrainedPrimitive) -> None:
     tree = primitive_to_tree(trained.primitive, SKELETON) | {"log_slope_range": [1.0, -1.0]}
     with pytest.raises(ValidationError, match="the second number must not be less"):
         MotionPrimitiveDocument.model_validate(tree)
@@ -79,7 +83,7 @@ def test_a_range_of_steps_that_is_none_is_refused(trained):
         primitive_from_tree(tree, trained.primitive.skeleton)
 
 
-def test_joints_may_stand_in_another_order():
+def test_joints_may_stand_in_another_order() -> None:
     model = train_primitive(bending_chains()).primitive
     tree = primitive_to_tree(model, SKELETON)
     branched = Skeleton(
@@ -91,7 +95,7 @@ def test_joints_may_stand_in_another_order():
     np.testing.assert_array_equal(here, there[:, :, [0, 2, 1, 3]])
 
 
-def test_splines_whose_degree_is_not_told_are_cubic():
+def test_splines_whose_degree_is_not_told_are_cubic() -> None:
     model = train_primitive(bending_chains()).primitive
     tree = primitive_to_tree(model, SKELETON)
     untold = {
@@ -101,7 +105,7 @@ def test_splines_whose_degree_is_not_told_are_cubic():
     assert (read.spatial.basis.degree, read.temporal.basis.degree) == (3, 3)
 
 
-def test_a_model_of_other_joints_is_refused():
+def test_a_model_of_other_joints_is_refused() -> None:
     tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
     with pytest.raises(MotionError, match="not the skeleton's: bone_4"):
         primitive_from_tree(tree, chain(5))
@@ -120,7 +124,7 @@ def test_a_model_of_other_joints_is_refused():
         (("mixture", "weights"), "weights"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(place, told):
+def test_arrays_that_do_not_fit_are_refused(place: tuple[Any, ...], told: str) -> None:
     tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
     holder = tree
     for name in place[:-1]:

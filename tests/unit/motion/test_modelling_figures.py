@@ -4,16 +4,18 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.drawn_figures import cut_off, is_sound, rows_of
 from tests.support.model_examples import FRAMES, walks
 
+from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.modelling.search.check import SearchCheck
 from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
-from marey_reports.drawing.drawn import finish
+from marey_reports.drawing.drawn import DrawnFigure, finish
 from marey_reports.models.figures import (
     ALIGNMENT_FIGURES,
     MODEL_FIGURES,
@@ -30,42 +32,42 @@ from marey_schemas.options.modelling import ModelOptions
 QUICK = ModelOptions(report_samples=20, starts=1)
 
 
-def modelled(aligned, options=QUICK):
+def modelled(aligned: AlignedSet, options: ModelOptions = QUICK) -> ModelSubject:
     trained = train_primitive(aligned, options, name="walk")
     return ModelSubject(trained.primitive, aligned, trained.report, seed=3)
 
 
 @pytest.fixture(scope="module")
-def subject():
+def subject() -> ModelSubject:
     return modelled(walks())
 
 
 @pytest.fixture(scope="module")
-def figures(subject):
+def figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
     return {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
 
 
-def test_every_figure_is_sound(figures):
+def test_every_figure_is_sound(figures: dict[str, DrawnFigure]) -> None:
     assert (set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"}) - set(figures) == {"search-errors"}
     for figure in figures.values():
         is_sound(figure)
 
 
 @pytest.mark.slow
-def test_the_same_model_gives_the_same_bytes(subject, figures):
+def test_the_same_model_gives_the_same_bytes(subject: Any, figures: dict[str, DrawnFigure]) -> None:
     again = {**draw_alignment_figures(subject.examples), **draw_model_figures(replace(subject))}
     assert {name: figure.files() for name, figure in again.items()} == {
         name: figure.files() for name, figure in figures.items()
     }
 
 
-def test_threads_draw_the_same_figures_at_once(subject, figures):
+def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
     with ThreadPoolExecutor(3) as pool:
         drawn = list(pool.map(lambda _: draw_alignment_figures(subject.examples), range(3)))
     assert {each["time-warps"].svg for each in drawn} == {figures["time-warps"].svg}
 
 
-def test_matplotlib_is_not_loaded_before_something_is_drawn():
+def test_matplotlib_is_not_loaded_before_something_is_drawn() -> None:
     script = "import sys, marey_reports.models.page; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
@@ -73,7 +75,9 @@ def test_matplotlib_is_not_loaded_before_something_is_drawn():
 # Alignments
 
 
-def test_time_warps_hold_the_time_functions_of_all_clips(subject, figures):
+def test_time_warps_hold_the_time_functions_of_all_clips(
+    subject: ModelSubject, figures: dict[str, DrawnFigure]
+) -> None:
     rows = rows_of(figures["time-warps"], "time_functions")
     for clip in subject.examples.clips:
         mine = [row for row in rows if row["clip"] == clip.uid]
@@ -83,7 +87,7 @@ def test_time_warps_hold_the_time_functions_of_all_clips(subject, figures):
     assert durations["walk000"] == (FRAMES - 1) / 60.0
 
 
-def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject):
+def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject: ModelSubject) -> None:
     aligned = subject.examples
     late = np.concatenate((np.linspace(0.0, 5.0, FRAMES - 5), [20.0, 40.0, 60.0, 80.0, 100.0]))
     odd = replace(aligned.clips[7], name="late one", time_function=late, source_frames=101)
@@ -91,23 +95,30 @@ def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject):
     assert "late one" in figure.svg
 
 
-def test_keyframes_are_marked_by_their_labels(figures):
+def test_keyframes_are_marked_by_their_labels(figures: dict[str, DrawnFigure]) -> None:
     assert "left foot down" in figures["time-warps"].svg
     assert "left foot down" in figures["mean"].svg
     assert "2 keyframes" in figures["time-warps"].caption
 
 
-def test_costs_show_the_worst_clip_and_a_typical_one_with_their_ways(subject, figures):
+def test_costs_show_the_worst_clip_and_a_typical_one_with_their_ways(
+    subject: ModelSubject, figures: dict[str, DrawnFigure]
+) -> None:
     rows = rows_of(figures["alignment-costs"], "paths")
     assert list(dict.fromkeys(row["clip"] for row in rows)) == ["walk006", "walk011"]
     worst = [row["clip_frame"] for row in rows if row["clip"] == "walk011"]
     assert worst == subject.examples.clips[11].time_function.tolist()
 
 
-def test_a_clip_that_is_the_reference_played_at_half_speed_costs_nothing_along_its_way(subject):
+def test_a_clip_that_is_the_reference_played_at_half_speed_costs_nothing_along_its_way(subject: ModelSubject) -> None:
     aligned = subject.examples
     first, other = aligned.clips[:2]
-    slow = replace(other, motion=first.motion, time_function=2.0 * np.arange(FRAMES), source_frames=2 * FRAMES - 1)
+    slow = replace(
+        other,
+        motion=first.motion,
+        time_function=2.0 * np.arange(FRAMES, dtype=np.float64),
+        source_frames=2 * FRAMES - 1,
+    )
     rows = rows_of(draw_alignment_figures(replace(aligned, clips=(first, slow)))["alignment-costs"], "paths")
     assert max(row["distance_cm"] for row in rows) < 1e-6
 
@@ -115,7 +126,9 @@ def test_a_clip_that_is_the_reference_played_at_half_speed_costs_nothing_along_i
 # Components
 
 
-def test_a_sweep_goes_two_deviations_to_both_sides_of_the_mean(subject, figures):
+def test_a_sweep_goes_two_deviations_to_both_sides_of_the_mean(
+    subject: ModelSubject, figures: dict[str, DrawnFigure]
+) -> None:
     primitive = subject.primitive
     rows = rows_of(figures["component-1"], "positions")
     latents = np.zeros((1, primitive.dimensions))
@@ -129,27 +142,29 @@ def test_a_sweep_goes_two_deviations_to_both_sides_of_the_mean(subject, figures)
     assert np.allclose(places, last[: len(places)], atol=1e-12)
 
 
-def test_the_caption_of_a_component_tells_its_share_and_what_it_moves(subject):
+def test_the_caption_of_a_component_tells_its_share_and_what_it_moves(subject: ModelSubject) -> None:
     caption = draw_component(subject, 0).caption
     assert f"({100 * subject.primitive.spatial.energy[0]:.0f} % of the variance)" in caption
     assert any(joint in caption for joint in subject.primitive.skeleton.joint_names)
 
 
-def test_time_components_hold_the_durations_of_the_model(subject, figures):
+def test_time_components_hold_the_durations_of_the_model(
+    subject: ModelSubject, figures: dict[str, DrawnFigure]
+) -> None:
     primitive = subject.primitive
     rows = rows_of(figures["time-components"], "time")
     means = {row["time_s"] for row in rows if row["deviations"] == 0.0 and row["canonical_frame"] == FRAMES - 1}
     assert list(means) == pytest.approx([float(primitive.durations_s(np.zeros((1, primitive.dimensions)))[0])])
 
 
-def test_columns_of_strips_are_keyframes_where_there_are_some(subject):
+def test_columns_of_strips_are_keyframes_where_there_are_some(subject: ModelSubject) -> None:
     frames, moments = subject.moments()
     assert frames.tolist() == sorted(frames.tolist())
     assert dict(zip(moments.labels, frames.tolist(), strict=True)).items() >= subject.primitive.keyframes.items()
     assert (frames[0], frames[-1]) == (0, FRAMES - 1)
 
 
-def test_motions_that_travel_are_seen_more_from_the_side(subject):
+def test_motions_that_travel_are_seen_more_from_the_side(subject: ModelSubject) -> None:
     place = np.tile((0.0, 1.0, 0.0), (FRAMES, 1))
     clips = [replace(clip, motion=clip.motion._replace(root_translations=place)) for clip in subject.examples.clips]
     standing = modelled(replace(subject.examples, clips=tuple(clips)))
@@ -159,7 +174,7 @@ def test_motions_that_travel_are_seen_more_from_the_side(subject):
 # Examples and samples
 
 
-def test_examples_stand_beside_as_many_samples(subject, figures):
+def test_examples_stand_beside_as_many_samples(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
     rows = rows_of(figures["samples"], "positions")
     names = list(dict.fromkeys(row["row"] for row in rows))
     uids = [clip.uid for clip in subject.examples.clips]
@@ -169,13 +184,13 @@ def test_examples_stand_beside_as_many_samples(subject, figures):
     assert [first["x_m"], first["y_m"], first["z_m"]] == pytest.approx(subject.examples.poses[3, 0, :3].tolist())
 
 
-def test_paths_are_those_of_wrists_and_ankles(subject, figures):
+def test_paths_are_those_of_wrists_and_ankles(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
     rows = rows_of(figures["paths"], "paths")
     assert {row["joint"] for row in rows} == {"left wrist", "right wrist", "left ankle", "right ankle"}
     assert len({row["motion"] for row in rows}) == 2 * len(subject.examples.clips)
 
 
-def test_the_reach_of_examples_is_where_their_joints_are(subject):
+def test_the_reach_of_examples_is_where_their_joints_are(subject: ModelSubject) -> None:
     reaches = {reach.joint: reach for reach in reach_of(subject)}
     assert reaches["left wrist"].examples_m[0, 0] > reaches["right wrist"].examples_m[0, 1] - 0.4
     for reach in reaches.values():
@@ -183,7 +198,7 @@ def test_the_reach_of_examples_is_where_their_joints_are(subject):
         assert np.abs(reach.samples_m - reach.examples_m).max() < 0.5
 
 
-def test_durations_are_shares_of_all_motions(figures):
+def test_durations_are_shares_of_all_motions(figures: dict[str, DrawnFigure]) -> None:
     rows = rows_of(figures["durations"], "durations")
     assert sum(row["examples_share"] for row in rows) == pytest.approx(1.0)
     assert sum(row["samples_share"] for row in rows) == pytest.approx(1.0)
@@ -192,7 +207,9 @@ def test_durations_are_shares_of_all_motions(figures):
 # Numbers
 
 
-def test_variance_reconstruction_and_mixture_are_those_of_the_training_report(subject, figures):
+def test_variance_reconstruction_and_mixture_are_those_of_the_training_report(
+    subject: ModelSubject, figures: dict[str, DrawnFigure]
+) -> None:
     report = subject.report
     assert [row["share"] for row in rows_of(figures["variance"], "poses")] == report.spatial_energy.tolist()
     kept = sum(row["kept"] for row in rows_of(figures["variance"], "time"))
@@ -203,21 +220,21 @@ def test_variance_reconstruction_and_mixture_are_those_of_the_training_report(su
     assert [row["bic"] for row in rows_of(figures["mixture"], "candidates")] == [c.bic for c in report.candidates]
 
 
-def test_the_latent_space_holds_examples_and_samples(subject, figures):
+def test_the_latent_space_holds_examples_and_samples(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
     rows = rows_of(figures["latent-space"], "examples")
     assert [row["example"] for row in rows] == [clip.uid for clip in subject.examples.clips]
     assert [row["poses 1"] for row in rows] == pytest.approx(subject.latents[:, 0].tolist())
     assert len(rows_of(figures["latent-space"], "samples")) == 400
 
 
-def test_an_outline_holds_two_standard_deviations():
+def test_an_outline_holds_two_standard_deviations() -> None:
     covariance = np.array([[2.0, 0.6], [0.6, 1.0]])
     away = ellipse(np.array([1.0, -1.0]), covariance) - (1.0, -1.0)
     assert np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away) == pytest.approx(np.full(60, 4.0))
 
 
 @pytest.mark.slow
-def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(subject):
+def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(subject: Any) -> None:
     examples = list(subject.report.examples)
     examples[4] = replace(examples[4], held_out_log_likelihood=-1e4, outlier=True, name="limping")
     clips = list(subject.examples.clips)
@@ -235,7 +252,7 @@ def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(
     assert "limping" in figure.caption
 
 
-def test_search_errors_are_drawn_beside_each_other():
+def test_search_errors_are_drawn_beside_each_other() -> None:
     searched, refined = np.array([3.0, 5.0, 40.0]), np.array([0.1, 0.2, 12.0])
     sketch = draw_search_errors(searched, refined, about="wrists of examples left out")
     assert sketch.tables["errors"]["refined_cm"] is refined
@@ -248,7 +265,7 @@ def test_search_errors_are_drawn_beside_each_other():
 # Odd models
 
 
-def headless(aligned):
+def headless(aligned: Any) -> Any:
     """The same motions of a skeleton that knows no joint by its name."""
     old = aligned.skeleton
     names = tuple(f"j{number}" for number in range(old.joint_count))
@@ -256,13 +273,13 @@ def headless(aligned):
     return replace(aligned, skeleton=bare)
 
 
-def alike(aligned, count):
+def alike(aligned: Any, count: Any) -> Any:
     first = aligned.clips[0]
     copies = tuple(replace(first, uid=f"copy{index}", name=f"copy {index}") for index in range(count))
     return replace(aligned, clips=copies, reference="copy0")
 
 
-def backwards(aligned):
+def backwards(aligned: Any) -> Any:
     """Motions that stay below the floor and go backwards."""
     clips = []
     for clip in aligned.clips:
@@ -292,7 +309,7 @@ ODD = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", ODD)
-def test_odd_models_are_drawn_and_nothing_is_cut_off(odd):
+def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
     subject = ODD[odd]()
     sketches = {name: draw(subject) for name, (_, draw) in MODEL_FIGURES.items()}
     sketches |= {name: draw(subject.examples) for name, (_, draw) in ALIGNMENT_FIGURES.items()}
@@ -305,7 +322,7 @@ def test_odd_models_are_drawn_and_nothing_is_cut_off(odd):
 
 
 @pytest.mark.slow
-def test_two_hundred_examples_are_drawn_as_twenty_are():
+def test_two_hundred_examples_are_drawn_as_twenty_are() -> None:
     subject = modelled(walks(200), QUICK.replace(leave_one_out=False, folds=0))
     drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
     assert len(rows_of(drawn["likelihood"], "examples")) == 200
@@ -315,12 +332,12 @@ def test_two_hundred_examples_are_drawn_as_twenty_are():
         assert len(figure.svg) < 700_000
 
 
-def test_the_figures_of_no_samples_of_the_search_say_so():
+def test_the_figures_of_no_samples_of_the_search_say_so() -> None:
     assert draw_search_errors(np.zeros(0), np.zeros(0)).caption == "No target was searched for."
 
 
 @pytest.mark.slow
-def test_the_check_of_searches_is_drawn_where_there_is_one(subject):
+def test_the_check_of_searches_is_drawn_where_there_is_one(subject: Any) -> None:
     found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
     figure = draw_model_figures(replace(subject, check=found))["search-errors"]
     assert [row["joint"] for row in rows_of(figure, "errors")] == ["left_wrist", "right_wrist"]

@@ -10,18 +10,20 @@ from tests.support.tiers import examples
 
 from marey_motion import quaternions
 from marey_motion.alignment.signs import consistent_signs
+from marey_motion.arrays import Floats
 from marey_motion.modelling import scaling
-from marey_motion.modelling.fpca import Keep, find_components
+from marey_motion.modelling.fpca import Keep, PrincipalExamples, find_components
 from marey_motion.modelling.scaled_fpca import SMALLEST_WEIGHT, _logarithms, _Problem, optimised_weights
 from marey_motion.modelling.scaling import LEAST_WEIGHT_M, jacobian_weights, root_max_weights
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
+from marey_schemas.options.modelling import InnerProduct
 
 BASIS = SplineBasis.clamped(30, 8)
 CHANNELS = 11
 
 
-def some(examples=12, seed=0, rank=None):
+def some(examples: int = 12, seed: int = 0, rank: int | None = None) -> Floats:
     """Coefficients (examples, 8, 11) of full rank, or of a lower one."""
     random = np.random.default_rng(seed)
     if rank is None:
@@ -30,14 +32,18 @@ def some(examples=12, seed=0, rank=None):
     return 1.0 + np.tensordot(random.standard_normal((examples, rank)), modes, axes=1)
 
 
-def all_of(coefficients, weights=None, inner_product="coefficients"):
+def all_of(
+    coefficients: Floats, weights: Floats | None = None, inner_product: InnerProduct = "coefficients"
+) -> PrincipalExamples:
     weights = np.ones(coefficients.shape[2]) if weights is None else weights
     return find_components(BASIS, coefficients, weights, Keep(1.0), inner_product)
 
 
 @settings(max_examples=examples(20))
 @given(st.integers(2, 25), st.integers(0, 10_000), st.sampled_from(["coefficients", "l2"]))
-def test_all_components_together_reconstruct_the_examples(examples, seed, inner_product):
+def test_all_components_together_reconstruct_the_examples(
+    examples: int, seed: int, inner_product: InnerProduct
+) -> None:
     coefficients = some(examples, seed)
     weights = np.exp(np.random.default_rng(seed).uniform(-4.0, 4.0, CHANNELS))
     found = all_of(coefficients, weights, inner_product)
@@ -48,14 +54,14 @@ def test_all_components_together_reconstruct_the_examples(examples, seed, inner_
 
 
 @given(st.integers(0, 10_000))
-def test_projections_undo_directions(seed):
+def test_projections_undo_directions(seed: int) -> None:
     weights = np.exp(np.random.default_rng(seed).uniform(-3.0, 3.0, CHANNELS))
     functions = all_of(some(10, seed), weights).functions
     products = np.tensordot(functions.directions, functions.projections, axes=([1, 2], [1, 2]))
     np.testing.assert_allclose(products, np.eye(functions.count), atol=1e-9)
 
 
-def test_components_are_those_of_an_independent_library():
+def test_components_are_those_of_an_independent_library() -> None:
     coefficients = some(15, 3)
     found, known = all_of(coefficients), PCA().fit(coefficients.reshape(15, -1))
     count = found.functions.count
@@ -65,7 +71,7 @@ def test_components_are_those_of_an_independent_library():
     np.testing.assert_allclose(np.abs(np.sum(ours * known.components_[:count], axis=1)), 1.0, atol=1e-9)
 
 
-def test_the_share_of_variance_counts_every_component():
+def test_the_share_of_variance_counts_every_component() -> None:
     """A truncated decomposition, which lacks the last one, would call 95 % what is less."""
     coefficients = some(9, 5)
     deviations = np.linalg.svd((coefficients - coefficients.mean(axis=0)).reshape(9, -1), compute_uv=False)
@@ -78,7 +84,7 @@ def test_the_share_of_variance_counts_every_component():
     assert share[few - 1] >= 0.8 > share[few - 2]
 
 
-def test_as_many_components_are_kept_as_the_examples_have():
+def test_as_many_components_are_kept_as_the_examples_have() -> None:
     coefficients = some(20, 1, rank=3)
     weights = np.ones(CHANNELS)
     assert all_of(coefficients).functions.count == 3
@@ -88,7 +94,7 @@ def test_as_many_components_are_kept_as_the_examples_have():
 
 
 @pytest.mark.parametrize("examples", [1, 2, 7])
-def test_copies_of_one_example_have_no_components(examples):
+def test_copies_of_one_example_have_no_components(examples: int) -> None:
     coefficients = np.repeat(some(1, 4), examples, axis=0)
     found = all_of(coefficients)
     assert found.functions.count == 0
@@ -97,7 +103,7 @@ def test_copies_of_one_example_have_no_components(examples):
 
 @settings(max_examples=examples(10))
 @given(st.integers(0, 10_000))
-def test_more_components_never_reconstruct_worse(seed):
+def test_more_components_never_reconstruct_worse(seed: int) -> None:
     coefficients = some(12, seed)
     errors = []
     for count in range(12):
@@ -106,7 +112,7 @@ def test_more_components_never_reconstruct_worse(seed):
     assert (np.diff(errors) <= 1e-9).all()
 
 
-def test_as_functions_components_do_not_depend_on_the_knots():
+def test_as_functions_components_do_not_depend_on_the_knots() -> None:
     coarse, fine = SplineBasis.clamped(41, 8), SplineBasis(_refined(SplineBasis.clamped(41, 8).knots))
     coefficients = some(10, 2)[..., :3]
     finer = fine.fit(coarse.at_frames @ coefficients)
@@ -119,12 +125,12 @@ def test_as_functions_components_do_not_depend_on_the_knots():
     assert np.abs(np.abs(plain.scores) - np.abs(one.scores)).max() > 1e-2
 
 
-def _refined(knots):
+def _refined(knots: Floats) -> Floats:
     inner = np.unique(knots)
     return np.sort(np.concatenate((knots, 0.5 * (inner[1:] + inner[:-1]))))
 
 
-def test_signs_of_components_do_not_depend_on_the_order_of_the_examples():
+def test_signs_of_components_do_not_depend_on_the_order_of_the_examples() -> None:
     coefficients = some(9, 8)
     one, other = all_of(coefficients), all_of(coefficients[::-1])
     np.testing.assert_allclose(one.functions.directions, other.functions.directions, atol=1e-9)
@@ -135,12 +141,13 @@ def test_signs_of_components_do_not_depend_on_the_order_of_the_examples():
 # -- signs of quaternions ----------------------------------------------------------------------------------------------
 
 
-def turning(turns, frames=60):
+def turning(turns: float, frames: int = 60) -> Floats:
     """One joint that turns about y, (frames, 1, 4)."""
-    return quaternions.from_axis_angle((0.0, 1.0, 0.0), np.linspace(0.0, 2.0 * np.pi * turns, frames))[:, None]
+    angles = np.linspace(0.0, 2.0 * np.pi * turns, frames)
+    return quaternions.from_axis_angle((0.0, 1.0, 0.0), angles).astype(np.float64)[:, None]
 
 
-def test_a_turn_beyond_half_a_turn_stays_in_one_piece():
+def test_a_turn_beyond_half_a_turn_stays_in_one_piece() -> None:
     """Compared frame by frame with one pose, its quaternions would jump to the other side on the way."""
     rotations = turning(0.9)
     jumping = rotations * np.where(rotations @ rotations[0, 0] < 0.0, -1.0, 1.0)[..., None]
@@ -150,7 +157,7 @@ def test_a_turn_beyond_half_a_turn_stays_in_one_piece():
 
 
 @given(st.lists(st.booleans(), min_size=60, max_size=60), st.booleans())
-def test_signs_are_those_of_the_reference_whatever_they_were(flips, all_flipped):
+def test_signs_are_those_of_the_reference_whatever_they_were(flips: list[bool], all_flipped: bool) -> None:
     reference = turning(0.7)
     mine = turning(0.65) * np.where(flips, -1.0, 1.0)[:, None, None] * (-1.0 if all_flipped else 1.0)
     found = consistent_signs(mine[None], reference)[0]
@@ -160,13 +167,13 @@ def test_signs_are_those_of_the_reference_whatever_they_were(flips, all_flipped)
 # -- scalings ----------------------------------------------------------------------------------------------------------
 
 
-def test_root_axes_are_scaled_one_by_one_and_a_still_one_is_left():
+def test_root_axes_are_scaled_one_by_one_and_a_still_one_is_left() -> None:
     poses = np.zeros((3, 10, 3 + 4))
     poses[..., 0], poses[..., 2] = 1e-5, np.linspace(-4.0, 2.0, 10)
     np.testing.assert_allclose(root_max_weights(poses), [1.0, 1.0, 0.25, 1.0, 1.0, 1.0, 1.0])
 
 
-def test_a_joint_weighs_what_a_step_of_it_moves_the_body():
+def test_a_joint_weighs_what_a_step_of_it_moves_the_body() -> None:
     """Bones in a plane, turned about its normal: no lever is shortened by the direction of the turn."""
     skeleton = chain(5)
     pose = np.concatenate((np.zeros(3), np.tile([1.0, 0.0, 0.0, 0.0], 5)))
@@ -183,7 +190,7 @@ def test_a_joint_weighs_what_a_step_of_it_moves_the_body():
     np.testing.assert_array_equal(weights[:3], 1.0)
 
 
-def test_weights_do_not_depend_on_how_many_frames_are_held_at_once(monkeypatch):
+def test_weights_do_not_depend_on_how_many_frames_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     skeleton = chain(5)
     poses = unit_poses(np.random.default_rng(2).normal(size=(17, 3 + 4 * 5)))
     whole = jacobian_weights(skeleton, poses)
@@ -192,7 +199,7 @@ def test_weights_do_not_depend_on_how_many_frames_are_held_at_once(monkeypatch):
 
 
 @pytest.mark.parametrize("inner_product", ["coefficients", "l2"])
-def test_the_gradient_of_the_optimised_scaling_is_that_of_its_error(inner_product):
+def test_the_gradient_of_the_optimised_scaling_is_that_of_its_error(inner_product: InnerProduct) -> None:
     aligned = walks(10, 30)
     basis = SplineBasis.clamped(30, 8)
     problem = _Problem(aligned.skeleton, basis, basis.fit(aligned.poses), 3, inner_product)
@@ -205,7 +212,7 @@ def test_the_gradient_of_the_optimised_scaling_is_that_of_its_error(inner_produc
         assert gradient[place] == pytest.approx((ahead - behind) / (2 * step), rel=1e-4, abs=1e-10)
 
 
-def test_optimised_weights_bring_joints_nearer_than_those_they_start_from():
+def test_optimised_weights_bring_joints_nearer_than_those_they_start_from() -> None:
     aligned = walks(14, 30)
     basis = SplineBasis.clamped(30, 8)
     coefficients = basis.fit(aligned.poses)
@@ -220,7 +227,7 @@ def test_optimised_weights_bring_joints_nearer_than_those_they_start_from():
     np.testing.assert_array_equal(weights[3::4], weights[6::4])
 
 
-def test_an_optimised_scaling_of_copies_is_no_trouble():
+def test_an_optimised_scaling_of_copies_is_no_trouble() -> None:
     skeleton: Skeleton = chain()
     aligned = bending_chains(1)
     coefficients = np.repeat(SplineBasis.clamped(30, 7).fit(aligned.poses), 4, axis=0)

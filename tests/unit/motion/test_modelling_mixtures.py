@@ -8,20 +8,21 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 from tests.support.tiers import examples
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.mixture_fitting import fit_mixture, one_thread
 from marey_schemas.options.modelling import MixtureOptions
 
 
-def two_kinds(examples=200, dimensions=3, apart=8.0, seed=0):
+def two_kinds(examples: int = 200, dimensions: int = 3, apart: float = 8.0, seed: int = 0) -> Floats:
     """Examples of two well separated kinds, 3 to 2."""
     random = np.random.default_rng(seed)
     kinds = random.random(examples) < 0.6
     return random.standard_normal((examples, dimensions)) + apart * np.where(kinds, 0.5, -0.5)[:, None]
 
 
-def some_mixture(components=3, dimensions=4, seed=0):
+def some_mixture(components: int = 3, dimensions: int = 4, seed: int = 0) -> LatentMixture:
     random = np.random.default_rng(seed)
     spread = random.standard_normal((components, dimensions, dimensions))
     covariances = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(dimensions)
@@ -30,7 +31,7 @@ def some_mixture(components=3, dimensions=4, seed=0):
 
 
 @given(st.integers(0, 1000), st.integers(1, 5), st.integers(1, 6))
-def test_densities_are_those_of_an_independent_library(seed, components, dimensions):
+def test_densities_are_those_of_an_independent_library(seed: int, components: int, dimensions: int) -> None:
     mixture = some_mixture(components, dimensions, seed)
     points = np.random.default_rng(seed).standard_normal((7, dimensions))
     each = [
@@ -41,7 +42,7 @@ def test_densities_are_those_of_an_independent_library(seed, components, dimensi
     np.testing.assert_allclose(mixture.log_density(points), logsumexp(each, axis=0), rtol=1e-8, atol=1e-8)
 
 
-def test_samples_have_the_means_and_covariances_of_the_mixture():
+def test_samples_have_the_means_and_covariances_of_the_mixture() -> None:
     mixture = some_mixture(2, 3, 5)
     drawn = mixture.sample(200_000, 1)
     mean = mixture.weights @ mixture.means
@@ -52,21 +53,21 @@ def test_samples_have_the_means_and_covariances_of_the_mixture():
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(1, 30), st.integers(1, 30))
-def test_samples_are_the_same_for_the_same_seed_and_begin_alike(seed, few, many):
+def test_samples_are_the_same_for_the_same_seed_and_begin_alike(seed: int, few: int, many: int) -> None:
     mixture = some_mixture()
     shared = min(few, many)
     assert np.array_equal(mixture.sample(few, seed)[:shared], mixture.sample(many, seed)[:shared])
     assert not np.array_equal(mixture.sample(few, seed, 1), mixture.sample(few, seed))
 
 
-def test_a_mixture_of_nothing_gives_samples_of_nothing():
+def test_a_mixture_of_nothing_gives_samples_of_nothing() -> None:
     point = fit_mixture(np.empty((6, 0)))
     assert point.method == "point"
     assert point.mixture.sample(3, 0).shape == (3, 0)
     np.testing.assert_array_equal(point.mixture.log_density(np.empty((2, 0))), 0.0)
 
 
-def test_what_is_no_mixture_is_refused():
+def test_what_is_no_mixture_is_refused() -> None:
     for weights, covariances in (((0.5, 0.6), np.eye(2)), ((1.0,), np.eye(2)), ((0.5, 0.5), np.eye(3))):
         with pytest.raises(MotionError):
             LatentMixture(np.array(weights), np.zeros((2, 2)), np.stack([covariances] * 2))
@@ -78,7 +79,7 @@ def test_what_is_no_mixture_is_refused():
 # -- fitting -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_number_of_kinds_is_found():
+def test_the_number_of_kinds_is_found() -> None:
     fitted = fit_mixture(two_kinds())
     assert len(fitted.mixture.weights) == 2
     assert fitted.mixture.weights[0] == pytest.approx(0.6, abs=0.08)
@@ -88,18 +89,20 @@ def test_the_number_of_kinds_is_found():
 
 
 @pytest.mark.parametrize(("examples", "dimensions", "most"), [(40, 4, 5), (47, 4, 5), (48, 4, 6), (11, 6, 1)])
-def test_components_are_tried_as_long_as_each_has_two_examples_for_every_dimension(examples, dimensions, most):
+def test_components_are_tried_as_long_as_each_has_two_examples_for_every_dimension(
+    examples: int, dimensions: int, most: int
+) -> None:
     fitted = fit_mixture(np.random.default_rng(7).standard_normal((examples, dimensions)))
     assert [one.components for one in fitted.candidates] == list(range(1, most + 1))
 
 
-def test_one_kind_in_many_dimensions_is_one_component():
+def test_one_kind_in_many_dimensions_is_one_component() -> None:
     """The published choice, by Akaike's criterion up to 40 components, finds 24 in such data."""
     one_kind = np.random.default_rng(2).standard_normal((89, 12)) * np.linspace(3.0, 0.3, 12)
     assert len(fit_mixture(one_kind).mixture.weights) == 1
 
 
-def test_identical_examples_give_identical_mixtures_every_time():
+def test_identical_examples_give_identical_mixtures_every_time() -> None:
     """Without a seed, the number of components was another one in every run."""
     random = np.random.default_rng(4)
     examples = np.concatenate([random.standard_normal((25, 2)) + 3.0 * random.standard_normal(2) for _ in range(4)])
@@ -111,7 +114,7 @@ def test_identical_examples_give_identical_mixtures_every_time():
 
 @settings(max_examples=examples(4))
 @given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
-def test_the_choice_does_not_depend_on_the_unit(unit, seed):
+def test_the_choice_does_not_depend_on_the_unit(unit: float, seed: int) -> None:
     examples = two_kinds(80, 2, 5.0, seed)
     plain, scaled = fit_mixture(examples), fit_mixture(examples * unit)
     assert len(plain.mixture.weights) == len(scaled.mixture.weights)
@@ -123,7 +126,7 @@ def test_the_choice_does_not_depend_on_the_unit(unit, seed):
     assert scaled.candidates[len(scaled.mixture.weights) - 1].log_likelihood == pytest.approx(densities.sum())
 
 
-def test_few_examples_get_one_shrunk_component():
+def test_few_examples_get_one_shrunk_component() -> None:
     examples = np.random.default_rng(1).standard_normal((6, 8))
     fitted = fit_mixture(examples)
     assert fitted.method == "shrunk"
@@ -132,13 +135,13 @@ def test_few_examples_get_one_shrunk_component():
     np.testing.assert_allclose(fitted.mixture.means[0], examples.mean(axis=0))
 
 
-def test_the_heaviest_component_comes_first():
+def test_the_heaviest_component_comes_first() -> None:
     fitted = fit_mixture(two_kinds(seed=9))
     assert (np.diff(fitted.mixture.weights) <= 0.0).all()
     assert fitted.mixture.means[0].mean() > 0.0
 
 
-def test_a_component_of_a_few_stray_examples_is_not_taken():
+def test_a_component_of_a_few_stray_examples_is_not_taken() -> None:
     examples = two_kinds(60, 2, 0.0)
     examples[:2] += 60.0
     fitted = fit_mixture(examples)
@@ -146,7 +149,7 @@ def test_a_component_of_a_few_stray_examples_is_not_taken():
     assert fitted.mixture.weights.min() * 60 >= 5 or len(fitted.mixture.weights) == 1
 
 
-def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken():
+def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken() -> None:
     random = np.random.default_rng(11)
     refused = []
     for _ in range(20):
@@ -159,7 +162,7 @@ def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken():
     assert "held-out" in refused
 
 
-def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example():
+def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example() -> None:
     examples = two_kinds(100)
     fitted = fit_mixture(examples)
     assert fitted.held_out is not None
@@ -172,20 +175,20 @@ def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example():
     assert fit_mixture(examples, MixtureOptions(folds=0)).held_out is None
 
 
-def test_the_choice_can_be_made_by_hand():
+def test_the_choice_can_be_made_by_hand() -> None:
     assert len(fit_mixture(two_kinds(), MixtureOptions(mixture_components=3)).mixture.weights) == 3
     with pytest.raises(MotionError, match="9 components for 8 examples"):
         fit_mixture(two_kinds(8), MixtureOptions(mixture_components=9))
 
 
-def test_numbers_that_are_none_are_refused():
+def test_numbers_that_are_none_are_refused() -> None:
     with pytest.raises(MotionError, match="finite"):
         fit_mixture(np.full((5, 2), np.nan))
     with pytest.raises(MotionError, match="do not vary"):
         fit_mixture(np.ones((5, 2)))
 
 
-def test_libraries_keep_to_one_thread():
+def test_libraries_keep_to_one_thread() -> None:
     from threadpoolctl import threadpool_info
 
     with one_thread():

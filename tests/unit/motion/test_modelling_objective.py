@@ -1,6 +1,8 @@
 """Constraints and Equation 1, against forward kinematics of whole motions and formulas written out."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from tests.support.search_primitives import FRAMES, sliding, standard_joints, wa
 
 from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import as_global_rotations, forward_directions, forward_kinematics, headings
+from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import (
     InvalidConstraint,
     JointOrientation,
@@ -38,7 +42,7 @@ EVERY_KIND = (
 )
 
 
-def world(primitive, latents, frame):
+def world(primitive: MotionPrimitive, latents: Floats, frame: float) -> tuple[AnyFloats, AnyFloats]:
     """Positions (n, J, 3) and rotations (n, J, 4) at a canonical frame, in the world."""
     poses = primitive.poses(latents, [frame])[:, 0]
     turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), PLACEMENT.heading_rad)
@@ -48,16 +52,16 @@ def world(primitive, latents, frame):
     return positions + origin, quaternions.multiply(turn, rotations)
 
 
-def angle_between(a, b):
+def angle_between(a: AnyFloats, b: AnyFloats) -> AnyFloats:
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
 
 
-def frame_of(primitive, at):
+def frame_of(primitive: MotionPrimitive, at: float | str) -> float:
     moments = {"start": 0, "end": FRAMES - 1, **primitive.keyframes}
-    return float(moments.get(at, at))
+    return float(moments[at] if isinstance(at, str) else at)
 
 
-def plain_error(primitive, joints, latents, constraint):
+def plain_error(primitive: MotionPrimitive, joints: dict[str, int], latents: Floats, constraint: Any) -> AnyFloats:
     """The error of one constraint, from whole poses."""
     frame = frame_of(primitive, constraint.at)
     positions, rotations = world(primitive, latents, frame)
@@ -87,9 +91,10 @@ def plain_error(primitive, joints, latents, constraint):
             passed = primitive.time_functions(latents)
             reached = [np.interp(frame, np.arange(FRAMES), one) for one in passed]
             return np.abs(np.array(reached) / primitive.frame_rate_hz - constraint.seconds)
+    raise AssertionError(constraint)
 
 
-def test_errors_are_those_of_the_whole_motions():
+def test_errors_are_those_of_the_whole_motions() -> None:
     primitive, _ = walking()
     latents = primitive.sample(50, 1)
     objective = build_objective(primitive, EVERY_KIND, standard_joints(), placement=PLACEMENT)
@@ -100,7 +105,7 @@ def test_errors_are_those_of_the_whole_motions():
         )
 
 
-def kept_within(count):
+def kept_within(count: int) -> tuple[MotionPrimitive, Floats]:
     """A primitive whose motions last 0.9 to 1.1 s, and latent vectors of which many would last longer or shorter."""
     free, _ = walking()
     latents = free.sample(count, 1)
@@ -111,7 +116,7 @@ def kept_within(count):
     return replace(free, duration_range_s=(0.9, 1.1)), latents
 
 
-def test_times_are_those_of_motions_that_are_kept_within_their_range():
+def test_times_are_those_of_motions_that_are_kept_within_their_range() -> None:
     primitive, latents = kept_within(50)
     wanted = (KeyframeTime(10.5, 0.4), KeyframeTime("end", 1.09), KeyframeTime("end", 0.91))
     objective = build_objective(primitive, wanted, standard_joints())
@@ -124,7 +129,7 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range():
             build_objective(primitive, [KeyframeTime("end", seconds)], standard_joints())
 
 
-def cut_off(count):
+def cut_off(count: int) -> tuple[MotionPrimitive, Floats]:
     """A primitive whose steps are cut off at half the range that its latent vectors draw, and such vectors."""
     free, _ = walking()
     latents = free.sample(count, 1)
@@ -136,7 +141,9 @@ def cut_off(count):
 
 
 @pytest.mark.parametrize("lasting_s", [None, (0.95, 1.05)])
-def test_times_and_their_derivatives_are_those_of_motions_whose_steps_are_cut_off(lasting_s):
+def test_times_and_their_derivatives_are_those_of_motions_whose_steps_are_cut_off(
+    lasting_s: tuple[float, float] | None,
+) -> None:
     primitive, latents = cut_off(30)
     primitive = replace(primitive, duration_range_s=lasting_s)
     wanted = (KeyframeTime(10.5, 0.4), KeyframeTime("end", 1.0))
@@ -150,7 +157,7 @@ def test_times_and_their_derivatives_are_those_of_motions_whose_steps_are_cut_of
         assert_derivatives(problem, latent)
 
 
-def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances():
+def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances() -> None:
     primitive, _ = walking()
     latents = primitive.sample(20, 2)
     objective = build_objective(primitive, EVERY_KIND, standard_joints(), placement=PLACEMENT)
@@ -160,7 +167,7 @@ def test_the_objective_is_the_sum_of_weighted_errors_in_their_tolerances():
     np.testing.assert_allclose(objective.costs(latents), errors @ (np.array(weights) / tolerances), rtol=1e-12)
 
 
-def test_what_comes_out_for_one_does_not_depend_on_the_others():
+def test_what_comes_out_for_one_does_not_depend_on_the_others() -> None:
     primitive, _ = walking()
     latents = primitive.sample(40, 3)
     objective = build_objective(primitive, EVERY_KIND, standard_joints())
@@ -168,7 +175,7 @@ def test_what_comes_out_for_one_does_not_depend_on_the_others():
     assert np.array_equal(together, np.concatenate([objective.costs(one[None]) for one in latents]))
 
 
-def test_a_quarter_turn_about_any_axis_is_an_error_of_a_quarter_turn():
+def test_a_quarter_turn_about_any_axis_is_an_error_of_a_quarter_turn() -> None:
     primitive, _ = walking()
     latents = primitive.sample(1, 4)
     poses = primitive.poses(latents, [0.0])[:, 0]
@@ -179,7 +186,7 @@ def test_a_quarter_turn_about_any_axis_is_an_error_of_a_quarter_turn():
         np.testing.assert_allclose(objective.errors(latents), np.pi / 2, atol=1e-12)
 
 
-def test_a_heading_is_missed_by_the_shorter_way_round():
+def test_a_heading_is_missed_by_the_shorter_way_round() -> None:
     primitive, _ = walking()
     latents = primitive.sample(5, 5)
     for turns in (-3, 0, 2):
@@ -187,7 +194,7 @@ def test_a_heading_is_missed_by_the_shorter_way_round():
         assert build_objective(primitive, wanted, standard_joints()).errors(latents).max() < 0.5
 
 
-def test_looking_the_opposite_way_is_half_a_turn_off():
+def test_looking_the_opposite_way_is_half_a_turn_off() -> None:
     primitive = sliding()
     latents = primitive.sample(1, 0)
     for direction, angle in (((0, 0, 1), 0.0), ((0, 0, -1), np.pi), ((0, 2, 0), np.pi / 2)):
@@ -196,28 +203,28 @@ def test_looking_the_opposite_way_is_half_a_turn_off():
 
 
 @pytest.mark.parametrize("constraint", EVERY_KIND, ids=lambda one: f"{type(one).__name__} {one.at}")
-def test_derivatives_are_those_of_finite_differences(constraint):
+def test_derivatives_are_those_of_finite_differences(constraint: Any) -> None:
     primitive, _ = walking()
     problem = SeveralSteps.of([Step(primitive, (constraint,), standard_joints())], PLACEMENT)
     for latent in primitive.sample(5, 6):
         assert_derivatives(problem, latent)
 
 
-def test_derivatives_of_times_are_those_of_finite_differences_where_the_whole_lasts_as_long_as_it_may():
+def test_derivatives_of_times_are_those_of_finite_differences_where_the_whole_lasts_as_long_as_it_may() -> None:
     primitive, latents = kept_within(50)
     problem = SeveralSteps.of([Step(primitive, (KeyframeTime(10.5, 0.4),), standard_joints())], PLACEMENT)
     for latent in latents:
         assert_derivatives(problem, latent)
 
 
-def test_derivatives_of_steps_that_hang_together_are_those_of_finite_differences():
+def test_derivatives_of_steps_that_hang_together_are_those_of_finite_differences() -> None:
     primitive, _ = walking()
     steps = [Step(primitive, EVERY_KIND[:7], standard_joints()), Step(primitive, EVERY_KIND, standard_joints())] * 2
     problem = SeveralSteps.of(steps, PLACEMENT)
     assert_derivatives(problem, primitive.sample(len(steps), 7).ravel())
 
 
-def assert_derivatives(problem, stacked):
+def assert_derivatives(problem: SeveralSteps, stacked: Floats) -> None:
     _, slopes = problem.linearise(stacked)
     step = 1e-5
     for column, direction in enumerate(np.eye(len(stacked))):
@@ -242,7 +249,7 @@ def assert_derivatives(problem, stacked):
         (lambda: KeyframeTime(0, 1.0, weight=-1.0), "weight"),
     ],
 )
-def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make, where):
+def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make: Callable[..., Any], where: str) -> None:
     with pytest.raises(InvalidConstraint) as caught:
         make()
     assert caught.value.where == where
@@ -257,24 +264,24 @@ def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make, where):
         (RootPosition(FRAMES, (0.0, 0.0)), "not within 0 to 30"),
     ],
 )
-def test_what_the_model_has_not_is_refused_by_the_place_of_the_constraint(constraint, message):
+def test_what_the_model_has_not_is_refused_by_the_place_of_the_constraint(constraint: Any, message: str) -> None:
     primitive, _ = walking()
     with pytest.raises(MotionError, match=message) as caught:
         build_objective(primitive, [RootPosition(0, (0.0, 0.0)), constraint], standard_joints())
     assert caught.value.where.startswith("constraints[1]")
 
 
-def test_a_heading_needs_hips_and_shoulders():
+def test_a_heading_needs_hips_and_shoulders() -> None:
     with pytest.raises(MotionError, match="left_hip"):
         build_objective(sliding(), [RootHeading(0, 0.0)], {})
 
 
-def test_too_many_constraints_are_refused():
+def test_too_many_constraints_are_refused() -> None:
     with pytest.raises(InvalidConstraint, match="more than"):
         build_objective(sliding(), [RootPosition(0, (0.0, 0.0))] * (MOST_SOUGHT + 1), {})
 
 
-def test_a_joint_may_be_named_as_the_skeleton_names_it():
+def test_a_joint_may_be_named_as_the_skeleton_names_it() -> None:
     primitive, _ = walking()
     name = primitive.skeleton.joint_names[standard_joints()["left_wrist"]]
     latents = primitive.sample(3, 8)

@@ -1,17 +1,21 @@
 """Refinement: closed forms where there are some, what must hold everywhere else."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.mixture import LatentMixture
+from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
-from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.objective import Objective, build_objective
 from marey_motion.modelling.search.optimise import _Prior, refine
 from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
@@ -22,34 +26,36 @@ from marey_schemas.options.searching import RefineOptions
 WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
 
 
-def on_walks(constraints, mixtures=2):
+def on_walks(constraints: tuple[Any, ...], mixtures: int = 2) -> SeveralSteps:
     return SeveralSteps.of([Step(walking(mixtures=mixtures)[0], tuple(constraints), standard_joints())])
 
 
-def objective_of(primitive, constraints, joints):
+def objective_of(primitive: MotionPrimitive, constraints: tuple[Any, ...], joints: dict[str, int]) -> Objective:
     return build_objective(primitive, constraints, joints)
 
 
-def posterior(primitive, constraints, joints, weight):
+def posterior(
+    primitive: MotionPrimitive, constraints: tuple[Any, ...], joints: dict[str, int], weight: float
+) -> Callable[..., Any]:
     """½ Σ w (e / σ)² - λ ln p, from errors alone."""
     objective = objective_of(primitive, constraints, joints)
     scales = np.array(
         [one.weight / tolerance**2 for one, tolerance in zip(constraints, tolerances(constraints), strict=True)]
     )
 
-    def cost(latent):
+    def cost(latent: Floats) -> float:
         errors = objective.errors(latent[None])[0]
         return 0.5 * float(scales @ errors**2) - weight * float(primitive.log_density(latent[None])[0])
 
     return cost
 
 
-def tolerances(constraints):
+def tolerances(constraints: tuple[Any, ...]) -> list[float]:
     return [next(value for name, value in vars(one).items() if name.startswith("tolerance")) for one in constraints]
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.01, 25.0])
-def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_regression(weight):
+def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_regression(weight: float) -> None:
     primitive = sliding(2)
     constraints = (RootPosition("middle", (0.25, None), 0.02, 3.0),)
     problem = SeveralSteps.of([Step(primitive, constraints, {})])
@@ -62,20 +68,20 @@ def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_re
     np.testing.assert_allclose(found.latents, np.linalg.solve(slope.T @ slope + precision, right), rtol=1e-7)
 
 
-def test_without_constraints_the_result_is_the_mean():
+def test_without_constraints_the_result_is_the_mean() -> None:
     primitive = sliding(2)
     found = refine(SeveralSteps.of([Step(primitive, (), {})]), np.array([5.0, 5.0]))
     np.testing.assert_allclose(found.latents, primitive.mixture.means[0], atol=1e-9)
 
 
-def slopes_of(cost, latents):
+def slopes_of(cost: Callable[..., Any], latents: Floats) -> list[float]:
     """By central differences."""
     return [(cost(latents + 1e-5 * one) - cost(latents - 1e-5 * one)) / 2e-5 for one in np.eye(len(latents))]
 
 
 @pytest.mark.parametrize("mixtures", [1, 2, 3])
 @pytest.mark.parametrize("weight", [1.0, 0.05])
-def test_where_it_ends_nothing_nearby_is_better(weight, mixtures):
+def test_where_it_ends_nothing_nearby_is_better(weight: float, mixtures: int) -> None:
     primitive, _ = walking(mixtures=mixtures)
     constraints = (*WRIST, RootHeading("end", 0.2), KeyframeTime("end", 0.9))
     cost = posterior(primitive, constraints, standard_joints(), weight)
@@ -87,14 +93,14 @@ def test_where_it_ends_nothing_nearby_is_better(weight, mixtures):
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.05])
-def test_the_gradient_of_the_prior_is_that_of_its_cost(weight):
+def test_the_gradient_of_the_prior_is_that_of_its_cost(weight: float) -> None:
     prior = _Prior([walking(mixtures=1)[0].mixture, sliding(2).mixture], weight)
     for latents in np.random.default_rng(6).normal(size=(10, 10)):
         expected = slopes_of(prior.cost, latents)
         np.testing.assert_allclose(prior.quadratic(latents).gradient, expected, rtol=1e-6, atol=1e-6)
 
 
-def test_the_result_is_never_worse_than_the_start():
+def test_the_result_is_never_worse_than_the_start() -> None:
     primitive, _ = walking(mixtures=3)
     cost = posterior(primitive, WRIST, standard_joints(), 1.0)
     for start in primitive.sample(40, 9) * 2.0:
@@ -103,13 +109,13 @@ def test_the_result_is_never_worse_than_the_start():
         assert found.cost <= found.start_cost
 
 
-def test_no_iterations_return_the_start():
+def test_no_iterations_return_the_start() -> None:
     start = walking()[0].sample(1, 1)[0]
     found = refine(on_walks(WRIST), start, RefineOptions.model_construct(likelihood_weight=1.0, iterations=0))
     assert np.array_equal(found.latents, start)
 
 
-def test_what_a_motion_does_already_is_met_within_a_millimetre():
+def test_what_a_motion_does_already_is_met_within_a_millimetre() -> None:
     primitive, latents = walking()
     tree = build_tree(primitive, 1, TreeOptions(samples=3000, features="latent"))
     for example in latents[::8]:
@@ -124,7 +130,7 @@ def test_what_a_motion_does_already_is_met_within_a_millimetre():
         assert primitive.log_density(refined.latents[None])[0] > primitive.log_density(latents).min()
 
 
-def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likelier():
+def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likelier() -> None:
     primitive, _ = walking(mixtures=1)
     wanted = (JointPosition("left_wrist", "middle", (1.5, 2.0, 0.0), 0.1),)
     objective = objective_of(primitive, wanted, standard_joints())
@@ -141,7 +147,7 @@ def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likel
     assert (np.diff(densities) < 0).all()
 
 
-def test_the_component_of_the_mixture_is_picked_anew_on_the_way():
+def test_the_component_of_the_mixture_is_picked_anew_on_the_way() -> None:
     primitive = sliding(1)
     two = LatentMixture(np.array([0.5, 0.5]), np.array([[-2.0], [2.0]]), np.full((2, 1, 1), 0.25))
     problem = SeveralSteps.of([Step(replace(primitive, mixture=two), (RootPosition("middle", (0.2, None)),), {})])
@@ -150,20 +156,20 @@ def test_the_component_of_the_mixture_is_picked_anew_on_the_way():
     np.testing.assert_allclose(found.latents, 2.0, atol=1e-3)
 
 
-def test_a_model_that_never_varies_stays_as_it_is():
+def test_a_model_that_never_varies_stays_as_it_is() -> None:
     found = refine(SeveralSteps.of([Step(sliding(0), (RootPosition(0, (1.0, 0.0)),), {})]), np.zeros(0))
     assert found.latents.shape == (0,)
     assert found.cost == found.start_cost
 
 
 @pytest.mark.parametrize("options", [{"lambda": -1.0}, {"lambda": np.nan}, {"iterations": -1}])
-def test_options_out_of_range_are_refused(options):
+def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(options))):
         RefineOptions.model_validate(options)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_rounding_allows(weight):
+def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_rounding_allows(weight: float) -> None:
     constraints = (JointPosition("head", "end", (1e6, 1e6, 1e6), 1e-8, 1e6),)
     start = walking()[0].mixture.means[0]
     found = refine(on_walks(constraints), start, RefineOptions(likelihood_weight=weight))
@@ -172,20 +178,20 @@ def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_ro
     assert found.cost <= found.start_cost
 
 
-def test_slopes_without_any_curvature_are_damped_instead_of_failing():
+def test_slopes_without_any_curvature_are_damped_instead_of_failing() -> None:
     class Flat:
         """A constraint that nothing has an influence on, and a prior that counts nothing."""
 
         priors = (LatentMixture(np.ones(1), np.zeros((1, 2)), 1e40 * np.eye(2)[None]),)
 
-        def linearise(self, stacked):
+        def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
             return np.ones(1), np.array([[1e20, 1e20]]) * (1.0 + 0.0 * stacked)
 
     found = refine(Flat(), np.zeros(2), RefineOptions(likelihood_weight=0.0))
     np.testing.assert_array_equal(found.latents, 0.0)
 
 
-def test_errors_that_cannot_be_computed_with_are_told_of():
+def test_errors_that_cannot_be_computed_with_are_told_of() -> None:
     constraints = (JointPosition("head", "end", (1e200, 0.0, 0.0), 1e-8),)
     with pytest.raises(MotionError, match="too large"):
         refine(on_walks(constraints), walking()[0].mixture.means[0])

@@ -2,14 +2,17 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from tests.support.model_examples import walks
-from tests.support.report_pages import HOSTILE, is_sound
+from tests.support.report_pages import HOSTILE, Page, is_sound
 
-from marey_motion.modelling.training import train_primitive
+from marey_motion.alignment.aligned import AlignedSet
+from marey_motion.modelling.training import TrainedPrimitive, train_primitive
 from marey_motion.modelling.training_warnings import Warned
 from marey_motion.modelling.verdict import verdict_of
+from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_reports.models.page import render_model_report
 from marey_schemas.options.modelling import ModelOptions
@@ -25,57 +28,61 @@ ORIGIN = {
 QUICK = ModelOptions(report_samples=20, starts=1)
 
 
-def made(aligned, options=QUICK):
+def made(aligned: AlignedSet, options: ModelOptions = QUICK) -> tuple[TrainedPrimitive, ModelSubject]:
     trained = train_primitive(aligned, options, name="walk")
     return trained, ModelSubject(trained.primitive, aligned, trained.report)
 
 
-def rendered(trained, subject, figures=None, **options):
+def rendered(
+    trained: TrainedPrimitive, subject: ModelSubject, figures: dict[str, DrawnFigure] | None = None, **options: Any
+) -> str:
     return render_model_report(trained, subject, figures or {}, **{"title": "Walk", "origin": ORIGIN, **options})
 
 
 @pytest.fixture(scope="module")
-def model():
+def model() -> tuple[TrainedPrimitive, ModelSubject]:
     return made(walks())
 
 
 @pytest.fixture(scope="module")
-def figures(model):
+def figures(model: tuple[TrainedPrimitive, ModelSubject]) -> dict[str, DrawnFigure]:
     return {**draw_alignment_figures(model[1].examples), **draw_model_figures(model[1])}
 
 
 @pytest.fixture(scope="module")
-def page(model, figures):
+def page(model: tuple[TrainedPrimitive, ModelSubject], figures: dict[str, DrawnFigure]) -> Page:
     return is_sound(rendered(model[0], model[1], figures))
 
 
-def test_a_report_is_one_sound_file_that_shows_every_figure(page, figures):
+def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: dict[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(figures)
     assert page.tags["h1"] == 1
     for figure in figures.values():
         assert figure.caption in page.text
 
 
-def test_the_page_opens_with_the_verdict(page, model):
+def test_the_page_opens_with_the_verdict(page: Page, model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     assert page.text.startswith("Walk Walk " + verdict_of(model[0]))
 
 
-def test_the_same_model_gives_the_same_page(model, figures):
+def test_the_same_model_gives_the_same_page(
+    model: tuple[TrainedPrimitive, ModelSubject], figures: dict[str, DrawnFigure]
+) -> None:
     assert rendered(model[0], model[1], figures) == rendered(model[0], model[1], figures)
 
 
-def test_the_page_may_load_nothing(model):
+def test_the_page_may_load_nothing(model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     assert "default-src &#39;none&#39;" in rendered(*model)
     assert not re.search(r"(?:href|src)=\"(?!#|data:)", rendered(*model))
 
 
-def test_the_numbers_of_every_example_are_listed(page, model):
+def test_the_numbers_of_every_example_are_listed(page: Page, model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     for example in model[0].report.examples:
         assert f"{example.duration_s:.2f}" in page.text
         assert f"{example.left_out_error_cm:.1f}" in page.text
 
 
-def test_warnings_are_told_first_and_with_their_codes(model):
+def test_warnings_are_told_first_and_with_their_codes(model: tuple[TrainedPrimitive, ModelSubject]) -> None:
     trained, subject = model
     warned = replace(trained, warnings=(Warned("odd-durations", "half of the samples <last> longer"),))
     text = is_sound(rendered(warned, subject)).text
@@ -83,7 +90,7 @@ def test_warnings_are_told_first_and_with_their_codes(model):
     assert "Nothing stands out." in is_sound(rendered(replace(trained, warnings=()), subject)).text
 
 
-def test_it_says_what_the_model_was_made_of(page):
+def test_it_says_what_the_model_was_made_of(page: Page) -> None:
     assert "item_1@2" in page.text
     assert "lab/aligned/walk 00" in page.text
     assert "left foot down" in page.text
@@ -91,7 +98,7 @@ def test_it_says_what_the_model_was_made_of(page):
 
 
 @pytest.mark.slow
-def test_names_and_titles_are_shown_and_never_run():
+def test_names_and_titles_are_shown_and_never_run() -> None:
     trained, subject = made(walks(6, names=(*HOSTILE, "plain")))
     drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
     page = is_sound(rendered(trained, subject, drawn, title=HOSTILE[1]))
@@ -101,7 +108,7 @@ def test_names_and_titles_are_shown_and_never_run():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", ["copies", "bare"])
-def test_models_of_little_are_reported(odd):
+def test_models_of_little_are_reported(odd: str) -> None:
     aligned = walks(3)
     if odd == "copies":
         first = aligned.clips[0]

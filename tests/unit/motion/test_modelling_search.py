@@ -2,19 +2,22 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from tests.support.modelling_examples import walks
 from tests.support.search_primitives import sliding, standard_joints, walking
 from tests.support.tiers import examples
 
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.search.constraints import Constraint, JointPosition, RootPosition
-from marey_motion.modelling.search.objective import build_objective
+from marey_motion.modelling.search.objective import Objective, build_objective
 from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import FoundSamples, search_closely, search_tree
 from marey_motion.modelling.search.steps import SeveralSteps, Step
@@ -26,7 +29,7 @@ from marey_schemas.options.searching import RefineOptions
 EVERYTHING = 10**6
 
 
-def search_all(objective, tree, *, top=1):
+def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> FoundSamples:
     """Evaluate every sample, without the tree."""
     costs = objective.costs(tree.samples.astype(np.float64))
     chosen = np.lexsort((np.arange(len(costs)), costs))[:top]
@@ -34,21 +37,21 @@ def search_all(objective, tree, *, top=1):
 
 
 @cache
-def grown(leaf_size=1, samples=2000):
+def grown(leaf_size: int = 1, samples: int = 2000) -> SampleTree:
     return build_tree(walking()[0], 2, TreeOptions(samples=samples, leaf_size=leaf_size, features="latent"))
 
 
-def wrist_at(x, y, z):
+def wrist_at(x: float, y: float, z: float) -> Objective:
     return build_objective(walking()[0], [JointPosition("left_wrist", "middle", (x, y, z))], standard_joints())
 
 
 TARGETS = st.tuples(st.floats(-0.5, 0.8), st.floats(0.5, 1.5), st.floats(0.0, 1.5))
 
 
-def plain_beam(objective, tree, candidates):
+def plain_beam(objective: Objective, tree: SampleTree, candidates: int) -> tuple[float, int]:
     """The best sample by a beam, one node at a time."""
 
-    def cost(latent):
+    def cost(latent: NDArray[Any]) -> float:
         return float(objective.costs(np.asarray(latent, dtype=np.float64)[None])[0])
 
     frontier, found = [0], []
@@ -69,7 +72,9 @@ def plain_beam(objective, tree, candidates):
 
 @settings(max_examples=examples(25))
 @given(target=TARGETS, candidates=st.integers(1, 20), leaf_size=st.sampled_from((1, 5, 30)))
-def test_the_beam_keeps_the_true_best_of_each_level(target, candidates, leaf_size):
+def test_the_beam_keeps_the_true_best_of_each_level(
+    target: tuple[float, float, float], candidates: int, leaf_size: int
+) -> None:
     objective, tree = wrist_at(*target), grown(leaf_size)
     found = search_tree(objective, tree, candidates=candidates)
     cost, row = plain_beam(objective, tree, candidates)
@@ -78,7 +83,9 @@ def test_the_beam_keeps_the_true_best_of_each_level(target, candidates, leaf_siz
 
 @settings(max_examples=examples(25))
 @given(target=TARGETS, leaf_size=st.sampled_from((1, 5, 30)), top=st.integers(1, 50))
-def test_a_beam_of_all_nodes_is_an_exhaustive_search(target, leaf_size, top):
+def test_a_beam_of_all_nodes_is_an_exhaustive_search(
+    target: tuple[float, float, float], leaf_size: int, top: int
+) -> None:
     objective, tree = wrist_at(*target), grown(leaf_size)
     beam, everything = (
         search_tree(objective, tree, candidates=EVERYTHING, top=top),
@@ -89,18 +96,18 @@ def test_a_beam_of_all_nodes_is_an_exhaustive_search(target, leaf_size, top):
     assert np.array_equal(beam.latents, everything.latents)
 
 
-def test_few_of_many_samples_are_looked_at():
+def test_few_of_many_samples_are_looked_at() -> None:
     found = search_tree(wrist_at(0.3, 1.0, 0.4), grown(), candidates=4)
     assert found.evaluations < 150
 
 
-def test_what_is_found_is_a_sample_and_never_a_mean():
+def test_what_is_found_is_a_sample_and_never_a_mean() -> None:
     tree = grown()
     found = search_tree(wrist_at(0.3, 1.0, 0.4), tree, candidates=1)
     assert (tree.samples == found.latents[0].astype(np.float32)).all(axis=1).any()
 
 
-def test_where_everything_costs_the_same_the_first_in_the_tree_are_found():
+def test_where_everything_costs_the_same_the_first_in_the_tree_are_found() -> None:
     tree = grown()
     free = build_objective(walking()[0], [], standard_joints())
     assert search_all(free, tree, top=3).samples.tolist() == [0, 1, 2]
@@ -108,24 +115,24 @@ def test_where_everything_costs_the_same_the_first_in_the_tree_are_found():
     assert first.costs.tolist() == [0.0]
 
 
-def test_a_root_that_is_a_leaf_is_searched():
+def test_a_root_that_is_a_leaf_is_searched() -> None:
     tree = build_tree(walking()[0], 2, TreeOptions(samples=50, leaf_size=50, features="latent"))
     objective = wrist_at(0.3, 1.0, 0.4)
     assert search_tree(objective, tree).costs == search_all(objective, tree).costs
 
 
-def test_the_target_that_is_a_samples_own_is_found():
+def test_the_target_that_is_a_samples_own_is_found() -> None:
     tree, primitive = grown(), walking()[0]
     wanted = primitive.poses(tree.samples[777:778].astype(np.float64), [0.0])[0, 0, :3]
     objective = build_objective(primitive, [JointPosition("pelvis", 0, tuple(wanted))], {"pelvis": 0})
     assert search_all(objective, tree).costs[0] < 1e-6
 
 
-def test_threads_find_the_same():
+def test_threads_find_the_same() -> None:
     tree = grown()
     tree.means  # noqa: B018
 
-    def found(_number):
+    def found(_number: int) -> bytes:
         one = search_tree(wrist_at(0.2, 1.1, 0.5), tree, candidates=6, top=10)
         return one.latents.tobytes() + one.costs.tobytes()
 
@@ -133,25 +140,25 @@ def test_threads_find_the_same():
         assert len(set(pool.map(found, range(8)))) == 1
 
 
-def test_a_tree_of_another_model_is_refused():
+def test_a_tree_of_another_model_is_refused() -> None:
     with pytest.raises(MotionError, match="the model needs") as caught:
         search_tree(build_objective(sliding(), [RootPosition(0, (0.0, 0.0))], {}), grown())
     assert caught.value.code == "tree-of-another"
 
 
-def test_a_beam_is_at_least_one_wide():
+def test_a_beam_is_at_least_one_wide() -> None:
     with pytest.raises(MotionError):
         search_tree(wrist_at(0.0, 0.0, 0.0), grown(), candidates=0)
 
 
-def test_a_model_that_never_varies_has_one_motion_to_find():
+def test_a_model_that_never_varies_has_one_motion_to_find() -> None:
     primitive = sliding(0)
     tree = SampleTree(np.zeros((1, 0), np.float32), np.array([1], np.int32), np.array([0], np.int32))
     found = search_tree(build_objective(primitive, [RootPosition(0, (0.5, None))], {}), tree)
     np.testing.assert_allclose(found.costs, 50.0)
 
 
-def test_looking_closer_comes_nearer_and_stays_as_likely():
+def test_looking_closer_comes_nearer_and_stays_as_likely() -> None:
     primitive, tree = walking()[0], grown()
     once, twice = [], []
     for target in primitive.sample(25, 31):
@@ -167,7 +174,7 @@ def test_looking_closer_comes_nearer_and_stays_as_likely():
     assert np.median(densities) > np.percentile(primitive.log_density(tree.samples.astype(float)), 10)
 
 
-def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says():
+def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says() -> None:
     objective, tree = wrist_at(0.3, 1.0, 0.4), grown()
     found = search_closely(objective, tree)
     assert found.samples.tolist() == [-1]
@@ -175,7 +182,7 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
     assert search_closely(objective, tree, passes=1).samples[0] >= 0
 
 
-def own_keyframes(**options):
+def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPosition]], Floats]:
     """A model of walks is asked to put the left wrist where each of its examples has it at the keyframe.
 
     Objectives by example, the model's tree, constraints by example, and the latent vectors (m, L) of the examples.
@@ -190,14 +197,14 @@ def own_keyframes(**options):
     return objectives, tree, wanted, primitive.latents_of(aligned.poses, aligned.time_functions)
 
 
-def test_what_an_example_does_at_a_keyframe_is_found_as_near_as_the_model_holds_that_example():
+def test_what_an_example_does_at_a_keyframe_is_found_as_near_as_the_model_holds_that_example() -> None:
     objectives, tree, _, latents = own_keyframes()
     for objective, own in zip(objectives, latents, strict=True):
         found = search_closely(objective, tree)
         assert objective.errors(found.latents)[0, 0] <= objective.errors(own[None])[0, 0]
 
 
-def test_a_model_that_keeps_more_finds_it_within_millimetres_and_refined_within_one():
+def test_a_model_that_keeps_more_finds_it_within_millimetres_and_refined_within_one() -> None:
     objectives, tree, wanted, _ = own_keyframes(spatial_share=0.999)
     searched, refined = [], []
     for objective, constraints in zip(objectives, wanted, strict=True):

@@ -1,11 +1,15 @@
 """Searching a model of real motions: raised hands, and places where the wrist was in takes the model has not seen."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.aligning import SourceExample, align_clips
 from marey_motion.alignment.signs import consistent_poses
+from marey_motion.arrays import Flags, Floats
+from marey_motion.clip import Clip
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
@@ -14,10 +18,12 @@ from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
-from marey_motion.modelling.training import train_primitive
+from marey_motion.modelling.training import TrainedPrimitive, train_primitive
 from marey_motion.retargeting import plan_retarget, retarget
 from marey_motion.rigs import guess_axes, map_joints
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.rigs.axes import JointAxes
+from marey_motion.rigs.mapping import JointMapping
+from marey_motion.skeleton import Skeleton, same_hierarchy
 from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.options.searching import RefineOptions
 
@@ -25,7 +31,7 @@ TARGETS = 200
 HELD_OUT_EVERY = 4
 
 
-def test_places_that_unseen_takes_reached_are_found_and_met(mocap):
+def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None:
     files = sorted(mocap.glob("bandai-namco-2/*raise-up*right-hand*.bvh"))
     assert len(files) >= 20
     clips = _on_one_skeleton([read_motion(file.read_bytes(), file.name).clip for file in files])
@@ -44,10 +50,10 @@ def test_places_that_unseen_takes_reached_are_found_and_met(mocap):
     assert np.mean(likely) >= 0.97
 
 
-def _on_one_skeleton(clips):
+def _on_one_skeleton(clips: list[Clip]) -> list[Clip]:
     """All clips on the skeleton of the first."""
 
-    def rigged(skeleton):
+    def rigged(skeleton: Skeleton) -> tuple[Skeleton, JointMapping, dict[str, JointAxes]]:
         mapping = map_joints(skeleton)
         return skeleton, mapping, guess_axes(skeleton, mapping)
 
@@ -60,7 +66,9 @@ def _on_one_skeleton(clips):
     ]
 
 
-def _search_all(trained, unseen, body):
+def _search_all(
+    trained: TrainedPrimitive, unseen: list[AlignedClip], body: MatchingBody
+) -> tuple[Floats, Floats, Flags]:
     """What searching misses in centimetres, what refinement leaves, and whether likelihoods are those of examples."""
     primitive, joints = trained.primitive, dict(body.standard_joints)
     least = np.percentile([one.log_likelihood for one in trained.report.examples], 1)

@@ -1,12 +1,14 @@
 """Several motions in a row: that they hang together, and do what was asked, in the world and in real time."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.search_primitives import sliding, standard_joints, walking
 
 from marey_motion.alignment.aligned import Placement
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, headings
 from marey_motion.modelling.search.constraints import (
@@ -18,10 +20,10 @@ from marey_motion.modelling.search.constraints import (
     RootPosition,
 )
 from marey_motion.modelling.search.finishing import finish_motion
-from marey_motion.modelling.search.found_motions import found_motion
-from marey_motion.modelling.search.step_search import search_steps
+from marey_motion.modelling.search.found_motions import FoundMotion, found_motion
+from marey_motion.modelling.search.step_search import Sequel, search_steps
 from marey_motion.modelling.search.steps import MOST_SEARCH_STEPS, Step
-from marey_motion.modelling.search.tree import build_tree
+from marey_motion.modelling.search.tree import SampleTree, build_tree
 from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
 from marey_schemas.options.modelling import TreeOptions
@@ -30,11 +32,11 @@ from marey_schemas.options.searching import RefineOptions, TransitionOptions
 START = Placement(0.5, 1.0, -2.0)
 
 
-def tree():
+def tree() -> SampleTree:
     return build_tree(walking()[0], 1, TreeOptions(samples=2000, features="latent"))
 
 
-def walk_to(*places):
+def walk_to(*places: Any) -> list[Step]:
     """Steps of a second that end near places on the ground."""
     return [Step(walking()[0], (RootPosition("end", place, 0.05),), standard_joints()) for place in places]
 
@@ -42,19 +44,19 @@ def walk_to(*places):
 THREE = walk_to((1.6, -0.9), (2.3, 0.2), (3.1, 1.2))
 
 
-def found_three(**options):
+def found_three(**options: Any) -> tuple[Sequel, FoundMotion]:
     sequel = search_steps(THREE, [tree()] * 3, start=START, **options)
     return sequel, found_motion(THREE, sequel)
 
 
-def heading_at(positions):
+def heading_at(positions: Floats) -> Floats:
     joints = standard_joints()
     lefts, rights = ([joints[f"{side}_{part}"] for part in ("hip", "shoulder")] for side in ("left", "right"))
     return headings(forward_directions(positions, lefts, rights))
 
 
 @pytest.mark.parametrize("refining", [None, RefineOptions()])
-def test_the_body_goes_on_where_and_as_it_stood(refining):
+def test_the_body_goes_on_where_and_as_it_stood(refining: RefineOptions | None) -> None:
     sequel, found = found_three(refining=refining)
     ends = [found.frame_of(step, walking()[0], "end") for step in range(3)]
     for number, (step, latent) in enumerate(zip(THREE, sequel.latents, strict=True)):
@@ -71,13 +73,13 @@ def test_the_body_goes_on_where_and_as_it_stood(refining):
         np.testing.assert_allclose(heading_at(turned), heading_at(before), atol=1e-9)
 
 
-def rotated(positions, placement):
+def rotated(positions: Floats, placement: Placement) -> Floats:
     cos, sin = np.cos(placement.heading_rad), np.sin(placement.heading_rad)
     x, y, z = np.moveaxis(positions, -1, 0)
     return np.stack((cos * x + sin * z + placement.x, y, cos * z - sin * x + placement.z), axis=-1)
 
 
-def test_refining_brings_hands_and_feet_together_at_the_seams():
+def test_refining_brings_hands_and_feet_together_at_the_seams() -> None:
     sampled, _ = found_three(refining=None)
     refined, _ = found_three(refining=RefineOptions(likelihood_weight=0.1))
     for before, after in zip(sampled.measured.jumps_m, refined.measured.jumps_m, strict=True):
@@ -85,7 +87,7 @@ def test_refining_brings_hands_and_feet_together_at_the_seams():
     assert max(jumps[1:].max() for jumps in refined.measured.jumps_m) < 0.12
 
 
-def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were():
+def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were() -> None:
     sequel, _ = found_three(refining=RefineOptions(likelihood_weight=0.01))
     assert set(sequel.joints) == {"left_wrist", "right_wrist", "left_ankle", "right_ankle"}
     for jumps in sequel.measured.jumps_m:
@@ -93,25 +95,26 @@ def test_both_hands_and_both_feet_go_on_within_centimetres_of_where_they_were():
         assert jumps[1:].max() < 0.05
 
 
-def test_steps_end_where_they_were_asked_to():
+def test_steps_end_where_they_were_asked_to() -> None:
     sequel, found = found_three(transitions=TransitionOptions(tolerance_m=0.3))
     positions = found.motion.positions(found.skeleton)[:, standard_joints()["pelvis"]]
     for number, step in enumerate(THREE):
-        target = step.constraints[0].target_m
+        root = step.constraints[0]
+        assert isinstance(root, RootPosition)
         place = positions[found.frame_of(number, step.primitive, "end"), [0, 2]]
-        reached = np.linalg.norm(place - target)
+        reached = np.linalg.norm(place - root.target_m)
         np.testing.assert_allclose(reached, sequel.measured.errors[number][0], atol=5e-3)
         assert reached < 0.1
 
 
-def test_the_motion_begins_where_it_was_put():
+def test_the_motion_begins_where_it_was_put() -> None:
     _, found = found_three()
     positions = found.motion.positions(found.skeleton)[:1]
     np.testing.assert_allclose(positions[0, standard_joints()["pelvis"], [0, 2]], (START.x, START.z), atol=0.05)
     np.testing.assert_allclose(heading_at(positions), START.heading_rad, atol=0.3)
 
 
-def test_a_row_of_motions_has_the_frames_of_all_of_them_and_the_seams_once():
+def test_a_row_of_motions_has_the_frames_of_all_of_them_and_the_seams_once() -> None:
     sequel, found = found_three()
     lasting = [float(walking()[0].durations_s(one[None])[0]) * found.frame_rate_hz for one in sequel.latents]
     assert found.motion.frame_count == sum(map(round, lasting)) + 1
@@ -120,7 +123,7 @@ def test_a_row_of_motions_has_the_frames_of_all_of_them_and_the_seams_once():
     assert jumps.min() > 0.0
 
 
-def test_a_tolerance_that_is_larger_lets_joints_jump_more():
+def test_a_tolerance_that_is_larger_lets_joints_jump_more() -> None:
     tight, loose = (
         search_steps(THREE, [tree()] * 3, start=START, transitions=TransitionOptions(tolerance_m=size))
         for size in (0.005, 0.5)
@@ -128,7 +131,7 @@ def test_a_tolerance_that_is_larger_lets_joints_jump_more():
     assert sum(map(np.sum, tight.measured.jumps_m)) < sum(map(np.sum, loose.measured.jumps_m))
 
 
-def test_one_step_needs_no_hips_and_shoulders():
+def test_one_step_needs_no_hips_and_shoulders() -> None:
     primitive = sliding(2)
     step = Step(primitive, (RootPosition("end", (0.3, None)),), {})
     one = build_tree(primitive, 0, TreeOptions(samples=500, features="latent"))
@@ -138,7 +141,7 @@ def test_one_step_needs_no_hips_and_shoulders():
         search_steps([step, step], [one, one])
 
 
-def test_a_constraint_that_is_wrong_is_told_by_step_and_place():
+def test_a_constraint_that_is_wrong_is_told_by_step_and_place() -> None:
     steps = [THREE[0], Step(walking()[0], (RootHeading("end", 0.0), RootHeading("never", 0.0)), standard_joints())]
     with pytest.raises(InvalidConstraint, match="no keyframe 'never'") as caught:
         search_steps(steps, [tree()] * 2)
@@ -146,12 +149,12 @@ def test_a_constraint_that_is_wrong_is_told_by_step_and_place():
 
 
 @pytest.mark.parametrize("count", [0, MOST_SEARCH_STEPS + 1])
-def test_the_number_of_steps_is_limited(count):
+def test_the_number_of_steps_is_limited(count: int) -> None:
     with pytest.raises(InvalidConstraint, match="steps"):
         search_steps(THREE[:1] * count, [tree()] * count)
 
 
-def test_steps_of_different_skeletons_make_no_motion():
+def test_steps_of_different_skeletons_make_no_motion() -> None:
     sequel = search_steps(THREE[:1], [tree()])
     primitive = sliding(2)
     other = Step(primitive, (), {})
@@ -161,12 +164,12 @@ def test_steps_of_different_skeletons_make_no_motion():
     assert caught.value.where == "steps[1]"
 
 
-def joined(first, second):
+def joined(first: Sequel, second: Sequel) -> Sequel:
     measured = first.measured._replace(placements=first.measured.placements + second.measured.placements)
     return replace(first, latents=first.latents + second.latents, measured=measured)
 
 
-def test_inverse_kinematics_removes_what_is_left():
+def test_inverse_kinematics_removes_what_is_left() -> None:
     wanted = (
         JointPosition("left_wrist", "middle", (1.6, 1.1, -1.3)),
         JointOrientation("head", "end", (1.0, 0.0, 0.3, 0.0)),
@@ -188,7 +191,7 @@ def test_inverse_kinematics_removes_what_is_left():
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_straight_legs_are_finished_with_knees_that_bend_forwards(side):
+def test_straight_legs_are_finished_with_knees_that_bend_forwards(side: str) -> None:
     step = THREE[0]
     found = found_motion([step], search_steps([step], [tree()], start=START))
     hip, knee, ankle = (standard_joints()[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
@@ -208,7 +211,7 @@ def test_straight_legs_are_finished_with_knees_that_bend_forwards(side):
     assert (after[knee] - 0.5 * (after[hip] + after[ankle])) @ forwards > 0.05
 
 
-def test_where_nothing_can_be_finished_the_motion_stays():
+def test_where_nothing_can_be_finished_the_motion_stays() -> None:
     step = THREE[0]
     found = found_motion([step], search_steps([step], [tree()], start=START))
     assert finish_motion([step], found, map_joints(found.skeleton)).found is found

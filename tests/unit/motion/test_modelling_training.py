@@ -1,6 +1,7 @@
 """Motion primitives: what training makes of aligned examples, and what it says about it."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,17 +9,19 @@ from pydantic import ValidationError
 from scipy.stats import multivariate_normal
 from tests.support.modelling_examples import aligned_set, bending_chains, chain, unit_poses, walks, warps
 
-from marey_motion.alignment.aligned import AlignedClip
+from marey_motion.alignment.aligned import AlignedClip, AlignedSet
 from marey_motion.alignment.signs import consistent_poses
+from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling import reconstruction_kernels
 from marey_motion.modelling.fpca import Keep, find_components
+from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.reconstruction import comparison_frames, reconstruction_errors
 from marey_motion.modelling.sample_quality import FootQuality
 from marey_motion.modelling.splines import SplineBasis
-from marey_motion.modelling.training import fit_examples, train_primitive
+from marey_motion.modelling.training import TrainedPrimitive, fit_examples, train_primitive
 from marey_motion.modelling.training_warnings import warnings_of
 from marey_motion.modelling.verdict import headline_of, verdict_of
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
@@ -28,7 +31,7 @@ SCALINGS = ["jacobian", "root_max", "sfpca", "none"]
 QUICK = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 
-def as_bytes(trained):
+def as_bytes(trained: TrainedPrimitive) -> bytes:
     return encode_tree(trained_to_tree(trained, {"item": "skeleton", "revision": 1}, {}), MSGPACK)
 
 
@@ -36,7 +39,7 @@ def as_bytes(trained):
 
 
 @pytest.mark.parametrize("scaling", SCALINGS)
-def test_examples_come_back_from_their_latent_vectors(scaling):
+def test_examples_come_back_from_their_latent_vectors(scaling: str) -> None:
     aligned = bending_chains(size=0.02)
     options = QUICK.replace(scaling=scaling, spatial_components=20, temporal_share=1.0)
     primitive = train_primitive(aligned, options).primitive
@@ -49,7 +52,7 @@ def test_examples_come_back_from_their_latent_vectors(scaling):
 
 
 @pytest.mark.parametrize("copies", [1, 5])
-def test_copies_of_one_clip_give_that_clip(copies):
+def test_copies_of_one_clip_give_that_clip(copies: int) -> None:
     poses = np.repeat(bending_chains(1).poses, copies, axis=0)
     times = np.repeat(warps(1, 30), copies, axis=0)
     trained = train_primitive(aligned_set(chain(), poses, times))
@@ -62,7 +65,7 @@ def test_copies_of_one_clip_give_that_clip(copies):
 
 
 @pytest.mark.parametrize("copies", [1, 5])
-def test_copies_of_what_a_cubic_spline_can_hold_come_back_to_the_last_digits(copies):
+def test_copies_of_what_a_cubic_spline_can_hold_come_back_to_the_last_digits(copies: int) -> None:
     turned = np.random.default_rng(1).standard_normal((4, 4))
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     t = np.linspace(0.0, 1.0, 30)
@@ -73,7 +76,7 @@ def test_copies_of_what_a_cubic_spline_can_hold_come_back_to_the_last_digits(cop
         np.testing.assert_allclose(drawn, poses, rtol=0, atol=1e-9)
 
 
-def test_every_sampled_quaternion_has_unit_length():
+def test_every_sampled_quaternion_has_unit_length() -> None:
     primitive = train_primitive(walks(), QUICK).primitive
     poses = primitive.poses(primitive.sample(50, 2))
     lengths = np.linalg.norm(poses[..., 3:].reshape(*poses.shape[:2], -1, 4), axis=-1)
@@ -82,13 +85,13 @@ def test_every_sampled_quaternion_has_unit_length():
         np.testing.assert_allclose(np.linalg.norm(motion.rotations, axis=2), 1.0, atol=1e-12)
 
 
-def test_whatever_is_drawn_time_runs_forward():
+def test_whatever_is_drawn_time_runs_forward() -> None:
     primitive = train_primitive(bending_chains(), QUICK).primitive
     extreme = 6.0 * primitive.mixture.sample(200, 0)
     assert (np.diff(primitive.time_functions(extreme), axis=1) > 0.0).all()
 
 
-def test_samples_hold_no_frame_longer_or_shorter_than_the_examples_did():
+def test_samples_hold_no_frame_longer_or_shorter_than_the_examples_did() -> None:
     aligned = bending_chains(30)
     primitive = train_primitive(aligned, QUICK).primitive
     given = np.diff(aligned.time_functions, axis=1)
@@ -102,7 +105,7 @@ def test_samples_hold_no_frame_longer_or_shorter_than_the_examples_did():
     assert np.diff(free.time_functions(extreme), axis=1).max() > most * 1.06
 
 
-def test_examples_are_rebuilt_as_if_nothing_were_cut_off():
+def test_examples_are_rebuilt_as_if_nothing_were_cut_off() -> None:
     for examples, options in ((bending_chains(30), QUICK), (walks(), QUICK)):
         primitive = train_primitive(examples, options).primitive
         latents = latents_of_examples(primitive, examples)
@@ -110,11 +113,11 @@ def test_examples_are_rebuilt_as_if_nothing_were_cut_off():
         np.testing.assert_array_equal(primitive.time_functions(latents), free.time_functions(latents))
 
 
-def latents_of_examples(primitive, aligned):
+def latents_of_examples(primitive: MotionPrimitive, aligned: AlignedSet) -> Floats:
     return primitive.latents_of(consistent_poses(aligned.poses, aligned.clips[0].motion.poses), aligned.time_functions)
 
 
-def test_samples_last_no_longer_or_shorter_than_the_examples_by_more_than_a_fifth():
+def test_samples_last_no_longer_or_shorter_than_the_examples_by_more_than_a_fifth() -> None:
     aligned = bending_chains(30)
     primitive = train_primitive(aligned, QUICK).primitive
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
@@ -126,14 +129,14 @@ def test_samples_last_no_longer_or_shorter_than_the_examples_by_more_than_a_fift
     np.testing.assert_array_equal(primitive.sample(20, 3), primitive.sample(2000, 3)[:20])
 
 
-def test_motions_last_as_long_as_their_latent_vectors_say():
+def test_motions_last_as_long_as_their_latent_vectors_say() -> None:
     primitive = train_primitive(walks(), QUICK).primitive
     latents = primitive.sample(6, 0)
     for motion, seconds in zip(primitive.motions(latents), primitive.durations_s(latents), strict=True):
         assert (motion.frame_count - 1) / primitive.frame_rate_hz == pytest.approx(seconds, abs=0.5 / 60.0)
 
 
-def test_a_mixture_of_a_known_latent_space_is_recovered():
+def test_a_mixture_of_a_known_latent_space_is_recovered() -> None:
     """Two kinds of motion in a space of three functions."""
     random = np.random.default_rng(0)
     skeleton, basis, examples = chain(), SplineBasis.clamped(40, 8), 120
@@ -156,7 +159,7 @@ def test_a_mixture_of_a_known_latent_space_is_recovered():
     np.testing.assert_allclose(primitive.log_density(drawn), expected, rtol=1e-9)
 
 
-def test_signs_of_quaternions_do_not_matter():
+def test_signs_of_quaternions_do_not_matter() -> None:
     aligned = walks()
     flips = np.where(np.random.default_rng(0).random((16, 1, aligned.skeleton.joint_count)) < 0.5, -1.0, 1.0)
     poses = aligned.poses
@@ -169,7 +172,7 @@ def test_signs_of_quaternions_do_not_matter():
 
 
 @pytest.mark.parametrize("scaling", SCALINGS)
-def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling):
+def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(scaling: str) -> None:
     aligned, options = walks(12, 30), ModelOptions(scaling=scaling)
     first = as_bytes(train_primitive(aligned, options, seed=3))
     assert as_bytes(train_primitive(aligned, options, seed=3)) == first
@@ -179,7 +182,7 @@ def test_training_gives_the_same_bytes_every_time_and_on_any_number_of_threads(s
 # -- the report --------------------------------------------------------------------------------------------------------
 
 
-def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses():
+def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses() -> None:
     aligned = bending_chains(8)
     options = QUICK.replace(spatial_share=1.0)
     fitted = fit_examples(aligned, options)
@@ -199,7 +202,7 @@ def test_what_a_left_out_example_loses_is_what_a_model_without_it_loses():
     assert found.left_out_cm == pytest.approx(found.left_out_each_cm.mean(axis=0))
 
 
-def test_more_components_lose_less_and_unseen_examples_lose_more():
+def test_more_components_lose_less_and_unseen_examples_lose_more() -> None:
     report = train_primitive(walks(24), ModelOptions(scaling="sfpca")).report
     errors = report.reconstruction
     assert (np.diff(errors.training_cm) < 0.05).all()
@@ -208,7 +211,7 @@ def test_more_components_lose_less_and_unseen_examples_lose_more():
     assert report.spatial_energy[-1] == pytest.approx(1.0)
 
 
-def test_the_gradient_of_distances_of_joints_is_right():
+def test_the_gradient_of_distances_of_joints_is_right() -> None:
     random = np.random.default_rng(3)
     skeleton = walks(1).skeleton
     poses = walks(1).poses[0, :3] + 0.2 * random.standard_normal((3, 3 + 4 * skeleton.joint_count))
@@ -216,7 +219,7 @@ def test_the_gradient_of_distances_of_joints_is_right():
         (3, skeleton.joint_count, 3)
     )
 
-    def error(at):
+    def error(at: Floats) -> tuple[float, Floats]:
         gradient = np.empty_like(at)
         arguments = (at, skeleton.parents, skeleton.offsets, targets, gradient)
         return reconstruction_kernels.squared_error_gradient(*arguments), gradient
@@ -230,7 +233,7 @@ def test_the_gradient_of_distances_of_joints_is_right():
         assert gradient[1, column] == pytest.approx(slope, rel=1e-5, abs=1e-6)
 
 
-def test_an_example_unlike_the_others_is_named():
+def test_an_example_unlike_the_others_is_named() -> None:
     aligned = bending_chains(30)
     poses = aligned.poses
     poses[7, :, 0] += np.linspace(0.0, 3.0, 30)
@@ -240,7 +243,7 @@ def test_an_example_unlike_the_others_is_named():
     assert "clip 7" in told.message
 
 
-def test_the_report_tells_of_feet_durations_and_likelihoods():
+def test_the_report_tells_of_feet_durations_and_likelihoods() -> None:
     aligned = walks(24)
     trained = train_primitive(aligned, seed=1)
     report = trained.report
@@ -258,7 +261,7 @@ def test_the_report_tells_of_feet_durations_and_likelihoods():
     assert headline_of(trained)["examples"] == 24
 
 
-def test_feet_below_the_floor_are_told():
+def test_feet_below_the_floor_are_told() -> None:
     aligned = walks(16)
     poses = aligned.poses
     poses[..., 1] -= 0.1
@@ -267,11 +270,11 @@ def test_feet_below_the_floor_are_told():
     assert "feet-below-floor" in [warning.code for warning in trained.warnings]
 
 
-def test_feet_that_slide_in_samples_and_stand_in_examples_are_told():
+def test_feet_that_slide_in_samples_and_stand_in_examples_are_told() -> None:
     trained = train_primitive(walks(16), QUICK)
     standing, sliding, creeping = (FootQuality(0.0, 0.0, 1.0, speed) for speed in (0.04, 0.13, 0.07))
 
-    def codes(examples, samples):
+    def codes(examples: FootQuality, samples: FootQuality) -> list[str]:
         report = dataclasses.replace(trained.report, training_feet=examples, sample_feet=samples)
         return [warning.code for warning in warnings_of(trained.primitive, report, QUICK)]
 
@@ -280,18 +283,18 @@ def test_feet_that_slide_in_samples_and_stand_in_examples_are_told():
     assert "feet-slide" not in codes(sliding, sliding)
 
 
-def test_few_examples_are_a_warning():
+def test_few_examples_are_a_warning() -> None:
     codes = [warning.code for warning in train_primitive(walks(5)).warnings]
     assert "too-few-examples" in codes
 
 
-def test_a_skeleton_without_feet_has_no_feet_to_report():
+def test_a_skeleton_without_feet_has_no_feet_to_report() -> None:
     report = train_primitive(bending_chains()).report
     assert report.training_feet is None
     assert report.sample_feet is None
 
 
-def test_examples_of_a_set_without_its_reference_can_be_trained_on():
+def test_examples_of_a_set_without_its_reference_can_be_trained_on() -> None:
     aligned = dataclasses.replace(bending_chains(), reference="gone@1")
     assert train_primitive(aligned, QUICK).primitive.dimensions > 0
 
@@ -299,13 +302,13 @@ def test_examples_of_a_set_without_its_reference_can_be_trained_on():
 # -- what is refused ---------------------------------------------------------------------------------------------------
 
 
-def changed(aligned, index, **members):
+def changed(aligned: AlignedSet, index: int, **members: Any) -> AlignedSet:
     clips = list(aligned.clips)
     clips[index] = dataclasses.replace(clips[index], **members)
     return dataclasses.replace(aligned, clips=tuple(clips))
 
 
-def test_examples_that_make_no_model_are_refused_by_name():
+def test_examples_that_make_no_model_are_refused_by_name() -> None:
     aligned = bending_chains(4)
     odd: AlignedClip = aligned.clips[2]
     holes = odd.motion._replace(root_translations=np.full((30, 3), np.nan))
@@ -334,6 +337,6 @@ def test_examples_that_make_no_model_are_refused_by_name():
         ("temporal_weight", np.inf),
     ],
 )
-def test_options_out_of_range_are_refused_by_name(name, value):
+def test_options_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValidationError, match=name):
         ModelOptions(**{name: value})

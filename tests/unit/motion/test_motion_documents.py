@@ -1,6 +1,8 @@
 """Skeletons, mappings and clips survive the way through documents and their wire forms."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,16 +10,19 @@ import pytest
 from marey_motion import documents
 from marey_motion.errors import ClipError, MappingError, SkeletonError
 from marey_motion.rigs import guess_axes, map_joints
-from marey_motion.skeleton import same_hierarchy
+from marey_motion.skeleton import Skeleton, same_hierarchy
 from marey_schemas.documents import clips, skeletons
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.encoding import codecs
 
 STORED = RevisionRef(item="skeleton-1", revision=3)
 
 
 @pytest.mark.parametrize("media_type", ["application/json", "application/msgpack", "application/bson"])
-def test_a_clip_comes_back_to_the_bit_in_every_media_type(body, tumbling, media_type):
+def test_a_clip_comes_back_to_the_bit_in_every_media_type(
+    body: Skeleton, tumbling: Callable[..., Any], media_type: str
+) -> None:
     clip = tumbling(body, translated=(3, 9))
     sent = codecs.encode_tree(documents.clip_to_document(clip, STORED).model_dump(by_alias=True), media_type)
     document = clips.MotionDocument.model_validate(codecs.decode_tree(sent, media_type))
@@ -30,12 +35,12 @@ def test_a_clip_comes_back_to_the_bit_in_every_media_type(body, tumbling, media_
 
 
 @pytest.mark.parametrize("stop", [6, 9])
-def test_a_slice_of_a_clip_is_a_document_too(body, tumbling, stop):
+def test_a_slice_of_a_clip_is_a_document_too(body: Skeleton, tumbling: Callable[..., Any], stop: int) -> None:
     part = tumbling(body).sliced(5, stop)
     assert documents.clip_to_document(part, STORED).poses.shape == part.poses.shape
 
 
-def test_a_skeleton_comes_back_exactly(body):
+def test_a_skeleton_comes_back_exactly(body: Skeleton) -> None:
     skeleton = replace(body, display_names=("Hips", *["again"] * 21))
     tree = documents.skeleton_to_document(skeleton).model_dump(by_alias=True, mode="json")
     back = documents.skeleton_from_document(skeletons.SkeletonHierarchy.model_validate(tree))
@@ -44,7 +49,7 @@ def test_a_skeleton_comes_back_exactly(body):
     assert back.display_names == skeleton.display_names
 
 
-def test_a_skeleton_whose_rest_rotation_is_none_is_refused(body):
+def test_a_skeleton_whose_rest_rotation_is_none_is_refused(body: Skeleton) -> None:
     document = documents.skeleton_to_document(body)
     joint = document.joints[4].model_copy(update={"rest_rotation": (0.0, 0.0, 0.0, 0.0)})
     broken = document.model_copy(update={"joints": (*document.joints[:4], joint, *document.joints[5:])})
@@ -54,7 +59,7 @@ def test_a_skeleton_whose_rest_rotation_is_none_is_refused(body):
     assert caught.value.where == "LeftToeBase"
 
 
-def test_rotations_in_another_order_find_their_joints(body, tumbling):
+def test_rotations_in_another_order_find_their_joints(body: Skeleton, tumbling: Callable[..., Any]) -> None:
     clip = tumbling(body, translated=(3, 9))
     document = documents.clip_to_document(clip, STORED)
     order = [0, *range(21, 0, -1)]
@@ -80,7 +85,9 @@ def test_rotations_in_another_order_find_their_joints(body, tumbling):
         (lambda names: (*names[:-1], names[0]), "Head"),
     ],
 )
-def test_a_motion_of_another_skeleton_is_refused(body, tumbling, change, words):
+def test_a_motion_of_another_skeleton_is_refused(
+    body: Skeleton, tumbling: Callable[..., Any], change: Callable[..., Any], words: str
+) -> None:
     document = documents.clip_to_document(tumbling(body), STORED)
     other = document.model_copy(update={"joints": change(document.joints)})
 
@@ -88,7 +95,7 @@ def test_a_motion_of_another_skeleton_is_refused(body, tumbling, change, words):
         documents.clip_from_document(other, body)
 
 
-def test_a_mapping_comes_back_with_its_axes(body):
+def test_a_mapping_comes_back_with_its_axes(body: Skeleton) -> None:
     mapping = map_joints(body)
     axes = guess_axes(body, mapping)
     tree = documents.mapping_to_document(mapping, axes).model_dump(by_alias=True, mode="json")
@@ -101,11 +108,13 @@ def test_a_mapping_comes_back_with_its_axes(body):
         np.testing.assert_allclose(back_axes[name].swing, one.swing, atol=1e-15)
 
 
-def edited(body, joints=None, axes=None):
+def edited(
+    body: Skeleton, joints: dict[str, str] | None = None, axes: dict[str, dict[str, tuple[int, int, int]]] | None = None
+) -> SkeletonMapping:
     return skeletons.SkeletonMapping.model_validate({"joints": joints or {}, "axes": axes or {}})
 
 
-def test_axes_that_a_person_wrote_are_squared_up(body):
+def test_axes_that_a_person_wrote_are_squared_up(body: Skeleton) -> None:
     document = edited(body, axes={"Hips": {"twist": (0, 2, 0), "swing": (3, 3, 0)}})
     _, axes = documents.mapping_from_document(document, body)
 
@@ -124,7 +133,9 @@ def test_axes_that_a_person_wrote_are_squared_up(body):
         (None, {"Hips": {"twist": (0, 1, 0), "swing": (0, 0, 0)}}, "axes.Hips"),
     ],
 )
-def test_an_edited_mapping_that_makes_no_sense_says_where(body, joints, axes, where):
+def test_an_edited_mapping_that_makes_no_sense_says_where(
+    body: Skeleton, joints: dict[str, str] | None, axes: dict[str, dict[str, tuple[int, int, int]]] | None, where: str
+) -> None:
     with pytest.raises(MappingError) as caught:
         documents.mapping_from_document(edited(body, joints, axes), body)
     assert caught.value.where == where

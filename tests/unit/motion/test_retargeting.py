@@ -2,19 +2,22 @@
 
 from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError, UnknownJoint
 from marey_motion.formats import read_motion
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
 from marey_motion.importing.checks import CODES
 from marey_motion.moved_bones import LEAST_TURN_DEG, SHORTEST_BONE_M, follow_moved_bones
-from marey_motion.retargeting import moved_bones, plan_retarget, retarget
+from marey_motion.retargeting import RetargetPlan, moved_bones, plan_retarget, retarget
 from marey_motion.rigs import JointAxes, guess_axes, map_joints
 from marey_motion.rigs.axes import bone_end
 from marey_motion.skeleton import Skeleton
@@ -32,27 +35,27 @@ FOLDERS = ("cmu-amc/16", "bandai-namco-2", "snu-mss", "game-engine")
 class Actor:
     """A skeleton with all that retargeting needs to know of it, and a motion."""
 
-    def __init__(self, clip):
+    def __init__(self, clip: Clip) -> None:
         self.clip, self.skeleton = clip, clip.skeleton
         self.mapping = map_joints(self.skeleton)
         self.axes = guess_axes(self.skeleton, self.mapping, clip)
 
-    def joint(self, standard):
+    def joint(self, standard: str) -> int:
         return self.skeleton.index_of(self.mapping.joints[standard])
 
 
-def plan_between(source, target, **options):
+def plan_between(source: Any, target: Any, **options: Any) -> RetargetPlan:
     return plan_retarget(
         source.skeleton, source.mapping, source.axes, target.skeleton, target.mapping, target.axes, **options
     )
 
 
-def resting(skeleton):
+def resting(skeleton: Skeleton) -> Clip:
     """A clip of one frame at rest."""
     return Clip(skeleton, 60.0, np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))[None])
 
 
-def tumbling(skeleton, frames=200, seed=4):
+def tumbling(skeleton: Skeleton, frames: int = 200, seed: int = 4) -> Clip:
     """Rotations of any kind, half turns among them, that no body makes."""
     generator = np.random.default_rng(seed)
     rotations = quaternions.normalise(generator.normal(size=(frames, skeleton.joint_count, 4)))
@@ -63,20 +66,20 @@ def tumbling(skeleton, frames=200, seed=4):
 
 
 @pytest.fixture(scope="module")
-def studio():
+def studio() -> Actor:
     return Actor(generate_gait(1.3, 0.6, 3.0))
 
 
 @pytest.fixture(scope="module")
-def game():
+def game() -> Actor:
     return Actor(resting(game_skeleton()))
 
 
 @pytest.fixture(scope="module")
-def real(mocap):
+def real(mocap: Path) -> dict[str, Actor]:
     """A take of each of four capture systems, by folder."""
 
-    def take(path, companion=None):
+    def take(path: str, companion: str | None = None) -> Actor:
         asf = (mocap / companion).read_bytes() if companion else None
         return Actor(read_motion((mocap / path).read_bytes(), path.rsplit("/")[-1], companion=asf).clip)
 
@@ -88,23 +91,25 @@ def real(mocap):
     }
 
 
-def degrees_between(a, b):
+def degrees_between(a: AnyFloats, b: AnyFloats) -> AnyFloats:
     """Angles between directions, exact for small ones."""
     a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(float), b.astype(float)))
     return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-def bone_directions(clip, start, end):
+def bone_directions(clip: Clip, start: int, end: int) -> AnyFloats:
     positions = kinematics.global_positions(clip).astype(np.float64)
     return positions[:, end] - positions[:, start]
 
 
-def axis_directions(clip, joint, axis):
+def axis_directions(clip: Clip, joint: int, axis: tuple[float, float, float]) -> AnyFloats:
     rotations = kinematics.global_rotations(clip).astype(np.float64)
     return quaternions.rotate_vectors(rotations[:, joint], axis)
 
 
-def assert_bones_point_alike(source, target, result, plan, tolerance_deg=1e-3):
+def assert_bones_point_alike(
+    source: Actor, target: Actor, result: Clip, plan: RetargetPlan, tolerance_deg: float = 1e-3
+) -> None:
     for start, end in LIMBS:
         expected = bone_directions(source.clip, source.joint(start), source.joint(end))
         found = bone_directions(result, target.joint(start), target.joint(end))
@@ -120,7 +125,7 @@ def assert_bones_point_alike(source, target, result, plan, tolerance_deg=1e-3):
             assert degrees_between(expected, found).max() < tolerance_deg, (pair, axis)
 
 
-def assert_no_flips_of_its_own(source, result, plan):
+def assert_no_flips_of_its_own(source: Actor, result: Clip, plan: RetargetPlan) -> None:
     """Every mapped joint turns between frames as the source's does, and no quaternion changes its sign."""
     before = kinematics.global_rotations(source.clip).astype(np.float64)
     after = kinematics.global_rotations(result).astype(np.float64)
@@ -136,32 +141,32 @@ def assert_no_flips_of_its_own(source, result, plan):
     assert np.sum(result.rotations[1:] * result.rotations[:-1], axis=-1).min() >= 0.0
 
 
-def assert_changes_nothing(plan):
+def assert_changes_nothing(plan: RetargetPlan) -> None:
     assert np.abs(plan.corrections - quaternions.identity(len(plan.corrections))).max() < 1e-12
     assert plan.scale == pytest.approx(1.0, rel=0, abs=1e-12)
 
 
-def assert_pelvis_travels(source, target, clip, result, plan):
+def assert_pelvis_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
     """As far as the source's, times the scale."""
     expected = plan.scale * kinematics.global_positions(clip)[:, source.joint("pelvis")].astype(np.float64)
     found = kinematics.global_positions(result)[:, target.joint("pelvis")].astype(np.float64)
     assert np.abs(found - expected).max() < 1e-6
 
 
-def assert_same_motion(result, expected):
+def assert_same_motion(result: Clip, expected: Clip) -> None:
     angles = quaternions.angle_between(result.rotations.astype(float), expected.rotations.astype(float))
     assert angles.max() < 1e-6
     assert np.abs(result.root_translations - expected.root_translations).max() < 1e-6
 
 
-def after_rest_pose(clip):
+def after_rest_pose(clip: Clip) -> Clip:
     """The clip with the rest pose as a frame before it."""
     return Clip(
         clip.skeleton, clip.frame_rate_hz, np.concatenate((resting(clip.skeleton).poses, clip.poses), dtype=np.float32)
     )
 
 
-def with_lowered_arms(skeleton, angle_deg):
+def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
     """The skeleton with both arms lowered at rest, from reaching out sideways."""
     rest = skeleton.rest_rotations.copy()
     for name, sign in (("LeftArm", -1.0), ("RightArm", 1.0)):
@@ -171,7 +176,7 @@ def with_lowered_arms(skeleton, angle_deg):
     return replace(skeleton, rest_rotations=rest)
 
 
-def algorithm_1(source, target, plan, frame):
+def algorithm_1(source: SimpleNamespace, target: Actor, plan: RetargetPlan, frame: int) -> Floats:
     """Local rotations (K, 4) of one pose as the paper's Algorithm 1 finds them, joint by joint."""
     source_global = kinematics.global_rotations(source.clip).astype(np.float64)[frame]
     target_global = quaternions.identity(target.skeleton.joint_count)
@@ -196,7 +201,7 @@ def algorithm_1(source, target, plan, frame):
     return local
 
 
-def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio, game):
+def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio: Actor, game: Actor) -> None:
     for source, target in ((studio, game), (game, studio)):
         moving = SimpleNamespace(clip=tumbling(source.skeleton), skeleton=source.skeleton, axes=source.axes)
         plan = plan_between(source, target)
@@ -207,7 +212,7 @@ def test_the_precomputed_corrections_equal_algorithm_1_done_pose_by_pose(studio,
             assert quaternions.angle_between(result.rotations[frame].astype(float), expected).max() < 1e-5
 
 
-def test_the_same_skeleton_gives_the_same_motion(studio, game):
+def test_the_same_skeleton_gives_the_same_motion(studio: Actor, game: Actor) -> None:
     for actor, clip in ((studio, studio.clip), (game, tumbling(game.skeleton))):
         plan = plan_between(actor, actor)
         assert_changes_nothing(plan)
@@ -219,7 +224,7 @@ def test_the_same_skeleton_gives_the_same_motion(studio, game):
         assert_pelvis_travels(actor, actor, clip, result, plan)
 
 
-def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game):
+def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game: Actor) -> None:
     smaller = Actor(resting(replace(game.skeleton, offsets=0.8 * game.skeleton.offsets)))
     plan = plan_between(game, smaller)
 
@@ -230,7 +235,7 @@ def test_every_joint_of_a_copy_is_carried_along_mapped_or_not(game):
     assert quaternions.angle_between(result.rotations.astype(float), clip.rotations.astype(float)).max() < 1e-6
 
 
-def test_bones_point_where_the_source_points_them_on_another_rig(studio, game):
+def test_bones_point_where_the_source_points_them_on_another_rig(studio: Actor, game: Actor) -> None:
     plan = plan_between(studio, game)
     result = retarget(studio.clip, plan)
 
@@ -240,7 +245,7 @@ def test_bones_point_where_the_source_points_them_on_another_rig(studio, game):
     assert result.frame_rate_hz == studio.clip.frame_rate_hz
 
 
-def test_there_and_back_returns_the_mapped_joints(studio, game):
+def test_there_and_back_returns_the_mapped_joints(studio: Actor, game: Actor) -> None:
     there = retarget(studio.clip, plan_between(studio, game))
     back = retarget(there, plan_between(game, studio))
 
@@ -250,7 +255,7 @@ def test_there_and_back_returns_the_mapped_joints(studio, game):
 
 
 @pytest.mark.parametrize("stature_m", [1.1, 1.5, 2.1])
-def test_scaled_copies_keep_the_height_of_their_feet_in_proportion(studio, stature_m):
+def test_scaled_copies_keep_the_height_of_their_feet_in_proportion(studio: Actor, stature_m: float) -> None:
     copy = Actor(resting(studio_skeleton(stature_m)))
     plan = plan_between(studio, copy)
     result = retarget(studio.clip, plan)
@@ -260,7 +265,7 @@ def test_scaled_copies_keep_the_height_of_their_feet_in_proportion(studio, statu
     assert np.abs(kinematics.global_positions(result, end_sites=True) - expected).max() < 1e-5
 
 
-def test_the_feet_of_another_body_stay_on_the_floor(studio, game):
+def test_the_feet_of_another_body_stay_on_the_floor(studio: Actor, game: Actor) -> None:
     result = retarget(studio.clip, plan_between(studio, game))
 
     toes = [game.joint(f"{side}_toe") for side in SIDES]
@@ -268,7 +273,7 @@ def test_the_feet_of_another_body_stay_on_the_floor(studio, game):
     assert 0.01 < heights.min() < 0.03
 
 
-def test_an_explicit_scale_is_used_for_the_travel(studio, game):
+def test_an_explicit_scale_is_used_for_the_travel(studio: Actor, game: Actor) -> None:
     plan = plan_between(studio, game, scale=2.0)
     result = retarget(studio.clip, plan)
 
@@ -276,7 +281,7 @@ def test_an_explicit_scale_is_used_for_the_travel(studio, game):
     assert np.abs(pelvis - 2.0 * studio.clip.root_translations).max() < 1e-5
 
 
-def test_unmapped_joints_rest_and_the_plan_names_them(studio, game):
+def test_unmapped_joints_rest_and_the_plan_names_them(studio: Actor, game: Actor) -> None:
     plan = plan_between(studio, game)
     result = retarget(studio.clip, plan)
 
@@ -290,7 +295,7 @@ def test_unmapped_joints_rest_and_the_plan_names_them(studio, game):
         assert angles.max() < 1e-6
 
 
-def test_each_frame_depends_on_itself_alone_and_no_frame_is_a_reference_pose(studio, game):
+def test_each_frame_depends_on_itself_alone_and_no_frame_is_a_reference_pose(studio: Actor, game: Actor) -> None:
     plan = plan_between(studio, game)
     whole = retarget(studio.clip, plan)
     part = retarget(studio.clip.sliced(70, 120), plan)
@@ -298,7 +303,7 @@ def test_each_frame_depends_on_itself_alone_and_no_frame_is_a_reference_pose(stu
     assert_same_motion(part, whole.sliced(70, 120))
 
 
-def test_a_rest_pose_before_the_clip_changes_no_frame_after_it(studio, game):
+def test_a_rest_pose_before_the_clip_changes_no_frame_after_it(studio: Actor, game: Actor) -> None:
     longer = Actor(after_rest_pose(studio.clip))
     assert_same_motion(
         retarget(longer.clip, plan_between(longer, game)).sliced(1, longer.clip.frame_count),
@@ -307,7 +312,7 @@ def test_a_rest_pose_before_the_clip_changes_no_frame_after_it(studio, game):
 
 
 @pytest.mark.parametrize("angle_deg", [20.0, 45.0, 70.0])
-def test_a_rest_pose_with_lower_arms_moves_another_body_alike(studio, game, angle_deg):
+def test_a_rest_pose_with_lower_arms_moves_another_body_alike(studio: Actor, game: Actor, angle_deg: float) -> None:
     lowered = Actor(replace(studio.clip, skeleton=with_lowered_arms(studio.skeleton, angle_deg)))
     expected, found = (retarget(actor.clip, plan_between(actor, game)) for actor in (studio, lowered))
 
@@ -315,7 +320,7 @@ def test_a_rest_pose_with_lower_arms_moves_another_body_alike(studio, game, angl
     assert np.degrees(quaternions.angle_between(*turns).max()) < 1.5
 
 
-def test_signs_stay_continuous_when_the_source_flips_its_own(studio, game):
+def test_signs_stay_continuous_when_the_source_flips_its_own(studio: Actor, game: Actor) -> None:
     poses = studio.clip.poses.copy()
     poses[1::2, 3:] *= -1.0
     result = retarget(replace(studio.clip, poses=poses), plan_between(studio, game))
@@ -323,12 +328,12 @@ def test_signs_stay_continuous_when_the_source_flips_its_own(studio, game):
     assert np.sum(result.rotations[1:] * result.rotations[:-1], axis=-1).min() > 0.0
 
 
-def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game, studio):
+def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game: Actor, studio: Actor) -> None:
     clip = tumbling(game.skeleton, 5)
     pelvis, knee = game.joint("pelvis"), game.joint("left_knee")
     shift = np.zeros((5, 2, 3))
     shift[:, 0], shift[:, 1] = (0.3, -0.2, 0.5), 1.5 * game.skeleton.offsets[knee]
-    stretched = replace(clip, translations=shift, translated_joints=(pelvis, knee))
+    stretched = replace(clip, translations=shift.astype(np.float32), translated_joints=(pelvis, knee))
     plan = plan_between(game, studio)
     result, plain = retarget(stretched, plan), retarget(clip, plan)
 
@@ -338,17 +343,17 @@ def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game, st
     assert np.abs(result.root_translations - expected).max() < 1e-5
 
 
-def with_moved_joints(actor, *standards, by_m=0.08):
+def with_moved_joints(actor: Actor, *standards: Any, by_m: float = 0.08) -> Clip:
     """The actor's clip with joints that move against their parents, each its own way."""
     joints = sorted(actor.joint(standard) for standard in standards)
     time = np.arange(actor.clip.frame_count)[:, None, None] / 20.0
     ways = by_m * np.sin(time + np.arange(3 * len(joints)).reshape(1, -1, 3))
     moved = actor.skeleton.offsets[joints] + ways
-    return replace(actor.clip, translations=moved, translated_joints=tuple(joints))
+    return replace(actor.clip, translations=moved.astype(np.float32), translated_joints=tuple(joints))
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_bones_point_where_translations_of_the_source_point_them(studio, game, side):
+def test_bones_point_where_translations_of_the_source_point_them(studio: Actor, game: Actor, side: str) -> None:
     clip = with_moved_joints(studio, *(f"{side}_{joint}" for joint in ("elbow", "wrist", "knee", "ankle")))
     result = retarget(clip, plan_between(studio, game))
 
@@ -360,7 +365,7 @@ def test_bones_point_where_translations_of_the_source_point_them(studio, game, s
         assert degrees_between(source, found).max() < 0.01
 
 
-def test_bones_that_translations_moved_are_told_with_their_joints(studio, game):
+def test_bones_that_translations_moved_are_told_with_their_joints(studio: Actor, game: Actor) -> None:
     clip, plan = with_moved_joints(studio, "left_elbow"), plan_between(studio, game)
     warning = moved_bones(clip, plan).warning
 
@@ -371,7 +376,7 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio, game):
     assert moved_bones(studio.clip, plan).warning is None
 
 
-def bones_followed_by_numpy(clip, joints):
+def bones_followed_by_numpy(clip: Any, joints: Any) -> Any:
     """Rotations (F, 4·J) and largest turns in degrees, by the formula in numpy, bone by bone."""
     still = replace(clip, translations=None, translated_joints=())
     rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))
@@ -392,7 +397,7 @@ def bones_followed_by_numpy(clip, joints):
     return local.reshape(clip.frame_count, -1).astype(np.float32), largest
 
 
-def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio):
+def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio: Actor) -> None:
     clip = with_moved_joints(studio, "left_elbow", "right_wrist", "left_knee", "right_ankle", "left_ankle")
     elbow, wrist = (clip.translated_joints.index(studio.joint(name)) for name in ("left_elbow", "right_wrist"))
     translations = clip.translations.copy()
@@ -410,7 +415,7 @@ def test_bones_are_turned_to_the_bit_as_numpy_turns_them(studio):
     assert found.rotations.tobytes() == rotations.tobytes()
 
 
-def test_a_bone_beyond_the_range_of_single_precision_does_not_turn(studio):
+def test_a_bone_beyond_the_range_of_single_precision_does_not_turn(studio: Actor) -> None:
     clip = with_moved_joints(studio, "left_knee", "left_ankle", "left_toe")
     translations = clip.translations.copy()
     translations[5, :2] = 3e38  # ankle and toe are infinitely far away, so that the bone between them has no direction
@@ -426,7 +431,7 @@ def test_a_bone_beyond_the_range_of_single_precision_does_not_turn(studio):
     assert found.rotations.tobytes() == rotations.tobytes()
 
 
-def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio):
+def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio: Actor) -> None:
     clip, plan = with_moved_joints(studio, "left_elbow", "left_knee"), plan_between(studio, studio)
     result = retarget(clip, plan)
 
@@ -436,21 +441,22 @@ def test_a_clip_keeps_the_translations_of_its_joints_on_its_own_skeleton(studio)
     assert quaternions.angle_between(result.rotations, clip.rotations).max() < 1e-6
 
 
-def test_a_joint_that_moves_onto_its_parent_leaves_the_bone_as_its_rotation_has_it(studio, game):
+def test_a_joint_that_moves_onto_its_parent_leaves_the_bone_as_its_rotation_has_it(studio: Actor, game: Actor) -> None:
     elbow = studio.joint("left_elbow")
-    clip = replace(studio.clip, translations=np.zeros((studio.clip.frame_count, 1, 3)), translated_joints=(elbow,))
+    still = np.zeros((studio.clip.frame_count, 1, 3), dtype=np.float32)
+    clip = replace(studio.clip, translations=still, translated_joints=(elbow,))
     plan = plan_between(studio, game)
 
     assert np.array_equal(retarget(clip, plan).rotations, retarget(studio.clip, plan).rotations)
 
 
-def test_the_same_clip_gives_the_same_bytes(studio, game):
+def test_the_same_clip_gives_the_same_bytes(studio: Actor, game: Actor) -> None:
     first, second = (retarget(studio.clip, plan_between(studio, game)) for _ in range(2))
 
     assert first.poses.tobytes() == second.poses.tobytes()
 
 
-def test_too_small_a_mapping_is_refused_with_what_is_missing(studio, game):
+def test_too_small_a_mapping_is_refused_with_what_is_missing(studio: Actor, game: Actor) -> None:
     few = {name: game.mapping.joints[name] for name in ("root", "pelvis", "left_hip", "right_hip", "head")}
 
     with pytest.raises(MappingError) as error:
@@ -467,7 +473,7 @@ def test_too_small_a_mapping_is_refused_with_what_is_missing(studio, game):
     assert "standard name: joint name" in str(error.value)
 
 
-def test_a_mapping_without_a_pelvis_is_refused(studio, game):
+def test_a_mapping_without_a_pelvis_is_refused(studio: Actor, game: Actor) -> None:
     joints = {name: joint for name, joint in studio.mapping.joints.items() if name != "pelvis"}
 
     with pytest.raises(MappingError, match="source skeleton's mapping has no pelvis"):
@@ -477,7 +483,7 @@ def test_a_mapping_without_a_pelvis_is_refused(studio, game):
         )
 
 
-def test_a_mapping_to_a_joint_that_is_not_there_is_refused_by_name(studio, game):
+def test_a_mapping_to_a_joint_that_is_not_there_is_refused_by_name(studio: Actor, game: Actor) -> None:
     joints = {**studio.mapping.joints, "head": "Haed"}
 
     with pytest.raises(UnknownJoint, match="did you mean Head"):
@@ -487,7 +493,7 @@ def test_a_mapping_to_a_joint_that_is_not_there_is_refused_by_name(studio, game)
         )
 
 
-def test_bodies_without_legs_need_an_explicit_scale(studio, game):
+def test_bodies_without_legs_need_an_explicit_scale(studio: Actor, game: Actor) -> None:
     joints = {name: joint for name, joint in studio.mapping.joints.items() if "knee" not in name}
     crippled = SimpleNamespace(
         skeleton=studio.skeleton, mapping=replace(studio.mapping, joints=joints), axes=studio.axes
@@ -498,7 +504,7 @@ def test_bodies_without_legs_need_an_explicit_scale(studio, game):
     assert plan_between(crippled, game, scale=1.5).scale == 1.5
 
 
-def test_legs_without_length_need_an_explicit_scale(studio, game):
+def test_legs_without_length_need_an_explicit_scale(studio: Actor, game: Actor) -> None:
     offsets = studio.skeleton.offsets.copy()
     for side in SIDES:
         offsets[[studio.joint(f"{side}_{joint}") for joint in ("hip", "knee", "ankle", "toe")]] = 0.0
@@ -511,12 +517,12 @@ def test_legs_without_length_need_an_explicit_scale(studio, game):
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_scale_must_be_positive(studio, game, scale):
+def test_a_scale_must_be_positive(studio: Actor, game: Actor, scale: float) -> None:
     with pytest.raises(MappingError, match="positive"):
         plan_between(studio, game, scale=scale)
 
 
-def test_missing_or_parallel_axes_are_refused_by_the_joint_they_are_missing_for(studio, game):
+def test_missing_or_parallel_axes_are_refused_by_the_joint_they_are_missing_for(studio: Actor, game: Actor) -> None:
     without = {name: axes for name, axes in game.axes.items() if name != "calf_l"}
     parallel = {**game.axes, "calf_l": JointAxes((1.0, 0.0, 0.0), (2.0, 0.0, 0.0))}
 
@@ -525,12 +531,12 @@ def test_missing_or_parallel_axes_are_refused_by_the_joint_they_are_missing_for(
             plan_between(studio, SimpleNamespace(skeleton=game.skeleton, mapping=game.mapping, axes=axes))
 
 
-def test_a_clip_of_another_skeleton_than_planned_is_refused(studio, game):
+def test_a_clip_of_another_skeleton_than_planned_is_refused(studio: Actor, game: Actor) -> None:
     with pytest.raises(ClipError, match="another skeleton"):
         retarget(studio.clip, plan_between(game, studio))
 
 
-def test_skeletons_of_one_joint_are_refused(studio):
+def test_skeletons_of_one_joint_are_refused(studio: Actor) -> None:
     stick = Skeleton(("stick",), np.array([-1]), np.zeros((1, 3)), np.array([(1.0, 0.0, 0.0, 0.0)]))
 
     with pytest.raises(MappingError, match="no pelvis"):
@@ -538,7 +544,7 @@ def test_skeletons_of_one_joint_are_refused(studio):
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_real_motion_on_its_own_skeleton_stays_as_it_is(real, folder):
+def test_real_motion_on_its_own_skeleton_stays_as_it_is(real: dict[str, Actor], folder: str) -> None:
     actor = real[folder]
     plan = plan_between(actor, actor)
     assert_changes_nothing(plan)
@@ -550,7 +556,9 @@ def test_real_motion_on_its_own_skeleton_stays_as_it_is(real, folder):
 
 
 @pytest.mark.parametrize("folder", ["cmu-amc/16", "snu-mss"])
-def test_a_rest_pose_that_stands_changes_no_frame_of_a_real_clip_after_it(real, game, folder):
+def test_a_rest_pose_that_stands_changes_no_frame_of_a_real_clip_after_it(
+    real: dict[str, Actor], game: Actor, folder: str
+) -> None:
     longer = Actor(after_rest_pose(real[folder].clip))
     assert_same_motion(
         retarget(longer.clip, plan_between(longer, game)).sliced(1, longer.clip.frame_count),
@@ -559,7 +567,9 @@ def test_a_rest_pose_that_stands_changes_no_frame_of_a_real_clip_after_it(real, 
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
-def test_real_motion_points_all_bones_alike_on_another_rig(real, from_folder, to_folder):
+def test_real_motion_points_all_bones_alike_on_another_rig(
+    real: dict[str, Actor], from_folder: str, to_folder: str
+) -> None:
     source, target = real[from_folder], real[to_folder]
     plan = plan_between(source, target)
     result = retarget(source.clip, plan)
@@ -572,7 +582,7 @@ def test_real_motion_points_all_bones_alike_on_another_rig(real, from_folder, to
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
-def test_real_feet_keep_their_height_over_the_floor(real, from_folder, to_folder):
+def test_real_feet_keep_their_height_over_the_floor(real: dict[str, Actor], from_folder: str, to_folder: str) -> None:
     source, target = real[from_folder], real[to_folder]
     plan = plan_between(source, target)
     result = retarget(source.clip, plan)
@@ -584,7 +594,7 @@ def test_real_feet_keep_their_height_over_the_floor(real, from_folder, to_folder
     assert lowest[1] == pytest.approx(plan.scale * lowest[0], abs=0.03)
 
 
-def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mocap, studio):
+def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mocap: Path, studio: Actor) -> None:
     path = mocap / "rigs/game-engine/vis_example.bvh"  # its thighs are drawn above the pelvis at rest
     folded = Actor(read_motion(path.read_bytes(), path.name).clip)
     legs = [
@@ -596,7 +606,9 @@ def test_the_hip_height_of_a_rig_that_lies_folded_at_rest_is_that_of_its_legs(mo
 
 
 @pytest.mark.parametrize(("from_folder", "to_folder"), list(permutations(FOLDERS, 2)))
-def test_real_motion_there_and_back_returns_the_mapped_joints(real, from_folder, to_folder):
+def test_real_motion_there_and_back_returns_the_mapped_joints(
+    real: dict[str, Actor], from_folder: str, to_folder: str
+) -> None:
     source, target = real[from_folder], real[to_folder]
     plan = plan_between(source, target)
     back = retarget(retarget(source.clip, plan), plan_between(target, source))

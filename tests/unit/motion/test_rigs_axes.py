@@ -1,27 +1,34 @@
 """Twist and swing axes mean the same anatomically, whatever a rig's frames, rest pose and proportions."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from marey_motion import kinematics, quaternions
+from marey_motion.arrays import AnyFloats, Floats
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, MappingError
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
+from marey_motion.rigs.axes import JointAxes
 from marey_motion.skeleton import EndSite, Skeleton
 
 X, Y, Z = np.eye(3)
 PARTS = ("trunk", "left arm", "left leg", "right arm", "right leg")
 
 
-def at_rest(skeleton, axes, name):
+def at_rest(skeleton: Skeleton, axes: dict[str, JointAxes], name: str) -> tuple[AnyFloats, AnyFloats]:
     """Twist and swing of a joint in the world of the rest pose."""
     rotation = skeleton.rest_global_rotations[skeleton.index_of(name)]
-    return tuple(quaternions.rotate_vectors(rotation, axis) for axis in (axes[name].twist, axes[name].swing))
+    twist, swing = (quaternions.rotate_vectors(rotation, axis) for axis in (axes[name].twist, axes[name].swing))
+    return twist, swing
 
 
-def with_arms(body, direction_left):
+def with_arms(body: Skeleton, direction_left: tuple[float, float, float]) -> Skeleton:
     """The body with straight arms in another direction; the right arm mirrors the left one."""
     offsets = body.offsets.copy()
     for name in ("LeftForeArm", "LeftHand"):
@@ -50,7 +57,7 @@ def with_arms(body, direction_left):
         ("RightHand", -X, -Y),
     ],
 )
-def test_in_a_t_pose_the_axes_are_those_of_a_drawing(body, joint, twist, swing):
+def test_in_a_t_pose_the_axes_are_those_of_a_drawing(body: Skeleton, joint: str, twist: Floats, swing: Floats) -> None:
     axes = guess_axes(body, map_joints(body))
 
     np.testing.assert_allclose(axes[joint].twist, twist, atol=1e-12)
@@ -58,7 +65,7 @@ def test_in_a_t_pose_the_axes_are_those_of_a_drawing(body, joint, twist, swing):
     assert rest_pose_doubts(body, map_joints(body)) == ()
 
 
-def test_every_mapped_joint_has_unit_axes_at_a_right_angle(body):
+def test_every_mapped_joint_has_unit_axes_at_a_right_angle(body: Skeleton) -> None:
     mapping = map_joints(body)
     axes = guess_axes(body, mapping)
 
@@ -70,7 +77,7 @@ def test_every_mapped_joint_has_unit_axes_at_a_right_angle(body):
 
 
 @pytest.mark.parametrize("lowered", np.radians([0, 20, 45, 70, 90]))
-def test_an_arm_lowered_sideways_takes_its_swing_axis_along(body, lowered):
+def test_an_arm_lowered_sideways_takes_its_swing_axis_along(body: Skeleton, lowered: float) -> None:
     posed = with_arms(body, (np.cos(lowered), -np.sin(lowered), 0.0))
     axes = guess_axes(posed, map_joints(posed))
 
@@ -78,7 +85,7 @@ def test_an_arm_lowered_sideways_takes_its_swing_axis_along(body, lowered):
     np.testing.assert_allclose(axes["RightForeArm"].swing, [np.sin(lowered), -np.cos(lowered), 0], atol=1e-12)
 
 
-def test_arms_stretched_forward_hinge_about_the_left_as_hanging_ones_do(body):
+def test_arms_stretched_forward_hinge_about_the_left_as_hanging_ones_do(body: Skeleton) -> None:
     posed = with_arms(body, (0.0, 0.0, 1.0))
     axes = guess_axes(posed, map_joints(posed))
 
@@ -86,7 +93,7 @@ def test_arms_stretched_forward_hinge_about_the_left_as_hanging_ones_do(body):
     np.testing.assert_allclose(axes["RightArm"].swing, X, atol=1e-12)
 
 
-def test_a_hand_with_fingers_swings_across_its_palm(body):
+def test_a_hand_with_fingers_swings_across_its_palm(body: Skeleton) -> None:
     hand = body.index_of("LeftHand")
     skeleton = Skeleton(
         (*body.joint_names, "LeftHandIndex1", "LeftHandPinky1"),
@@ -101,7 +108,7 @@ def test_a_hand_with_fingers_swings_across_its_palm(body):
     np.testing.assert_allclose(axes["LeftForeArm"].swing, Y, atol=1e-12)
 
 
-def reframed(clip, seed):
+def reframed(clip: Clip, seed: int) -> tuple[Clip, AnyFloats]:
     """The same motion on a rig with other local frames, and with all its bones on odd lines at rest."""
     body = clip.skeleton
     random = np.random.default_rng(seed)
@@ -109,10 +116,8 @@ def reframed(clip, seed):
     above = frames[body.parents[1:]]
     offsets = body.offsets.copy()
     offsets[1:] = quaternions.rotate_vectors(quaternions.conjugate(above), offsets[1:])
-    sites = tuple(
-        replace(site, offset=quaternions.rotate_vectors(quaternions.conjugate(frames[site.joint]), site.offset))
-        for site in body.end_sites
-    )
+    turned = [quaternions.rotate_vectors(quaternions.conjugate(frames[at.joint]), at.offset) for at in body.end_sites]
+    sites = tuple(replace(at, offset=one.astype(np.float64)) for at, one in zip(body.end_sites, turned, strict=True))
     skeleton = replace(body, offsets=offsets, end_sites=sites)
     rotations = quaternions.multiply(kinematics.global_rotations(clip).astype(np.float64), frames)
     local = kinematics.as_local_rotations(skeleton, rotations)
@@ -121,14 +126,14 @@ def reframed(clip, seed):
 
 
 @pytest.fixture
-def exercising(body):
+def exercising(body: Skeleton) -> Clip:
     """Knees and elbows bend and the body turns, from a T-pose with the arms let down."""
     frames = 50
     phase = np.linspace(0, 4 * np.pi, frames)
     rotations = quaternions.identity(frames, body.joint_count)
     bend = 0.6 + 0.5 * np.sin(phase)
 
-    def turn(joint, axis, angle):
+    def turn(joint: str, axis: Floats, angle: Floats) -> None:
         at = body.index_of(joint)
         rotations[:, at] = quaternions.multiply(
             rotations[:, at], quaternions.from_axis_angle(np.tile(axis, (frames, 1)), angle)
@@ -145,11 +150,13 @@ def exercising(body):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_axes_do_not_depend_on_the_frames_that_a_rig_gives_its_joints(body, exercising, seed):
+def test_axes_do_not_depend_on_the_frames_that_a_rig_gives_its_joints(
+    body: Skeleton, exercising: Clip, seed: int
+) -> None:
     clip, frames = reframed(exercising, seed)
     rotated = replace(
         clip.skeleton,
-        rest_rotations=kinematics.as_local_rotations(clip.skeleton, frames),
+        rest_rotations=kinematics.as_local_rotations(clip.skeleton, frames).astype(np.float64),
         offsets=np.concatenate((body.offsets[:1], clip.skeleton.offsets[1:])),
     )
     np.testing.assert_allclose(rotated.rest_global_positions, body.rest_global_positions, atol=1e-12)
@@ -161,7 +168,9 @@ def test_axes_do_not_depend_on_the_frames_that_a_rig_gives_its_joints(body, exer
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_where_the_rest_pose_is_no_body_a_motion_tells_the_same_axes(body, exercising, seed):
+def test_where_the_rest_pose_is_no_body_a_motion_tells_the_same_axes(
+    body: Skeleton, exercising: Clip, seed: int
+) -> None:
     clip, frames = reframed(exercising, seed)
     mapping = map_joints(clip.skeleton)
     assert rest_pose_doubts(clip.skeleton, mapping) == PARTS
@@ -174,7 +183,7 @@ def test_where_the_rest_pose_is_no_body_a_motion_tells_the_same_axes(body, exerc
             assert angle < 12.0, (name, kind, angle)
 
 
-def test_only_the_part_that_rests_oddly_is_doubted(body):
+def test_only_the_part_that_rests_oddly_is_doubted(body: Skeleton) -> None:
     offsets = body.offsets.copy()
     for name in ("LeftForeArm", "LeftHand"):
         offsets[body.index_of(name)] = [0.0, 0.3, 0.0]
@@ -183,14 +192,14 @@ def test_only_the_part_that_rests_oddly_is_doubted(body):
     assert rest_pose_doubts(raised, map_joints(raised)) == ("left arm",)
 
 
-def test_a_tip_that_an_exporter_misplaced_is_not_the_end_of_a_hand(body):
+def test_a_tip_that_an_exporter_misplaced_is_not_the_end_of_a_hand(body: Skeleton) -> None:
     sites = tuple(replace(site, offset=np.array([9.0, 9.0, 9.0])) for site in body.end_sites if site.joint == 15)
     odd = replace(body, end_sites=sites)
 
     np.testing.assert_allclose(guess_axes(odd, map_joints(odd))["LeftHand"].twist, X, atol=1e-12)
 
 
-def test_a_toe_joint_straight_below_the_ankle_leaves_the_foot_pointing_forward(body):
+def test_a_toe_joint_straight_below_the_ankle_leaves_the_foot_pointing_forward(body: Skeleton) -> None:
     offsets = body.offsets.copy()
     sites = []
     for side in ("Left", "Right"):
@@ -207,14 +216,14 @@ def test_a_toe_joint_straight_below_the_ankle_leaves_the_foot_pointing_forward(b
     np.testing.assert_allclose(axes["LeftToeBase"].twist, Z, atol=1e-12)
 
 
-def test_axes_need_two_sides(body):
+def test_axes_need_two_sides(body: Skeleton) -> None:
     mapping = JointMapping(None, {"pelvis": "Hips", "head": "Head"}, 0.1, "manual")
     with pytest.raises(MappingError, match="both"):
         guess_axes(body, mapping)
 
 
 @pytest.mark.parametrize(("joint", "parent"), [("LeftForeArm", "LeftArm"), ("LeftHand", "LeftForeArm")])
-def test_an_arm_without_length_is_refused_by_its_joints_and_what_to_do(body, joint, parent):
+def test_an_arm_without_length_is_refused_by_its_joints_and_what_to_do(body: Skeleton, joint: str, parent: str) -> None:
     offsets = body.offsets.copy()
     offsets[body.index_of(joint)] = 0.0
     told = rf"{parent} \(.*{joint} \(.*at the same position.*map left_\w+ to a joint further on"
@@ -222,7 +231,7 @@ def test_an_arm_without_length_is_refused_by_its_joints_and_what_to_do(body, joi
         guess_axes(replace(body, offsets=offsets), map_joints(body))
 
 
-def test_legs_alone_have_axes_too(body):
+def test_legs_alone_have_axes_too(body: Skeleton) -> None:
     legs = Skeleton(body.joint_names[:9], body.parents[:9], body.offsets[:9], body.rest_rotations[:9])
     axes = guess_axes(legs, map_joints(legs))
 
@@ -230,13 +239,13 @@ def test_legs_alone_have_axes_too(body):
     np.testing.assert_allclose(axes["Hips"].twist, Y, atol=1e-12)
 
 
-def test_hips_alone_do_not_tell_where_up_is(body):
+def test_hips_alone_do_not_tell_where_up_is(body: Skeleton) -> None:
     mapping = JointMapping(None, {"left_hip": "LeftUpLeg", "right_hip": "RightUpLeg"}, 0.1, "manual")
     with pytest.raises(MappingError, match="above or below"):
         guess_axes(body, mapping)
 
 
-def test_a_motion_of_another_skeleton_tells_nothing(body, tumbling):
+def test_a_motion_of_another_skeleton_tells_nothing(body: Skeleton, tumbling: Callable[..., Any]) -> None:
     other = replace(body, offsets=body.offsets * 2)
     with pytest.raises(ClipError, match="another skeleton"):
         guess_axes(body, map_joints(body), tumbling(other))
@@ -254,7 +263,7 @@ WALKS = (
 
 
 @pytest.mark.parametrize("file", WALKS)
-def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(mocap, file):
+def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(mocap: Path, file: str) -> None:
     from marey_motion.formats import read_motion
 
     path = mocap / file
@@ -266,7 +275,7 @@ def test_in_a_real_walk_bones_point_down_and_hinges_point_left_on_every_rig(moca
     left = positions[:, hips[0]] - positions[:, hips[1]]
     left /= np.linalg.norm(left, axis=1, keepdims=True)
 
-    def mean_along(joint, kind, direction):
+    def mean_along(joint: str, kind: str, direction: NDArray[Any]) -> float:
         turned = quaternions.rotate_vectors(
             rotations[:, skeleton.index_of(mapping.joints[joint])], getattr(axes[mapping.joints[joint]], kind)
         )

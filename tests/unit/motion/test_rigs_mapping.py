@@ -1,8 +1,11 @@
 """Known rigs are recognised by their names, unknown ones by their build, and animals are not passed off as people."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from time import process_time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ import pytest
 from marey_motion import quaternions
 from marey_motion.errors import MappingError
 from marey_motion.rigs import ESSENTIAL_JOINTS, STANDARD_JOINTS, map_joints, mirrored, require_trust, symmetric_joints
-from marey_motion.rigs.known import KNOWN_RIGS
+from marey_motion.rigs.known import KNOWN_RIGS, KnownRig
 from marey_motion.rigs.plain_names import readings
 from marey_motion.skeleton import Skeleton
 
@@ -89,10 +92,10 @@ RIGS = {
 }
 
 
-def renamed(body, rig):
+def renamed(body: Skeleton, rig: tuple[str, str, tuple[str, str]]) -> tuple[Skeleton, dict[str, str]]:
     """The body under another rig's names, with the names expected of each standard joint."""
-    centre, limbs, (left, right) = rig
-    limbs = limbs.split()
+    centre, of_left, (left, right) = rig
+    limbs = of_left.split()
     names = dict(zip(("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"), centre.split(), strict=True))
     expected = dict(zip(("pelvis", "spine", "spine_1", "spine_2", "neck", "head"), centre.split(), strict=True))
     for side, word in (("Left", left), ("Right", right)):
@@ -104,7 +107,7 @@ def renamed(body, rig):
 
 
 @pytest.mark.parametrize("rig", RIGS)
-def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body, rig):
+def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body: Skeleton, rig: str) -> None:
     skeleton, expected = renamed(body, RIGS[rig])
     mapping = map_joints(skeleton)
 
@@ -112,7 +115,7 @@ def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body, 
     assert dict(mapping.joints) == {"root": expected["pelvis"]} | expected
 
 
-def with_a_sword(skeleton, hand):
+def with_a_sword(skeleton: Skeleton, hand: int) -> Skeleton:
     """The skeleton with two joints more that hang from a hand and reach farther than its fingers."""
     return replace(
         skeleton,
@@ -154,7 +157,7 @@ EVERYDAY = {
 
 
 @pytest.mark.parametrize("style", EVERYDAY)
-def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body, style):
+def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body: Skeleton, style: str) -> None:
     skeleton, expected = renamed(body, EVERYDAY[style])
     holding = with_a_sword(skeleton, skeleton.index_of(expected["right_wrist"]))
     for rig in (skeleton, holding):
@@ -164,7 +167,7 @@ def test_everyday_words_name_a_body_of_no_known_rig_whatever_one_hand_holds(body
         assert "everyday words" in " ".join(mapping.notes)
 
 
-def test_a_build_that_shows_more_than_everyday_words_counts(body):
+def test_a_build_that_shows_more_than_everyday_words_counts(body: Skeleton) -> None:
     skeleton, _ = renamed(body, EVERYDAY["snake"])
     names = tuple(name.replace("upper_leg", "leg_top") for name in skeleton.joint_names)
     mapping = map_joints(replace(skeleton, joint_names=names, display_names=names))
@@ -173,7 +176,7 @@ def test_a_build_that_shows_more_than_everyday_words_counts(body):
     assert mapping.joints["left_hip"] == "left_leg_top"
 
 
-def test_a_prefix_before_all_names_does_not_matter(body):
+def test_a_prefix_before_all_names_does_not_matter(body: Skeleton) -> None:
     names = tuple(f"Character1_{name}" for name in body.joint_names)
     mapping = map_joints(replace(body, joint_names=names, display_names=names))
 
@@ -195,12 +198,12 @@ MARKS = {
 }
 
 
-def marked(skeleton, mark):
+def marked(skeleton: Skeleton, mark: Callable[..., Any]) -> Skeleton:
     names = tuple(mark(name, joint) for joint, name in enumerate(skeleton.joint_names))
     return replace(skeleton, joint_names=names, display_names=names)
 
 
-def with_index_fingers(body):
+def with_index_fingers(body: Skeleton) -> Skeleton:
     """The body with three joints of an index finger on each hand, as most rigs call them."""
     names, parents = list(body.joint_names), list(body.parents)
     for side in ("Left", "Right"):
@@ -212,7 +215,7 @@ def with_index_fingers(body):
 
 
 @pytest.mark.parametrize("mark", MARKS.values(), ids=MARKS)
-def test_a_mark_on_every_name_hides_neither_the_body_nor_its_fingers(body, mark):
+def test_a_mark_on_every_name_hides_neither_the_body_nor_its_fingers(body: Skeleton, mark: Callable[..., Any]) -> None:
     plain = with_index_fingers(body)
     known = map_joints(plain)
     skeleton = marked(plain, mark)
@@ -226,7 +229,7 @@ def test_a_mark_on_every_name_hides_neither_the_body_nor_its_fingers(body, mark)
 
 
 @pytest.mark.parametrize("mark", MARKS.values(), ids=MARKS)
-def test_a_mark_on_every_name_hides_no_real_rig(mocap, mark):
+def test_a_mark_on_every_name_hides_no_real_rig(mocap: Path, mark: Callable[..., Any]) -> None:
     plain = read_skeleton(mocap / "rigs/misc/test_freebvh.bvh")
     known = map_joints(plain)
     skeleton = marked(plain, mark)
@@ -237,20 +240,20 @@ def test_a_mark_on_every_name_hides_no_real_rig(mocap, mark):
     ]
 
 
-def test_numbers_that_tell_joints_apart_are_no_marks(body):
+def test_numbers_that_tell_joints_apart_are_no_marks(body: Skeleton) -> None:
     names = tuple(f"bone_{joint}" for joint in range(body.joint_count))
 
     assert readings(names)[-1] == tuple(map(str, range(body.joint_count)))
     assert map_joints(replace(body, joint_names=names, display_names=names)).method == "geometry"
 
 
-def test_a_mark_that_some_names_lack_is_part_of_the_others():
+def test_a_mark_that_some_names_lack_is_part_of_the_others() -> None:
     names = ("Hips", "Spine", "Spine.001", "Head.001")
 
     assert readings(names) == (names,)
 
 
-def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body):
+def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body: Skeleton) -> None:
     known = map_joints(body).joints
     names = tuple(f"bone{index}" for index in range(body.joint_count))
     anonymous = replace(body, joint_names=names, display_names=names)
@@ -260,12 +263,12 @@ def test_a_body_without_telling_names_is_found_whatever_one_hand_holds(body):
     assert dict(mapping.joints) == {joint: names[body.index_of(name)] for joint, name in known.items()}
 
 
-def anonymous(skeleton):
+def anonymous(skeleton: Skeleton) -> Skeleton:
     names = tuple(f"bone{index}" for index in range(skeleton.joint_count))
     return replace(skeleton, joint_names=names, display_names=names)
 
 
-def with_chains(skeleton, *chains):
+def with_chains(skeleton: Skeleton, *chains: Any) -> Skeleton:
     """The skeleton with more joints: chains of (name of the joint it hangs on, offset, and the offsets below it)."""
     parents, offsets = list(skeleton.parents), [*skeleton.offsets]
     for parent, *bones in chains:
@@ -276,7 +279,7 @@ def with_chains(skeleton, *chains):
     return Skeleton(names, np.array(parents), np.array(offsets), quaternions.identity(len(names)))
 
 
-def with_twist_joints(skeleton, *names):
+def with_twist_joints(skeleton: Skeleton, *names: Any) -> Skeleton:
     """The skeleton with a joint more in the middle of the bones that lead to these joints."""
     parents, offsets, order = list(skeleton.parents), [*skeleton.offsets], list(range(skeleton.joint_count))
     for name in names:
@@ -296,7 +299,7 @@ def with_twist_joints(skeleton, *names):
     )
 
 
-def both(parent, first, *others):
+def both(parent: str, first: tuple[Any, ...], *others: Any) -> list[Any]:
     """A chain on the left and its mirror image on the right."""
     return [(parent, *((side * x, y, z) for x, y, z in (first, *others))) for side in (1, -1)]
 
@@ -322,7 +325,7 @@ DRESSED = {
 }
 
 
-def assert_body_is_found(skeleton, body):
+def assert_body_is_found(skeleton: Skeleton, body: Skeleton) -> None:
     mapping = map_joints(anonymous(skeleton))
 
     assert mapping.method == "geometry"
@@ -332,7 +335,7 @@ def assert_body_is_found(skeleton, body):
 
 
 @pytest.mark.parametrize("clothes", DRESSED.values(), ids=DRESSED)
-def test_a_body_without_telling_names_is_found_in_all_kinds_of_clothes(body, clothes):
+def test_a_body_without_telling_names_is_found_in_all_kinds_of_clothes(body: Skeleton, clothes: list[Any]) -> None:
     assert_body_is_found(with_chains(body, *clothes), body)
 
 
@@ -341,13 +344,13 @@ def test_a_body_without_telling_names_is_found_in_all_kinds_of_clothes(body, clo
     [("ForeArm", "Hand"), ("Leg", "Foot"), ("Hand",), ("ForeArm", "Hand", "Leg", "Foot")],
     ids=["arms", "legs", "forearms", "all"],
 )
-def test_twist_joints_are_not_taken_for_elbows_and_knees(body, bones):
+def test_twist_joints_are_not_taken_for_elbows_and_knees(body: Skeleton, bones: tuple[Any, ...]) -> None:
     twisted = with_twist_joints(body, *(f"{side}{bone}" for side in ("Left", "Right") for bone in bones))
 
     assert_body_is_found(twisted, body)
 
 
-def test_arms_that_wings_may_be_as_well_are_doubted_in_words(body):
+def test_arms_that_wings_may_be_as_well_are_doubted_in_words(body: Skeleton) -> None:
     arm = [body.offsets[body.index_of(f"Left{bone}")] for bone in ("Shoulder", "Arm", "ForeArm", "Hand")]
     mapping = map_joints(anonymous(with_chains(body, *both("Spine2", *map(tuple, arm)))))
 
@@ -357,7 +360,7 @@ def test_arms_that_wings_may_be_as_well_are_doubted_in_words(body):
         require_trust(mapping)
 
 
-def test_sides_that_no_foot_tells_are_said_to_be_a_guess(body):
+def test_sides_that_no_foot_tells_are_said_to_be_a_guess(body: Skeleton) -> None:
     feet = [joint for joint, name in enumerate(body.joint_names) if "Toe" in name]
     kept = [joint for joint in range(body.joint_count) if joint not in feet]
     place = {joint: at for at, joint in enumerate(kept)}
@@ -374,12 +377,15 @@ def test_sides_that_no_foot_tells_are_said_to_be_a_guess(body):
 
 
 @pytest.mark.parametrize(("scale", "turn"), [(1.0, 0.0), (0.4, 2.0), (170.0, -1.0)])
-def test_a_body_without_telling_names_is_found_by_its_build_whatever_its_size_and_direction(body, scale, turn):
+def test_a_body_without_telling_names_is_found_by_its_build_whatever_its_size_and_direction(
+    body: Skeleton, scale: float, turn: float
+) -> None:
     known = map_joints(body).joints
     names = tuple(f"bone{index}" for index in range(body.joint_count))
     around = quaternions.from_axis_angle([0, 1, 0], turn)
-    offsets = quaternions.rotate_vectors(around, body.offsets * scale)
-    sites = tuple(replace(s, offset=quaternions.rotate_vectors(around, s.offset * scale)) for s in body.end_sites)
+    offsets = quaternions.rotate_vectors(around, body.offsets * scale).astype(np.float64)
+    turned = [quaternions.rotate_vectors(around, site.offset * scale).astype(np.float64) for site in body.end_sites]
+    sites = tuple(replace(site, offset=offset) for site, offset in zip(body.end_sites, turned, strict=True))
     skeleton = replace(body, joint_names=names, display_names=names, offsets=offsets, end_sites=sites)
     mapping = map_joints(skeleton)
 
@@ -391,7 +397,7 @@ def test_a_body_without_telling_names_is_found_by_its_build_whatever_its_size_an
     assert any("rest pose alone" in note for note in mapping.notes)
 
 
-def test_sides_in_unknown_names_are_believed(body):
+def test_sides_in_unknown_names_are_believed(body: Skeleton) -> None:
     names = tuple(
         f"{'R' if 'Right' in name else 'L' if 'Left' in name else 'C'}_b{i}x" for i, name in enumerate(body.joint_names)
     )
@@ -402,7 +408,7 @@ def test_sides_in_unknown_names_are_believed(body):
     assert not any("rest pose alone" in note for note in mapping.notes)
 
 
-def test_half_a_body_says_what_it_lacks(body):
+def test_half_a_body_says_what_it_lacks(body: Skeleton) -> None:
     legs = Skeleton(body.joint_names[:9], body.parents[:9], body.offsets[:9], body.rest_rotations[:9])
     mapping = map_joints(legs)
 
@@ -413,7 +419,7 @@ def test_half_a_body_says_what_it_lacks(body):
     )
 
 
-def test_what_is_no_body_is_said_to_be_none():
+def test_what_is_no_body_is_said_to_be_none() -> None:
     snake = Skeleton(
         tuple(f"s{i}" for i in range(20)),
         np.arange(-1, 19, dtype=np.int32),
@@ -427,8 +433,8 @@ def test_what_is_no_body_is_said_to_be_none():
     assert "does not look like a body" in mapping.notes[0]
 
 
-def test_a_tail_costs_the_confidence_and_a_pony_tail_does_not(body):
-    def with_tail(name, parent):
+def test_a_tail_costs_the_confidence_and_a_pony_tail_does_not(body: Skeleton) -> None:
+    def with_tail(name: str, parent: str) -> Skeleton:
         return Skeleton(
             (*body.joint_names, name),
             np.append(body.parents, np.int32(body.index_of(parent))),
@@ -442,7 +448,7 @@ def test_a_tail_costs_the_confidence_and_a_pony_tail_does_not(body):
     assert map_joints(with_tail("PonyTail", "Head")).confidence == 1.0
 
 
-def test_a_body_that_rests_on_all_fours_is_doubted(body):
+def test_a_body_that_rests_on_all_fours_is_doubted(body: Skeleton) -> None:
     offsets = body.offsets.copy()
     for joint, name in enumerate(body.joint_names):
         if "Spine" in name or name in ("Neck", "Head"):
@@ -455,7 +461,7 @@ def test_a_body_that_rests_on_all_fours_is_doubted(body):
     assert "stands on arms and legs" in mapping.notes[0]
 
 
-def test_the_plainer_of_two_names_is_the_joint(body):
+def test_the_plainer_of_two_names_is_the_joint(body: Skeleton) -> None:
     helpers = tuple(f"__{name}" for name in body.joint_names[1:])
     doubled = Skeleton(
         ("Hips", *(n for pair in zip(helpers, body.joint_names[1:], strict=True) for n in pair)),
@@ -466,7 +472,7 @@ def test_the_plainer_of_two_names_is_the_joint(body):
     assert map_joints(doubled).joints["left_hip"] == "LeftUpLeg"
 
 
-def test_indices_of_standard_joints_and_the_ones_missing(body):
+def test_indices_of_standard_joints_and_the_ones_missing(body: Skeleton) -> None:
     mapping = map_joints(body)
 
     assert mapping.indices(body, ("left_hip", "head")) == (1, 21)
@@ -475,7 +481,7 @@ def test_indices_of_standard_joints_and_the_ones_missing(body):
     assert caught.value.where == "left_heel"
 
 
-def test_the_partner_of_each_joint_is_across_the_body(body):
+def test_the_partner_of_each_joint_is_across_the_body(body: Skeleton) -> None:
     partners = symmetric_joints(body, map_joints(body))
     names = [body.joint_names[partner] for partner in partners]
 
@@ -485,7 +491,7 @@ def test_the_partner_of_each_joint_is_across_the_body(body):
     np.testing.assert_array_equal(partners[partners], np.arange(body.joint_count))
 
 
-def test_standard_names_are_unique_and_mirror_onto_each_other():
+def test_standard_names_are_unique_and_mirror_onto_each_other() -> None:
     assert len(set(STANDARD_JOINTS)) == len(STANDARD_JOINTS)
     assert {mirrored(name) for name in STANDARD_JOINTS} == set(STANDARD_JOINTS)
     assert set(ESSENTIAL_JOINTS) <= set(STANDARD_JOINTS)
@@ -494,7 +500,7 @@ def test_standard_names_are_unique_and_mirror_onto_each_other():
 
 
 @pytest.mark.parametrize("rig", KNOWN_RIGS, ids=lambda rig: rig.name)
-def test_dictionaries_speak_of_standard_joints_only_and_of_each_once(rig):
+def test_dictionaries_speak_of_standard_joints_only_and_of_each_once(rig: KnownRig) -> None:
     joints = [joint for joint, _ in rig.names()]
 
     assert set(ESSENTIAL_JOINTS) <= set(joints) <= set(STANDARD_JOINTS)
@@ -503,7 +509,7 @@ def test_dictionaries_speak_of_standard_joints_only_and_of_each_once(rig):
         assert max(Counter(name for _, names in rig.names() for name in names).values()) == 1
 
 
-def read_skeleton(path):
+def read_skeleton(path: Path) -> Skeleton:
     from marey_motion.formats import read_motion
 
     companion = next(path.parent.glob("*.asf")).read_bytes() if path.suffix == ".amc" else None
@@ -576,7 +582,7 @@ JOINTS = ("pelvis", *(f"left_{j}" for j in ("hip", "knee", "ankle", "toe", "shou
 SWAPS = (("Left", "Right"), ("_L", "_R"), (".L", ".R"), ("L_", "R_"))
 
 
-def right_of(name):
+def right_of(name: str) -> str:
     for left, right in SWAPS:
         if left in name:
             return name.replace(left, right)
@@ -584,7 +590,7 @@ def right_of(name):
 
 
 @pytest.mark.parametrize("file", REAL)
-def test_real_rigs_are_mapped_as_a_person_would(mocap, file):
+def test_real_rigs_are_mapped_as_a_person_would(mocap: Path, file: str) -> None:
     rig, names = REAL[file]
     mapping = map_joints(read_skeleton(mocap / file))
 
@@ -600,7 +606,7 @@ UNTELLABLE = ("rigs/game-engine/custom_skeleton_walk_example.bvh", "rigs/makehum
 
 
 @pytest.mark.parametrize("file", [file for file in REAL if file not in UNTELLABLE])
-def test_real_rigs_without_their_names_are_found_by_build(mocap, file):
+def test_real_rigs_without_their_names_are_found_by_build(mocap: Path, file: str) -> None:
     skeleton = read_skeleton(mocap / file)
     known = map_joints(skeleton)
     names = tuple(f"bone{index}" for index in range(skeleton.joint_count))
@@ -613,7 +619,7 @@ def test_real_rigs_without_their_names_are_found_by_build(mocap, file):
 
 
 @pytest.mark.parametrize("file", ["dog_run.bvh", "dog_walk.bvh"])
-def test_a_dog_is_not_passed_off_as_a_person(mocap, file):
+def test_a_dog_is_not_passed_off_as_a_person(mocap: Path, file: str) -> None:
     mapping = map_joints(read_skeleton(mocap / "rigs" / "quadruped" / file))
 
     assert mapping.rig is None
@@ -621,12 +627,12 @@ def test_a_dog_is_not_passed_off_as_a_person(mocap, file):
     assert any("animal" in note for note in mapping.notes)
 
 
-def test_a_rig_of_many_limbs_on_a_chain_of_a_thousand_joints_is_read_soon(body):
+def test_a_rig_of_many_limbs_on_a_chain_of_a_thousand_joints_is_read_soon(body: Skeleton) -> None:
     links = 1000
     many = with_chains(
         body, *((joint, *[(0.1 + 0.01 * k, 0.02, 0)] * 13) for joint in ("Hips", "Spine2") for k in range(12))
     )
-    parents = np.concatenate((np.arange(-1, links - 1), many.parents + links))
+    parents = np.concatenate((np.arange(-1, links - 1, dtype=np.int32), many.parents + np.int32(links)))
     parents[links] = links - 1
     offsets = np.concatenate((np.full((links, 3), 0.001), many.offsets))
     names = tuple(f"bone{joint}" for joint in range(len(parents)))

@@ -19,7 +19,7 @@ from marey_motion.rigs.names import parse_name
         "a|b:LUpLeg",
     ],
 )
-def test_every_style_of_a_left_thigh_is_one_name(name):
+def test_every_style_of_a_left_thigh_is_one_name(name: str) -> None:
     assert parse_name(name) == ("left", "upleg")
 
 
@@ -44,5 +44,5 @@ def test_every_style_of_a_left_thigh_is_one_name(name):
         ("", "", ""),
     ],
 )
-def test_sides_are_read_where_they_are_and_nowhere_else(name, side, base):
+def test_sides_are_read_where_they_are_and_nowhere_else(name: str, side: str, base: str) -> None:
     assert parse_name(name) == (side, base)

@@ -14,7 +14,7 @@ def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
     return Trial("circle", speed, float(np.radians(turn_rate_deg)), **options)
 
 
-def test_the_default_suite_is_that_of_the_paper_in_a_stable_order():
+def test_the_default_suite_is_that_of_the_paper_in_a_stable_order() -> None:
     trials = suite_trials(EvaluationOptions())
 
     assert len(trials) == 162
@@ -24,7 +24,7 @@ def test_the_default_suite_is_that_of_the_paper_in_a_stable_order():
     assert len({trial.name for trial in trials}) == 162
 
 
-def test_the_options_of_a_suite_reach_its_trials():
+def test_the_options_of_a_suite_reach_its_trials() -> None:
     options = EvaluationOptions(
         speeds_m_s=(1.5,),
         turn_rates_deg_s=(0.0, 30.0),
@@ -41,7 +41,7 @@ def test_the_options_of_a_suite_reach_its_trials():
 
 
 @pytest.mark.parametrize(("speed", "turn_rate_deg"), [(2.0, 50.0), (1.0, -100.0), (3.0, 25.0)])
-def test_a_circle_is_entered_along_its_tangent(speed, turn_rate_deg):
+def test_a_circle_is_entered_along_its_tangent(speed: float, turn_rate_deg: float) -> None:
     path = reference(circle(speed, turn_rate_deg))
 
     time = np.arange(1980 + 60) / RATE_HZ
@@ -56,7 +56,7 @@ def test_a_circle_is_entered_along_its_tangent(speed, turn_rate_deg):
     assert np.all(path.turn_rates_rad_s == np.where(time >= 3.0, omega, 0.0))
 
 
-def test_a_left_turn_goes_to_the_left_and_a_right_turn_is_its_mirror_image():
+def test_a_left_turn_goes_to_the_left_and_a_right_turn_is_its_mirror_image() -> None:
     left, right = reference(circle(2.0, 50.0)), reference(circle(2.0, -50.0))
 
     assert left.positions[200, 0] > 0.0
@@ -64,7 +64,7 @@ def test_a_left_turn_goes_to_the_left_and_a_right_turn_is_its_mirror_image():
     assert np.array_equal(left.headings, -right.headings)
 
 
-def test_a_turn_rate_of_zero_is_the_limit_of_small_ones():
+def test_a_turn_rate_of_zero_is_the_limit_of_small_ones() -> None:
     straight = reference(circle(3.0, 0.0))
 
     assert np.all(straight.positions[:, 0] == 0.0)
@@ -75,7 +75,7 @@ def test_a_turn_rate_of_zero_is_the_limit_of_small_ones():
         assert deviation < 1e-3 * turn_rate_deg / 1e-5, turn_rate_deg
 
 
-def test_switching_keeps_the_turn_rate_and_chains_tangent_arcs():
+def test_switching_keeps_the_turn_rate_and_chains_tangent_arcs() -> None:
     trial = Trial("switching", 1.5, float(np.radians(50)))
     path = reference(trial)
 
@@ -93,7 +93,7 @@ def test_switching_keeps_the_turn_rate_and_chains_tangent_arcs():
     np.testing.assert_allclose(directions, 0.5 * (path.headings[1:] + path.headings[:-1]), atol=1e-12)
 
 
-def test_the_speed_goes_on_switching_in_the_second_looked_ahead():
+def test_the_speed_goes_on_switching_in_the_second_looked_ahead() -> None:
     trial = Trial("switching", 1.0, 0.0, approach_s=1.0, duration_s=4.0, switch_every_s=4.0)
 
     path = reference(trial)
@@ -103,7 +103,7 @@ def test_the_speed_goes_on_switching_in_the_second_looked_ahead():
     assert np.all(path.speeds_m_s[300:] == 4.0)
 
 
-def test_a_switch_on_a_tick_counts_from_that_tick_on_however_its_time_is_rounded():
+def test_a_switch_on_a_tick_counts_from_that_tick_on_however_its_time_is_rounded() -> None:
     trial = Trial("switching", 1.0, 0.0, approach_s=0.1, duration_s=4.9, switch_every_s=0.1)
 
     path = reference(trial)
@@ -112,7 +112,7 @@ def test_a_switch_on_a_tick_counts_from_that_tick_on_however_its_time_is_rounded
     assert np.array_equal(path.speeds_m_s, np.where(after_entry % 2 == 1, 4.0, 1.0))
 
 
-def test_switches_between_ticks_lose_no_distance():
+def test_switches_between_ticks_lose_no_distance() -> None:
     trial = Trial("switching", 1.0, 0.0, approach_s=1.003, duration_s=10.0, switch_every_s=1.007)
 
     end = reference(trial).positions[-1, 1]
@@ -122,7 +122,7 @@ def test_switches_between_ticks_lose_no_distance():
     np.testing.assert_allclose(end, 1.003 + pieces[0::2].sum() + 4.0 * pieces[1::2].sum(), rtol=1e-13)
 
 
-def test_a_trial_may_begin_on_its_circle():
+def test_a_trial_may_begin_on_its_circle() -> None:
     path = reference(circle(2.0, 90.0, approach_s=0.0, duration_s=4.0))
 
     assert path.turn_rates_rad_s[0] == np.pi / 2
@@ -138,6 +138,6 @@ def test_a_trial_may_begin_on_its_circle():
         Trial("switching", 1.0, 0.0, switch_every_s=0.0),
     ],
 )
-def test_a_trial_that_cannot_be_run_is_named(trial):
+def test_a_trial_that_cannot_be_run_is_named(trial: Trial) -> None:
     with pytest.raises(MotionError, match=r"circle v=1 w=0|switching v=1 w=0"):
         reference(trial)

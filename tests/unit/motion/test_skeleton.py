@@ -22,7 +22,7 @@ def chain(**changes: Any) -> Skeleton:
     return Skeleton(**(fields | changes))
 
 
-def test_a_skeleton_takes_lists_and_holds_typed_read_only_arrays():
+def test_a_skeleton_takes_lists_and_holds_typed_read_only_arrays() -> None:
     skeleton = chain()
 
     assert skeleton.parents.dtype == np.int32
@@ -31,7 +31,7 @@ def test_a_skeleton_takes_lists_and_holds_typed_read_only_arrays():
         skeleton.offsets[0, 0] = 1.0
 
 
-def test_the_callers_own_array_stays_writable():
+def test_the_callers_own_array_stays_writable() -> None:
     offsets = np.zeros((3, 3))
     chain(offsets=offsets)
 
@@ -57,14 +57,16 @@ def test_the_callers_own_array_stays_writable():
         ({"display_names": ("a",)}, "display_names", "1 names for 3"),
     ],
 )
-def test_a_wrong_skeleton_is_refused_with_the_place_of_the_fault(changes, where, words):
+def test_a_wrong_skeleton_is_refused_with_the_place_of_the_fault(
+    changes: dict[str, Any], where: str, words: str
+) -> None:
     with pytest.raises(SkeletonError, match=words) as caught:
         chain(**changes)
     assert caught.value.where == where
     assert caught.value.code == "skeleton-invalid"
 
 
-def test_an_unknown_joint_is_answered_with_the_nearest_names(body):
+def test_an_unknown_joint_is_answered_with_the_nearest_names(body: Skeleton) -> None:
     with pytest.raises(UnknownJoint, match="LeftLeg"):
         body.index_of("LeftLegg")
     assert body.index_of("LeftLeg") == 2
@@ -72,12 +74,12 @@ def test_an_unknown_joint_is_answered_with_the_nearest_names(body):
     assert "Tail" not in body
 
 
-def test_children_and_the_path_to_the_root_follow_the_parents(body):
+def test_children_and_the_path_to_the_root_follow_the_parents(body: Skeleton) -> None:
     assert [body.joint_names[joint] for joint in body.children[0]] == ["LeftUpLeg", "RightUpLeg", "Spine"]
     assert [body.joint_names[joint] for joint in body.path_to_root(3)] == ["LeftFoot", "LeftLeg", "LeftUpLeg", "Hips"]
 
 
-def test_the_rest_pose_turns_with_the_rest_rotations():
+def test_the_rest_pose_turns_with_the_rest_rotations() -> None:
     quarter = quaternions.from_axis_angle([0, 0, 1], np.pi / 2)
     skeleton = chain(rest_rotations=np.stack([quarter, quarter, quaternions.identity()]))
 
@@ -86,7 +88,7 @@ def test_the_rest_pose_turns_with_the_rest_rotations():
     )
 
 
-def test_the_rest_pose_is_to_the_bit_that_of_the_arithmetic_of_quaternions():
+def test_the_rest_pose_is_to_the_bit_that_of_the_arithmetic_of_quaternions() -> None:
     rng = np.random.default_rng(5)
     parents = np.array([-1, *(int(rng.integers(joint)) for joint in range(1, 40))], np.int32)
     rest = np.asarray(quaternions.normalise(rng.normal(size=(40, 4))), np.float64)
@@ -101,7 +103,7 @@ def test_the_rest_pose_is_to_the_bit_that_of_the_arithmetic_of_quaternions():
     assert skeleton.rest_global_positions.tobytes() == points.tobytes()
 
 
-def test_the_same_content_is_the_same_hierarchy_whatever_the_display_names_or_the_quaternion_signs():
+def test_the_same_content_is_the_same_hierarchy_whatever_the_display_names_or_the_quaternion_signs() -> None:
     skeleton = chain()
 
     assert same_hierarchy(skeleton, skeleton)
@@ -109,7 +111,7 @@ def test_the_same_content_is_the_same_hierarchy_whatever_the_display_names_or_th
     assert same_hierarchy(skeleton, chain(rest_rotations=-quaternions.identity(3)))
 
 
-def test_any_difference_of_structure_is_a_different_hierarchy():
+def test_any_difference_of_structure_is_a_different_hierarchy() -> None:
     skeleton = chain()
 
     assert not same_hierarchy(skeleton, chain(joint_names=("a", "b", "d")))
@@ -122,7 +124,7 @@ def test_any_difference_of_structure_is_a_different_hierarchy():
     assert not same_hierarchy(skeleton, bent)
 
 
-def test_a_skeleton_survives_the_way_to_another_process(body):
+def test_a_skeleton_survives_the_way_to_another_process(body: Skeleton) -> None:
     assert same_hierarchy(pickle.loads(pickle.dumps(body)), body)
     assert body.display_names == body.joint_names
     assert replace(body, display_names=("same",) * 22).display_names == ("same",) * 22

@@ -45,7 +45,9 @@ def test_every_module_with_a_compiled_function_is_a_source_of_kernels() -> None:
         "from marey_motion.kernels import product",
     ],
 )
-def test_a_module_that_imports_the_compiler_or_kernels_is_a_source_of_kernels(line, tmp_path, monkeypatch) -> None:
+def test_a_module_that_imports_the_compiler_or_kernels_is_a_source_of_kernels(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "lanes.py").write_text(f"{line}\n")
     (tmp_path / "clips.py").write_text("import numpy\n")
     monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)

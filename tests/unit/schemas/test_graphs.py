@@ -1,6 +1,7 @@
 """Graphs of models: what holds together."""
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.registry import SCHEMAS
 
 
-def node(number, kind, *following):
+def node(number: int, kind: str, *following: Any) -> dict[str, Any]:
     return {
         "model": {"item": f"model_{number}", "revision": 1},
         "type": kind,
@@ -36,13 +37,13 @@ GRAPH: dict[str, Any] = {
 }
 
 
-def test_a_graph_whose_parts_hold_together_is_accepted_and_known_by_its_schema():
+def test_a_graph_whose_parts_hold_together_is_accepted_and_known_by_its_schema() -> None:
     graph = ModelGraph.model_validate(GRAPH)
     assert SCHEMAS["marey/model-graph@1"] is ModelGraph
     assert graph.model_dump(mode="json", by_alias=True, exclude_none=True) == GRAPH
 
 
-def changed(change):
+def changed(change: Callable[..., Any]) -> dict[str, Any]:
     graph = copy.deepcopy(GRAPH)
     change(graph)
     return graph
@@ -80,12 +81,12 @@ def changed(change):
         (lambda one: one["actions"]["walk"]["primitives"]["left"].pop("model"), "model"),
     ],
 )
-def test_a_graph_that_does_not_hold_together_is_refused_by_the_primitive(change, told):
+def test_a_graph_that_does_not_hold_together_is_refused_by_the_primitive(change: Callable[..., Any], told: str) -> None:
     with pytest.raises(ValidationError, match=told):
         ModelGraph.model_validate(changed(change))
 
 
-def test_a_graph_without_any_end_is_refused():
+def test_a_graph_without_any_end_is_refused() -> None:
     graph = copy.deepcopy(GRAPH)
     for action in graph["actions"].values():
         for primitive in action["primitives"].values():

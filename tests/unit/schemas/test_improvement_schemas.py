@@ -1,5 +1,7 @@
 """Parameters of comparisons, suggestions, optimisations and sweeps."""
 
+from typing import Any
+
 import pytest
 from pydantic import ValidationError
 
@@ -8,7 +10,7 @@ from marey_schemas.job_params import OptimiseParams, SuggestParams, SweepParams,
 from marey_schemas.options.improvement import ObjectiveOptions
 
 
-def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():
+def test_a_sweep_has_a_task_for_every_setting_and_never_too_many() -> None:
     assert count_sweep_tasks(SweepParams()) == 15
     assert count_sweep_tasks(SweepParams(factors=tuple(float(n) for n in range(20)))) <= MOST_TASKS
 
@@ -23,12 +25,12 @@ def test_a_sweep_has_a_task_for_every_setting_and_never_too_many():
         (SweepParams, {"factors": ()}),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_its_name(params, given):
+def test_what_makes_no_sense_is_refused_by_its_name(params: Any, given: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=next(iter(given))):
         params.model_validate(given)
 
 
 @pytest.mark.parametrize("kind", ["compare", "suggest", "optimise", "sweep"])
-def test_every_parameter_is_described(kind):
+def test_every_parameter_is_described(kind: str) -> None:
     for name, field in find_kind(kind).params.model_fields.items():
         assert field.description or name == "objective"

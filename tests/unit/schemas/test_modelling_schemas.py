@@ -1,5 +1,7 @@
 """Notes of a model: members that are read again are validated, others are kept."""
 
+from typing import Any
+
 import pytest
 from pydantic import ValidationError
 from tests.support import predecessor_models as models
@@ -9,7 +11,7 @@ from marey_schemas.documents.models import MotionPrimitiveDocument, log_likeliho
 
 
 @pytest.fixture(scope="module")
-def model():
+def model() -> dict[str, Any]:
     return models.imported()[0]["model"]
 
 
@@ -30,13 +32,15 @@ def model():
         ({"training": {"examples": [{"log_likelihood": float("nan")}]}}, "training/examples/0/log_likelihood"),
     ],
 )
-def test_notes_that_could_not_be_read_again_are_refused_with_their_place(model, notes, place):
+def test_notes_that_could_not_be_read_again_are_refused_with_their_place(
+    model: dict[str, Any], notes: dict[str, Any], place: str
+) -> None:
     with pytest.raises(ValidationError) as refused:
         MotionPrimitiveDocument.model_validate({**model, **notes})
     assert "/".join(map(str, refused.value.errors()[0]["loc"])) == place
 
 
-def test_other_notes_may_stand_beside_them(model):
+def test_other_notes_may_stand_beside_them(model: dict[str, Any]) -> None:
     notes = {
         "provenance": {"digest_of": ["x"], "predecessor": {"layout": "3"}, "set": 5},
         "training": {"examples": [{"name": "a", "odd": True}, {"log_likelihood": 2.0}], "warnings": ["any"]},
@@ -50,9 +54,9 @@ def test_other_notes_may_stand_beside_them(model):
 @pytest.mark.parametrize(
     "training", [None, {}, {"examples": 5}, {"examples": [1]}, {"examples": [{"log_likelihood": "a"}]}]
 )
-def test_an_older_document_with_odd_likelihoods_has_none(training):
+def test_an_older_document_with_odd_likelihoods_has_none(training: dict[str, Any] | None) -> None:
     assert log_likelihoods({"training": training}) == ()
 
 
-def test_an_older_document_with_odd_notes_comes_from_nowhere():
+def test_an_older_document_with_odd_notes_comes_from_nowhere() -> None:
     assert predecessor_origin({"provenance": {"predecessor": "x"}}) == predecessor_origin({})

@@ -1,5 +1,7 @@
 """Scopes, roles, passwords and tokens, without a database."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,17 +12,17 @@ from marey_server.access.secret_tokens import attempt_secret, issue_attempt_toke
 
 
 @pytest.fixture
-def cheap_hashes(monkeypatch):
+def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(passwords, "LOG2_N", 4)
 
 
-def test_roles_are_ordered():
+def test_roles_are_ordered() -> None:
     order = [Role.READER, Role.CONTRIBUTOR, Role.MAINTAINER, Role.OWNER]
     for i, role in enumerate(order):
         assert [roles.includes(role, need) for need in order] == [j <= i for j in range(4)]
 
 
-def test_a_bound_scope_reaches_its_project_only():
+def test_a_bound_scope_reaches_its_project_only() -> None:
     assert scopes.allows(["write!project=walk"], "write", "walk")
     assert not scopes.allows(["write!project=walk"], "write", "run")
     assert not scopes.allows(["write!project=walk"], "write")
@@ -32,14 +34,14 @@ scope_texts = st.sampled_from(["read", "write", "jobs", "read!project=a", "write
 
 
 @given(st.lists(scope_texts), st.lists(scope_texts))
-def test_what_does_not_exceed_allows_nothing_more(wanted, held):
+def test_what_does_not_exceed_allows_nothing_more(wanted: list[str], held: list[str]) -> None:
     if not scopes.exceeding(wanted, held):
         for need in ("read", "write", "jobs"):
             for project in ("a", "b", None):
                 assert scopes.allows(held, need, project) or not scopes.allows(wanted, need, project)
 
 
-def test_a_password_matches_its_own_hash_only(cheap_hashes):
+def test_a_password_matches_its_own_hash_only(cheap_hashes: Any) -> None:
     stored = passwords.hash_password("pässwörd 1\ud800")
     assert passwords.password_matches("pässwörd 1\ud800", stored)
     assert not passwords.password_matches("pässwörd 2", stored)
@@ -47,18 +49,18 @@ def test_a_password_matches_its_own_hash_only(cheap_hashes):
     assert passwords.hash_password("same") != passwords.hash_password("same")
 
 
-def test_a_hash_keeps_working_when_new_ones_cost_more(cheap_hashes, monkeypatch):
+def test_a_hash_keeps_working_when_new_ones_cost_more(cheap_hashes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = passwords.hash_password("correct horse")
     monkeypatch.setattr(passwords, "LOG2_N", 5)
     assert passwords.password_matches("correct horse", stored)
 
 
-def test_hashing_really_costs_32_mib():
+def test_hashing_really_costs_32_mib() -> None:
     assert (1 << passwords.LOG2_N) * 128 * 8 == 32 * 2**20
     assert passwords.password_matches("correct horse", passwords.hash_password("correct horse"))
 
 
-def test_tokens_of_users_and_attempts_are_told_apart():
+def test_tokens_of_users_and_attempts_are_told_apart() -> None:
     user, attempt = issue_user_token(), issue_attempt_token()
     prefix, secret = split_user_token(user.text)
     assert prefix == user.prefix

@@ -20,7 +20,7 @@ from marey_server.store import leader, tokens, users
 from marey_server.store.database.connections import Database
 
 
-def test_the_first_administrator_is_made_once_and_the_token_works(database: Database, tmp_path: Path):
+def test_the_first_administrator_is_made_once_and_the_token_works(database: Database, tmp_path: Path) -> None:
     file = tmp_path / "admin.token"
     database.write(SYSTEM, make_first_administrator, file)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -30,7 +30,9 @@ def test_the_first_administrator_is_made_once_and_the_token_works(database: Data
     assert file.read_text().strip() == secret
 
 
-def test_a_lost_token_of_an_administrator_is_replaced_by_who_owns_the_machine(database: Database, tmp_path: Path):
+def test_a_lost_token_of_an_administrator_is_replaced_by_who_owns_the_machine(
+    database: Database, tmp_path: Path
+) -> None:
     file = tmp_path / "admin.token"
     database.write(SYSTEM, make_first_administrator, file)
     lost = file.read_text().strip()
@@ -41,7 +43,9 @@ def test_a_lost_token_of_an_administrator_is_replaced_by_who_owns_the_machine(da
     assert database.read(SYSTEM, tokens.resolve_token, file.read_text().strip()).administrator
 
 
-def test_a_token_is_given_to_administrators_alone_and_a_refusal_leaves_the_file(database: Database, tmp_path: Path):
+def test_a_token_is_given_to_administrators_alone_and_a_refusal_leaves_the_file(
+    database: Database, tmp_path: Path
+) -> None:
     file = tmp_path / "admin.token"
     database.write(SYSTEM, make_first_administrator, file)
     held = file.read_text()
@@ -54,7 +58,9 @@ def test_a_token_is_given_to_administrators_alone_and_a_refusal_leaves_the_file(
     assert not file.with_suffix(".partial").exists()
 
 
-def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(database: Database, tmp_path: Path):
+def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(
+    database: Database, tmp_path: Path
+) -> None:
     database.write(SYSTEM, make_first_administrator, tmp_path / "admin.token")
     admin = database.read(SYSTEM, users.administrator_principal)
     database.write(admin, users.create_user, UserCreate(name="ops", administrator=True))
@@ -63,7 +69,7 @@ def test_local_workers_get_a_token_though_the_first_administrator_is_disabled(da
     assert database.read(SYSTEM, tokens.resolve_token, make_worker_token(database, Settings())).user_name == "ops"
 
 
-def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_servers(database: Database):
+def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_servers(database: Database) -> None:
     database.write(SYSTEM, users.ensure_first_administrator)
     one, other = Settings(port=8460), Settings(port=8461)
     first = make_worker_token(database, one)
@@ -75,7 +81,7 @@ def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_serv
         database.read(SYSTEM, tokens.resolve_token, first)
 
 
-def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path):
+def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         serve = [sys.executable, "-m", "marey_client.cli", "serve", "--data", str(tmp_path), "--workers", "0"]
@@ -86,7 +92,7 @@ def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path):
 
 def test_a_server_whose_database_is_away_stops_all_the_same(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
+) -> None:
     def without_database(*_: object) -> None:
         raise UnavailableProblem("The database does not answer.")
 

@@ -1,8 +1,12 @@
 """Possession of blobs: access to bytes and references to them."""
 
-import pytest
+from typing import Any
 
-from marey_schemas.items import ItemCreate
+import pytest
+from tests.support.database_fixtures import AdjustableClock
+from tests.support.store_fixtures import Lab
+
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
@@ -13,17 +17,17 @@ FILE = b"HIERARCHY ROOT hips"
 DIGEST = digest_of(FILE)
 
 
-def study(lab, who, name="s", **body):
+def study(lab: Lab, who: Principal, name: str = "s", **body: Any) -> Item:
     request = ItemCreate(name=name, parts={"study": {"schema": "marey/document@1", **body}})
     return lab.write(items.create_item, "lab", Kind.STUDY, request, who=who)
 
 
-def readers(lab):
+def readers(lab: Lab) -> set[Any]:
     everybody = (lab.owner, lab.contributor, lab.reader, lab.stranger, lab.anonymous)
     return {who.user_name for who in everybody if lab.read(blobs.readable, [DIGEST], who=who)}
 
 
-def test_who_sent_the_bytes_may_read_them_and_nobody_else(lab):
+def test_who_sent_the_bytes_may_read_them_and_nobody_else(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     assert readers(lab) == {lab.contributor.user_name}
     with pytest.raises(NotFoundProblem):
@@ -31,7 +35,7 @@ def test_who_sent_the_bytes_may_read_them_and_nobody_else(lab):
     assert lab.read(blobs.read_range, DIGEST, 0, 5, who=lab.contributor) == b"HIERA"
 
 
-def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab):
+def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     made = study(lab, lab.contributor, figures=[{"blob": DIGEST}])
     everybody_inside = {lab.owner.user_name, lab.contributor.user_name, lab.reader.user_name}
@@ -42,7 +46,7 @@ def test_a_document_shares_what_it_names_with_the_readers_of_its_project(lab):
     assert readers(lab) == {lab.contributor.user_name}
 
 
-def test_nobody_gets_bytes_by_naming_their_digest(lab):
+def test_nobody_gets_bytes_by_naming_their_digest(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     for body in ({"figures": [{"blob": DIGEST}]}, {"blob": DIGEST}):
         with pytest.raises(ConflictProblem) as refused:
@@ -55,14 +59,14 @@ def test_nobody_gets_bytes_by_naming_their_digest(lab):
     assert readers(lab) == {lab.contributor.user_name}
 
 
-def test_naming_a_digest_in_words_shares_nothing(lab):
+def test_naming_a_digest_in_words_shares_nothing(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     study(lab, lab.owner, "before", image=DIGEST)
     study(lab, lab.contributor, "after", image=DIGEST)
     assert readers(lab) == {lab.contributor.user_name}
 
 
-def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_bytes(lab):
+def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_bytes(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     made = study(lab, lab.contributor, "mine", blob=DIGEST)
     lab.write(items.delete_item, "lab", Kind.STUDY, made.id, expected_rev=None)
@@ -70,7 +74,7 @@ def test_a_stored_document_gives_no_access_to_who_stores_it_again_without_the_by
         study(lab, lab.owner, "theirs", blob=DIGEST)
 
 
-def test_missing_answers_by_the_same_rule_in_the_order_asked(lab):
+def test_missing_answers_by_the_same_rule_in_the_order_asked(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.contributor)
     other = digest_of(b"other")
     asked = [other, DIGEST, other, "sha256:nonsense"]
@@ -79,13 +83,13 @@ def test_missing_answers_by_the_same_rule_in_the_order_asked(lab):
     assert lab.read(blobs.missing, asked, who=lab.anonymous) == [other, DIGEST, "sha256:nonsense"]
 
 
-def test_thousands_of_digests_are_asked_for_at_once(lab):
+def test_thousands_of_digests_are_asked_for_at_once(lab: Lab) -> None:
     digests = [digest_of(str(number).encode()) for number in range(10_000)]
     lab.write(blobs.put_blob, b"9999")
     assert lab.read(blobs.missing, digests) == digests[:-1]
 
 
-def test_what_may_soon_be_collected_must_be_sent_again(lab, clock):
+def test_what_may_soon_be_collected_must_be_sent_again(lab: Lab, clock: AdjustableClock) -> None:
     lab.write(blobs.put_blob, FILE)
     clock.advance(GRACE_US / 1e6 * 0.6)
     assert lab.read(blobs.missing, [DIGEST]) == [DIGEST]
@@ -96,7 +100,7 @@ def test_what_may_soon_be_collected_must_be_sent_again(lab, clock):
     assert lab.read(blobs.missing, [DIGEST]) == []
 
 
-def test_sending_bytes_needs_a_credential_that_writes(lab):
+def test_sending_bytes_needs_a_credential_that_writes(lab: Lab) -> None:
     with pytest.raises(UnauthenticatedProblem):
         lab.write(blobs.put_blob, FILE, who=lab.anonymous)
     with pytest.raises(ForbiddenProblem):
@@ -105,7 +109,7 @@ def test_sending_bytes_needs_a_credential_that_writes(lab):
     assert lab.write(blobs.put_blob, FILE, who=bound) == DIGEST
 
 
-def test_what_an_attempt_sends_belongs_to_the_author_of_its_job(lab):
+def test_what_an_attempt_sends_belongs_to_the_author_of_its_job(lab: Lab) -> None:
     project_id = lab.read(projects.read_project, "lab").id
     attempt = Principal(
         "attempt", lab.contributor.user_id, scopes=("read",), job_id="job_1", fence=1, project_id=project_id

@@ -3,8 +3,11 @@
 import asyncio
 import sqlite3
 import sys
+from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -13,22 +16,23 @@ from marey_server.app import open_database
 from marey_server.errors import StorageFullProblem
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import DatabaseUnusable
+from marey_server.store.transaction import Transaction
 
 
 @pytest.fixture
-def data(tmp_path):
+def data(tmp_path: Path) -> Path:
     """A data folder with a database that its server left."""
     folder = tmp_path / "data"
     open_database(Settings(data=folder)).close()
     return folder
 
 
-def users_in(file):
+def users_in(file: Path) -> list[str]:
     with closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as database:
         return [name for (name,) in database.execute("SELECT name FROM user")]
 
 
-def test_a_backup_holds_what_was_written_before_it_though_the_database_is_in_use(data, tmp_path):
+def test_a_backup_holds_what_was_written_before_it_though_the_database_is_in_use(data: Path, tmp_path: Path) -> None:
     with closing(sqlite3.connect(data / "marey.db")) as server:
         server.execute("UPDATE user SET name = 'renamed'")
         server.commit()
@@ -39,7 +43,9 @@ def test_a_backup_holds_what_was_written_before_it_though_the_database_is_in_use
     assert (tmp_path / "copy.db").stat().st_mode & 0o777 == 0o600
 
 
-def test_a_backup_is_put_in_the_place_of_a_lost_database_and_checked(data, tmp_path, capsys):
+def test_a_backup_is_put_in_the_place_of_a_lost_database_and_checked(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     commands.backup(target=tmp_path / "copy.db", data=data)
     commands.restore(source=tmp_path / "copy.db", data=tmp_path / "elsewhere")
     assert users_in(tmp_path / "elsewhere" / "marey.db") == ["admin"]
@@ -47,7 +53,7 @@ def test_a_backup_is_put_in_the_place_of_a_lost_database_and_checked(data, tmp_p
     assert "checked" in capsys.readouterr().out
 
 
-def test_a_backup_never_writes_over_a_file(data, tmp_path):
+def test_a_backup_never_writes_over_a_file(data: Path, tmp_path: Path) -> None:
     (tmp_path / "copy.db").write_text("precious")
     with pytest.raises(commands.CommandFailed, match="exists"):
         commands.backup(target=tmp_path / "copy.db", data=data)
@@ -55,7 +61,7 @@ def test_a_backup_never_writes_over_a_file(data, tmp_path):
 
 
 @pytest.mark.parametrize("left", ["marey.db", "marey.db-wal", "marey.db-shm"])
-def test_nothing_is_restored_over_or_beside_what_a_server_left(data, tmp_path, left):
+def test_nothing_is_restored_over_or_beside_what_a_server_left(data: Path, tmp_path: Path, left: str) -> None:
     commands.backup(target=tmp_path / "copy.db", data=data)
     target = tmp_path / "target"
     target.mkdir()
@@ -65,7 +71,9 @@ def test_nothing_is_restored_over_or_beside_what_a_server_left(data, tmp_path, l
     assert [path.name for path in target.iterdir()] == [left]
 
 
-def test_a_new_administrators_token_is_written_for_who_lost_theirs(data, capsys):
+def test_a_new_administrators_token_is_written_for_who_lost_theirs(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     lost = (data / "admin.token").read_text()
     (data / "admin.token").unlink()
     commands.admin_token(data=data)
@@ -76,12 +84,14 @@ def test_a_new_administrators_token_is_written_for_who_lost_theirs(data, capsys)
 
 
 @pytest.mark.parametrize(("user", "folder", "why"), [("nobody", "data", "--user"), (None, "elsewhere", "--data")])
-def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(data, tmp_path, user, folder, why):
+def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(
+    data: Path, tmp_path: Path, user: str | None, folder: str, why: str
+) -> None:
     with pytest.raises(commands.CommandFailed, match=why):
         commands.admin_token(user=user, data=tmp_path / folder)
 
 
-def start(**settings):
+def start(**settings: Any) -> None:
     """What `serve` begins with."""
     open_database(Settings(**settings)).close()
 
@@ -95,7 +105,9 @@ def start(**settings):
     ],
 )
 @pytest.mark.parametrize("command", [start, commands.upgrade, commands.fsck])
-def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_password(tmp_path, command, url, told):
+def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_password(
+    tmp_path: Path, command: Callable[..., Any], url: str, told: str
+) -> None:
     with pytest.raises((commands.CommandFailed, DatabaseUnusable), match=told) as failed:
         command(data=tmp_path, database_url=url)
     assert "sekret" not in str(failed.value)
@@ -103,7 +115,7 @@ def test_a_database_that_cannot_be_opened_is_told_in_a_sentence_without_its_pass
 
 
 @pytest.mark.parametrize("command", [start, commands.upgrade])
-def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path, command):
+def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path: Path, command: Callable[..., Any]) -> None:
     (tmp_path / "marey.db").write_bytes(b"not a database " * 1000)
     with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="file is not a database"):
         command(data=tmp_path)
@@ -111,8 +123,10 @@ def test_a_file_that_is_no_database_is_told_and_left_as_it_is(tmp_path, command)
 
 
 @pytest.mark.parametrize("command", [start, commands.upgrade])
-def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypatch):
-    def full(_tx):
+def test_a_disk_without_room_for_the_tables_is_told(
+    tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_tx: Transaction) -> None:
         raise StorageFullProblem("The disk has no room left.")
 
     monkeypatch.setattr("marey_server.store.database.schema.make_cursor_key", full)
@@ -121,7 +135,7 @@ def test_a_disk_without_room_for_the_tables_is_told(tmp_path, command, monkeypat
 
 
 @pytest.mark.parametrize("command", [start, commands.upgrade])
-def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
+def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data: Path, command: Callable[..., Any]) -> None:
     with closing(sqlite3.connect(data / "marey.db")) as database, database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
     with pytest.raises(
@@ -132,8 +146,8 @@ def test_tables_of_a_newer_version_are_told_and_left_as_they_are(data, command):
         assert database.execute("SELECT version_num FROM alembic_version").fetchall() == [("9999",)]
 
 
-def test_serve_tells_what_is_wrong_with_its_database(tmp_path, monkeypatch):
-    async def unusable(_settings):
+def test_serve_tells_what_is_wrong_with_its_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def unusable(_settings: Settings) -> None:
         raise DatabaseUnusable("the database is a teapot")
 
     monkeypatch.setattr("marey_server.app.serve", unusable)
@@ -141,14 +155,14 @@ def test_serve_tells_what_is_wrong_with_its_database(tmp_path, monkeypatch):
         commands.serve(data=tmp_path)
 
 
-def test_the_server_runs_on_uvloop_where_that_is_installed(monkeypatch):
+def test_the_server_runs_on_uvloop_where_that_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = object()
     monkeypatch.setitem(sys.modules, "uvloop", SimpleNamespace(new_event_loop=lambda: loop))
 
     assert commands._new_event_loop() is loop
 
 
-def test_the_server_runs_on_asyncio_where_uvloop_is_not_installed(monkeypatch):
+def test_the_server_runs_on_asyncio_where_uvloop_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "uvloop", None)
 
     loop = commands._new_event_loop()

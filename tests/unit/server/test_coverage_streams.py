@@ -1,14 +1,18 @@
 """Rows of coverage streams: compare-and-swap, repeated requests, deletion after a day."""
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
+from tests.support.database_fixtures import AdjustableClock
 from tests.support.interleaving import Step as Half
 from tests.support.interleaving import interleave
-from tests.support.store_fixtures import WRITE, requiring
+from tests.support.store_fixtures import WRITE, Lab, requiring
 
 from marey_schemas.coverage_streams import MOST_STREAMS
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import coverage_streams, garbage
-from marey_server.store.coverage_streams import LIFETIME_US, CoverageOffset, NewStream, StreamStep
+from marey_server.store.coverage_streams import LIFETIME_US, CoverageOffset, NewStream, Stream, StreamStep
 
 SETTINGS = {
     "frame_rate_hz": 60.0, "skeleton": None, "evaluation": None, "speeds_m_s": [1.0], "turn_rates_deg_s": [0.0],
@@ -18,20 +22,20 @@ NEW = NewStream(SETTINGS, None, b"beginning")
 DAY_S = LIFETIME_US / 1e6
 
 
-def step(offset, said="a"):
+def step(offset: int, said: str = "a") -> StreamStep:
     return StreamStep(f"sha256:{said * 64}", {"offset": offset, "said": said}, offset, f"state {said}".encode())
 
 
 @pytest.fixture
-def stream(lab):
+def stream(lab: Lab) -> Stream:
     return lab.write(coverage_streams.create_stream, "lab", NEW, who=lab.contributor)
 
 
-def held(lab, stream):
+def held(lab: Lab, stream: Stream) -> Stream:
     return lab.read(coverage_streams.read_to_advance, "lab", stream.id, who=lab.contributor)
 
 
-def test_a_stream_moves_on_from_where_it_was(lab, stream):
+def test_a_stream_moves_on_from_where_it_was(lab: Lab, stream: Stream) -> None:
     assert held(lab, stream) == stream
     answer = lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)
     now = held(lab, stream)
@@ -41,7 +45,7 @@ def test_a_stream_moves_on_from_where_it_was(lab, stream):
     assert coverage_streams.answered_before(now, step(10, "b").said) is None
 
 
-def test_a_step_from_where_the_stream_no_longer_is_is_told_the_true_offset(lab, stream):
+def test_a_step_from_where_the_stream_no_longer_is_is_told_the_true_offset(lab: Lab, stream: Stream) -> None:
     lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)
     with pytest.raises(CoverageOffset) as refused:
         lab.write(coverage_streams.advance_stream, "lab", stream, step(20, "b"), who=lab.contributor)
@@ -49,7 +53,7 @@ def test_a_step_from_where_the_stream_no_longer_is_is_told_the_true_offset(lab, 
     assert held(lab, stream).state == b"state a"
 
 
-def test_the_same_step_again_gets_the_same_answer_and_counts_once(lab, stream):
+def test_the_same_step_again_gets_the_same_answer_and_counts_once(lab: Lab, stream: Stream) -> None:
     first = lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)
     again = lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)
     assert again == first
@@ -57,8 +61,10 @@ def test_the_same_step_again_gets_the_same_answer_and_counts_once(lab, stream):
 
 
 @pytest.mark.parametrize("commit", [True, False])
-def test_of_two_senders_at_once_one_is_taken_and_the_other_told_where_to_go_on(lab, stream, open_database, commit):
-    def send(said, offset):
+def test_of_two_senders_at_once_one_is_taken_and_the_other_told_where_to_go_on(
+    lab: Lab, stream: Stream, open_database: Callable[..., Any], commit: bool
+) -> None:
+    def send(said: str, offset: int) -> Callable[..., Any]:
         return lambda tx: coverage_streams.advance_stream(tx, "lab", stream, step(offset, said))
 
     one, other = (
@@ -75,7 +81,9 @@ def test_of_two_senders_at_once_one_is_taken_and_the_other_told_where_to_go_on(l
         assert second == now.answer == {"offset": 30, "said": "b"}
 
 
-def test_a_request_that_arrives_twice_at_once_counts_once(lab, stream, open_database):
+def test_a_request_that_arrives_twice_at_once_counts_once(
+    lab: Lab, stream: Stream, open_database: Callable[..., Any]
+) -> None:
     half = [
         Half(
             database,
@@ -89,13 +97,13 @@ def test_a_request_that_arrives_twice_at_once_counts_once(lab, stream, open_data
     assert held(lab, stream).rev == 2
 
 
-def test_the_end_of_a_take_and_frames_at_the_same_offset_do_not_overwrite_each_other(lab, stream):
+def test_the_end_of_a_take_and_frames_at_the_same_offset_do_not_overwrite_each_other(lab: Lab, stream: Stream) -> None:
     lab.write(coverage_streams.advance_stream, "lab", stream, step(0, "e"), who=lab.contributor)
     with pytest.raises(CoverageOffset):
         lab.write(coverage_streams.advance_stream, "lab", stream, step(10, "f"), who=lab.contributor)
 
 
-def test_contributors_send_readers_look_on_and_nobody_else_knows_of_it(lab, stream):
+def test_contributors_send_readers_look_on_and_nobody_else_knows_of_it(lab: Lab, stream: Stream) -> None:
     shown = lab.read(coverage_streams.read_stream, "lab", stream.id, who=lab.reader)
     assert shown == stream
     for attempt in (coverage_streams.read_to_advance, coverage_streams.delete_stream):
@@ -110,7 +118,7 @@ def test_contributors_send_readers_look_on_and_nobody_else_knows_of_it(lab, stre
             lab.read(coverage_streams.read_stream, "lab", stream.id, who=who)
 
 
-def test_a_stream_is_known_in_its_own_project_only(lab, stream):
+def test_a_stream_is_known_in_its_own_project_only(lab: Lab, stream: Stream) -> None:
     from tests.support.store_fixtures import Lab
 
     Lab(lab.database, "other")
@@ -119,7 +127,7 @@ def test_a_stream_is_known_in_its_own_project_only(lab, stream):
         lab.read(coverage_streams.read_stream, "other", stream.id, who=admin)
 
 
-def test_lists_show_the_newest_first_without_what_is_only_needed_to_go_on(lab):
+def test_lists_show_the_newest_first_without_what_is_only_needed_to_go_on(lab: Lab) -> None:
     made = [lab.write(coverage_streams.create_stream, "lab", NEW).id for _ in range(5)]
     page = lab.read(coverage_streams.list_streams, "lab", limit=3, who=lab.reader)
     rest = lab.read(coverage_streams.list_streams, "lab", limit=3, cursor=page.next_cursor, who=lab.reader)
@@ -129,7 +137,7 @@ def test_lists_show_the_newest_first_without_what_is_only_needed_to_go_on(lab):
     assert (page.items[0].expires_at - page.items[0].updated_at).total_seconds() == DAY_S
 
 
-def test_a_project_has_so_many_streams_and_no_more(lab):
+def test_a_project_has_so_many_streams_and_no_more(lab: Lab) -> None:
     for _ in range(MOST_STREAMS):
         last = lab.write(coverage_streams.create_stream, "lab", NEW)
     with pytest.raises(ConflictProblem) as refused:
@@ -139,7 +147,7 @@ def test_a_project_has_so_many_streams_and_no_more(lab):
     lab.write(coverage_streams.create_stream, "lab", NEW)
 
 
-def test_the_last_place_is_given_once(lab, open_database):
+def test_the_last_place_is_given_once(lab: Lab, open_database: Callable[..., Any]) -> None:
     for _ in range(MOST_STREAMS - 1):
         lab.write(coverage_streams.create_stream, "lab", NEW)
     halves = [
@@ -151,7 +159,9 @@ def test_the_last_place_is_given_once(lab, open_database):
     assert isinstance(second, ConflictProblem)
 
 
-def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(lab, stream, clock):
+def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(
+    lab: Lab, stream: Stream, clock: AdjustableClock
+) -> None:
     used = lab.write(coverage_streams.create_stream, "lab", NEW)
     clock.advance(0.75 * DAY_S)
     lab.write(coverage_streams.advance_stream, "lab", used, step(10), who=lab.contributor)
@@ -166,7 +176,7 @@ def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(lab, strea
     assert held(lab, used).offset == 10
 
 
-def test_a_stream_that_is_dropped_while_frames_are_worked_on_is_gone(lab, stream):
+def test_a_stream_that_is_dropped_while_frames_are_worked_on_is_gone(lab: Lab, stream: Stream) -> None:
     lab.write(coverage_streams.delete_stream, "lab", stream.id)
     with pytest.raises(NotFoundProblem):
         lab.write(coverage_streams.advance_stream, "lab", stream, step(10), who=lab.contributor)

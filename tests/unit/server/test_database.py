@@ -3,12 +3,17 @@
 import sqlite3
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import psycopg
 import pytest
 import sqlalchemy
+from sqlalchemy import Column
+from sqlalchemy.engine.default import DefaultDialect
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
@@ -16,22 +21,27 @@ from marey_server.store.database import connections as database_module
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import server_state, user
+from marey_server.store.transaction import Transaction
 
 on_sqlite = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 on_postgres = pytest.mark.parametrize("database_url", ["postgres"], indirect=True)
 
 
-def add_user(tx, name="u"):
+def add_user(tx: Transaction, name: str = "u") -> None:
     row = {"id": f"user_{name}", "name": name, "administrator": False, "disabled": False, "created_us": 0, "rev": 1}
     tx.execute(sqlalchemy.insert(user).values(**row))
 
 
-def user_names(tx):
+def add_large_row(tx: Transaction, key: str) -> None:
+    tx.execute(tx.insert_or_ignore(server_state, {"key": key, "value": "x" * 300_000}))
+
+
+def user_names(tx: Transaction) -> list[str]:
     return sorted(tx.execute(sqlalchemy.select(user.c.name)).scalars())
 
 
-def test_a_write_that_fails_leaves_nothing(database):
-    def fail(tx):
+def test_a_write_that_fails_leaves_nothing(database: Database) -> None:
+    def fail(tx: Transaction) -> None:
         add_user(tx)
         raise KeyError("on the way")
 
@@ -40,8 +50,8 @@ def test_a_write_that_fails_leaves_nothing(database):
     assert database.read(SYSTEM, user_names) == []
 
 
-def test_a_failure_says_nothing_of_what_was_to_be_written(database):
-    def add_twice(tx):
+def test_a_failure_says_nothing_of_what_was_to_be_written(database: Database) -> None:
+    def add_twice(tx: Transaction) -> None:
         add_user(tx)
         row = {"id": "user_u", "name": "ann", "password_hash": "scrypt$canary", "created_us": 0}
         tx.execute(sqlalchemy.insert(user), row)
@@ -52,14 +62,14 @@ def test_a_failure_says_nothing_of_what_was_to_be_written(database):
     assert "canary" not in str(failed.value)
 
 
-def test_a_read_cannot_write(database):
+def test_a_read_cannot_write(database: Database) -> None:
     with pytest.raises((sqlalchemy.exc.DBAPIError, UnavailableProblem)):
         database.read(SYSTEM, add_user)
     assert database.read(SYSTEM, user_names) == []
 
 
-def test_a_read_sees_one_state_throughout(database):
-    def look(tx):
+def test_a_read_sees_one_state_throughout(database: Database) -> None:
+    def look(tx: Transaction) -> tuple[list[Any], list[Any]]:
         before = user_names(tx)
         thread = threading.Thread(target=database.write, args=(SYSTEM, add_user))
         thread.start()
@@ -70,10 +80,10 @@ def test_a_read_sees_one_state_throughout(database):
     assert database.read(SYSTEM, user_names) == ["u"]
 
 
-def test_what_waits_for_the_commit_runs_once_after_it_and_not_after_a_failure(database):
+def test_what_waits_for_the_commit_runs_once_after_it_and_not_after_a_failure(database: Database) -> None:
     heard = []
 
-    def work(tx, fail):
+    def work(tx: Transaction, fail: bool) -> None:
         add_user(tx, "fails" if fail else "works")
         tx.after_commit(lambda: heard.append(database.read(SYSTEM, user_names)))
         if fail:
@@ -85,7 +95,7 @@ def test_what_waits_for_the_commit_runs_once_after_it_and_not_after_a_failure(da
     assert heard == [["works"]]
 
 
-def test_writes_from_many_threads_all_happen(database):
+def test_writes_from_many_threads_all_happen(database: Database) -> None:
     futures = [database.submit_write(SYSTEM, add_user, f"u{number:02d}") for number in range(40)]
     threads = [threading.Thread(target=database.write, args=(SYSTEM, add_user, f"t{number}")) for number in range(8)]
     for thread in threads:
@@ -98,12 +108,16 @@ def test_writes_from_many_threads_all_happen(database):
 
 
 @on_postgres
-def test_a_deadlock_is_resolved_by_trying_again(database):
-    database.write(SYSTEM, lambda tx: [add_user(tx, name) for name in "ab"])
+def test_a_deadlock_is_resolved_by_trying_again(database: Database) -> None:
+    def add_both(tx: Transaction) -> None:
+        for name in "ab":
+            add_user(tx, name)
+
+    database.write(SYSTEM, add_both)
     both = threading.Barrier(2)
     met = threading.Event()
 
-    def cross(tx, first, second):
+    def cross(tx: Transaction, first: str, second: str) -> None:
         tx.execute(sqlalchemy.update(user).where(user.c.name == first).values(rev=user.c.rev + 1))
         if not met.is_set():
             both.wait(10)
@@ -117,15 +131,15 @@ def test_a_deadlock_is_resolved_by_trying_again(database):
     assert revs == [3, 3]
 
 
-def break_connection(tx):
+def break_connection(tx: Transaction) -> None:
     tx.connection.exec_driver_sql("SELECT pg_terminate_backend(pg_backend_pid())")
 
 
 @on_postgres
-def test_a_broken_connection_is_replaced_and_the_work_done_again(database):
+def test_a_broken_connection_is_replaced_and_the_work_done_again(database: Database) -> None:
     tries = []
 
-    def work(tx):
+    def work(tx: Transaction) -> None:
         tries.append(1)
         if len(tries) == 1:
             break_connection(tx)
@@ -134,7 +148,7 @@ def test_a_broken_connection_is_replaced_and_the_work_done_again(database):
     database.write(SYSTEM, work)
     assert (len(tries), database.read(SYSTEM, user_names)) == (2, ["u"])
 
-    def look(tx):
+    def look(tx: Transaction) -> list[str]:
         tries.append(1)
         if len(tries) == 3:
             break_connection(tx)
@@ -144,17 +158,17 @@ def test_a_broken_connection_is_replaced_and_the_work_done_again(database):
 
 
 @on_postgres
-def test_a_commit_whose_answer_is_lost_is_not_done_twice(database, monkeypatch):
+def test_a_commit_whose_answer_is_lost_is_not_done_twice(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lost after the commit: the row is there, and nobody wrote it a second time behind the caller's back."""
     tries = []
 
-    def work(tx):
+    def work(tx: Transaction) -> None:
         tries.append(1)
         add_user(tx, f"u{len(tries)}")
 
-    real_commit = sqlalchemy.engine.default.DefaultDialect.do_commit
+    real_commit = DefaultDialect.do_commit
 
-    def commit_then_lose(self, connection):
+    def commit_then_lose(self: DefaultDialect, connection: Any) -> None:
         real_commit(self, connection)
         connection.driver_connection.close()
         raise psycopg.OperationalError("server closed the connection unexpectedly")
@@ -166,7 +180,7 @@ def test_a_commit_whose_answer_is_lost_is_not_done_twice(database, monkeypatch):
     assert database.read(SYSTEM, user_names) == ["u1"]
 
 
-def test_a_database_that_is_not_there_is_unavailable():
+def test_a_database_that_is_not_there_is_unavailable() -> None:
     database = Database("postgresql://nobody@127.0.0.1:1/none")
     for run in (database.read, database.write):
         with pytest.raises(UnavailableProblem) as refused:
@@ -177,10 +191,10 @@ def test_a_database_that_is_not_there_is_unavailable():
 
 
 @on_sqlite
-def test_a_full_database_says_so_and_keeps_what_was_there(database):
+def test_a_full_database_says_so_and_keeps_what_was_there(database: Database) -> None:
     database.write(SYSTEM, add_user, "before")
 
-    def too_much(tx):
+    def too_much(tx: Transaction) -> None:
         tx.connection.exec_driver_sql("PRAGMA max_page_count = 1")
         for number in range(5000):
             add_user(tx, f"{number:050d}")
@@ -193,8 +207,10 @@ def test_a_full_database_says_so_and_keeps_what_was_there(database):
 
 
 @pytest.mark.parametrize(("column", "value"), [(user.c.name, "\ud800"), (user.c.rev, 2**80), (user.c.rev, -(2**80))])
-def test_values_beyond_what_can_be_stored_are_the_callers_mistake(database, column, value):
-    def write(tx):
+def test_values_beyond_what_can_be_stored_are_the_callers_mistake(
+    database: Database, column: Column[Any], value: int | str
+) -> None:
+    def write(tx: Transaction) -> None:
         tx.execute(sqlalchemy.update(user).values({column: value}))
 
     with pytest.raises(InvalidProblem):
@@ -202,12 +218,14 @@ def test_values_beyond_what_can_be_stored_are_the_callers_mistake(database, colu
 
 
 @on_sqlite
-def test_a_long_log_is_written_back_under_steady_reads(tmp_path, database, monkeypatch):
+def test_a_long_log_is_written_back_under_steady_reads(
+    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
     monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
     stop = threading.Event()
 
-    def keep_reading():
+    def keep_reading() -> None:
         while not stop.is_set():
             database.read(SYSTEM, user_names)
 
@@ -216,8 +234,7 @@ def test_a_long_log_is_written_back_under_steady_reads(tmp_path, database, monke
         reader.start()
     try:
         for number in range(40):
-            row = {"key": f"k{number}", "value": "x" * 300_000}
-            database.write(SYSTEM, lambda tx, row=row: tx.execute(tx.insert_or_ignore(server_state, row)))
+            database.write(SYSTEM, add_large_row, f"k{number}")
         wal = tmp_path / "marey.db-wal"
         assert wal.stat().st_size < 4 * 2**20
     finally:
@@ -227,7 +244,9 @@ def test_a_long_log_is_written_back_under_steady_reads(tmp_path, database, monke
 
 
 @on_sqlite
-def test_writes_go_on_while_somebody_reads_for_long(tmp_path, database, monkeypatch):
+def test_writes_go_on_while_somebody_reads_for_long(
+    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As `marey db backup` does."""
     monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
     monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
@@ -235,22 +254,21 @@ def test_writes_go_on_while_somebody_reads_for_long(tmp_path, database, monkeypa
         reading.execute("BEGIN")
         reading.execute("SELECT count(*) FROM server_state").fetchall()
         for number in range(8):
-            row = {"key": f"k{number}", "value": "x" * 300_000}
-            written = database.submit_write(
-                SYSTEM, lambda tx, row=row: tx.execute(tx.insert_or_ignore(server_state, row))
-            )
+            written = database.submit_write(SYSTEM, add_large_row, f"k{number}")
             written.result(database_module.BUSY_TIMEOUT_MS / 2000)
     database.write(SYSTEM, user_names)
     assert (tmp_path / "marey.db-wal").stat().st_size == 0
 
 
 @on_sqlite
-def test_the_length_of_the_log_is_looked_at_once_in_some_seconds(tmp_path, database, monkeypatch):
+def test_the_length_of_the_log_is_looked_at_once_in_some_seconds(
+    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clock = SimpleNamespace(now_s=1000.0)
     monkeypatch.setattr(database_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=time.sleep))
     monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
 
-    def length_after_a_write(size):
+    def length_after_a_write(size: int) -> int:
         row = {"key": f"at {clock.now_s}", "value": "x" * size}
         database.write(SYSTEM, lambda tx: tx.execute(tx.insert_or_ignore(server_state, row)))
         return (tmp_path / "marey.db-wal").stat().st_size
@@ -263,7 +281,7 @@ def test_the_length_of_the_log_is_looked_at_once_in_some_seconds(tmp_path, datab
 
 
 @on_postgres
-def test_postgres_knows_who_connects_and_does_not_wait_for_ever(database):
+def test_postgres_knows_who_connects_and_does_not_wait_for_ever(database: Database) -> None:
     settings = database.read(
         SYSTEM,
         lambda tx: [
@@ -279,15 +297,15 @@ def test_postgres_knows_who_connects_and_does_not_wait_for_ever(database):
 HOUR_NS = 3600 * 10**9
 
 
-def now(database):
+def now(database: Database) -> int:
     return database.write(SYSTEM, lambda tx: tx.now_us)
 
 
 @pytest.fixture
-def with_own_clock(database_url):
+def with_own_clock(database_url: str) -> Iterator[Callable[..., Any]]:
     opened = []
 
-    def open_one():
+    def open_one() -> Database:
         opened.append(Database(database_url, clock=DatabaseClock()))
         return opened[-1]
 
@@ -297,7 +315,9 @@ def with_own_clock(database_url):
 
 
 @pytest.mark.parametrize("jump_ns", [HOUR_NS, -HOUR_NS])
-def test_a_jump_of_the_wall_clock_is_not_felt(with_own_clock, monkeypatch, jump_ns):
+def test_a_jump_of_the_wall_clock_is_not_felt(
+    with_own_clock: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, jump_ns: int
+) -> None:
     database = with_own_clock()
     before = now(database)
     real = time.time_ns
@@ -305,7 +325,9 @@ def test_a_jump_of_the_wall_clock_is_not_felt(with_own_clock, monkeypatch, jump_
     assert 0 <= now(database) - before < 60_000_000
 
 
-def test_a_restart_with_a_clock_set_back_does_not_go_back(with_own_clock, monkeypatch):
+def test_a_restart_with_a_clock_set_back_does_not_go_back(
+    with_own_clock: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = with_own_clock()
     latest = max(now(first) for _ in range(5))
     first.close()
@@ -316,7 +338,9 @@ def test_a_restart_with_a_clock_set_back_does_not_go_back(with_own_clock, monkey
 
 
 @on_sqlite
-def test_a_restart_with_a_clock_set_forward_follows_it(with_own_clock, monkeypatch):
+def test_a_restart_with_a_clock_set_forward_follows_it(
+    with_own_clock: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = with_own_clock()
     before = now(first)
     first.close()
@@ -325,8 +349,8 @@ def test_a_restart_with_a_clock_set_forward_follows_it(with_own_clock, monkeypat
     assert now(with_own_clock()) - before >= HOUR_NS // 1000
 
 
-def test_time_does_not_pass_within_a_transaction(database):
-    def look(tx):
+def test_time_does_not_pass_within_a_transaction(database: Database) -> None:
+    def look(tx: Transaction) -> int:
         first = tx.now_us
         time.sleep(0.01)
         return tx.now_us - first

@@ -1,11 +1,15 @@
 """The feed of events, and keys that make requests safe to repeat."""
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import pytest
-from tests.support.store_fixtures import declared
+from tests.support.database_fixtures import AdjustableClock
+from tests.support.store_fixtures import Lab, declared
 
 from marey_schemas.access import ProjectChange, ProjectCreate
+from marey_schemas.items import Event
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
 from marey_server.errors import (
@@ -17,13 +21,14 @@ from marey_server.errors import (
 )
 from marey_server.store import events, idempotency, items, projects
 from marey_server.store.idempotency import LIFETIME_US, StoredAnswer
+from marey_server.store.transaction import Transaction
 
 
-def feed(lab, after=0, **kwargs):
+def feed(lab: Lab, after: int = 0, **kwargs: Any) -> list[Event]:
     return lab.read(events.list_events, "lab", after=after, **kwargs)
 
 
-def test_what_happens_is_told_in_order_with_who_did_it(lab):
+def test_what_happens_is_told_in_order_with_who_did_it(lab: Lab) -> None:
     rig = lab.add_skeleton()
     clip = lab.add_clip(rig, who=lab.contributor)
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
@@ -36,7 +41,7 @@ def test_what_happens_is_told_in_order_with_who_did_it(lab):
     assert {event.project for event in feed(lab)} == {"lab"}
 
 
-def test_the_feed_goes_on_after_the_last_event_received(lab):
+def test_the_feed_goes_on_after_the_last_event_received(lab: Lab) -> None:
     for number in range(5):
         lab.add_skeleton(f"rig {number}", bone_m=number + 1)
     whole = [event.seq for event in feed(lab)]
@@ -48,19 +53,19 @@ def test_the_feed_goes_on_after_the_last_event_received(lab):
     assert feed(lab, after=whole[-1]) == []
 
 
-def test_what_failed_did_not_happen(lab):
+def test_what_failed_did_not_happen(lab: Lab) -> None:
     before = feed(lab)
     with pytest.raises(ConflictProblem):
         lab.write(projects.create_project, ProjectCreate(name="lab"))
     assert feed(lab) == before
 
 
-def test_no_event_is_missed_however_transactions_overlap(lab, open_database):
+def test_no_event_is_missed_however_transactions_overlap(lab: Lab, open_database: Callable[..., Any]) -> None:
     """A transaction that began first and commits last: a reader in between does not step over its event."""
     other = open_database()
     started, go_on = threading.Event(), threading.Event()
 
-    def slow(tx):
+    def slow(tx: Transaction) -> None:
         tx.emit("slow", "s", project_id=project_id)
         started.set()
         go_on.wait(10)
@@ -81,7 +86,7 @@ def test_no_event_is_missed_however_transactions_overlap(lab, open_database):
     assert sorted(told) == (["slow"] if lab.database.is_sqlite else ["quick", "slow"])
 
 
-def test_events_are_for_members_and_administrators(lab):
+def test_events_are_for_members_and_administrators(lab: Lab) -> None:
     required = declared("GET", "/projects/{project}/events")
     lab.make_public()
     with pytest.raises(UnauthenticatedProblem):
@@ -99,7 +104,7 @@ def test_events_are_for_members_and_administrators(lab):
 # -- idempotency ------------------------------------------------------------------------------------------------------
 
 
-def once(tx, key="k", fingerprint="f", *, fail=False):
+def once(tx: Transaction, key: str = "k", fingerprint: str = "f", *, fail: bool = False) -> StoredAnswer | None:
     """A request that counts up the project's title, once per key."""
     stored = idempotency.begin(tx, key, fingerprint)
     if stored is not None:
@@ -112,24 +117,24 @@ def once(tx, key="k", fingerprint="f", *, fail=False):
     return None
 
 
-def count(lab):
+def count(lab: Lab) -> int:
     return len(lab.read(projects.read_project, "lab").title or "")
 
 
-def test_a_request_sent_again_is_done_once_and_answered_the_same(lab):
+def test_a_request_sent_again_is_done_once_and_answered_the_same(lab: Lab) -> None:
     assert lab.write(once) is None
     assert lab.write(once) == StoredAnswer(201, {"Location": "/x"}, b"body")
     assert count(lab) == 1
 
 
-def test_a_request_sent_by_many_connections_at_once_is_done_once(lab):
+def test_a_request_sent_by_many_connections_at_once_is_done_once(lab: Lab) -> None:
     futures = [lab.database.submit_write(lab.owner, once) for _ in range(8)]
     answers = [future.result(60) for future in futures]
     assert answers.count(None) == 1
     assert count(lab) == 1
 
 
-def test_a_key_stands_for_one_request_of_one_caller(lab):
+def test_a_key_stands_for_one_request_of_one_caller(lab: Lab) -> None:
     lab.write(once)
     with pytest.raises(InvalidProblem) as refused:
         lab.write(once, fingerprint="other")
@@ -139,20 +144,20 @@ def test_a_key_stands_for_one_request_of_one_caller(lab):
     assert count(lab) == 2
 
 
-def test_a_request_that_failed_may_be_sent_again(lab):
+def test_a_request_that_failed_may_be_sent_again(lab: Lab) -> None:
     with pytest.raises(InvalidProblem):
         lab.write(once, fail=True)
     assert lab.write(once) is None
     assert count(lab) == 1
 
 
-def test_a_key_expires(lab, clock):
+def test_a_key_expires(lab: Lab, clock: AdjustableClock) -> None:
     lab.write(once)
     clock.advance(LIFETIME_US / 1e6 + 1)
     assert lab.write(once, fingerprint="other") is None
     assert count(lab) == 2
 
 
-def test_hidden_projects_have_no_feed(lab):
+def test_hidden_projects_have_no_feed(lab: Lab) -> None:
     with pytest.raises(NotFoundProblem):
         lab.read(events.list_events, "lab", who=lab.stranger)

@@ -1,10 +1,13 @@
 """Errors of fields have the same form in bodies, documents and parameters of jobs."""
 
+from typing import Any
+
 import pytest
 from pydantic import ValidationError
 
 from marey_schemas.editing.commands import Trim
 from marey_schemas.editing.edits import EditDocument
+from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 from marey_server.store import documents
@@ -12,23 +15,23 @@ from marey_server.store import documents
 BACKWARDS = {"command": "trim", "start": 5, "stop": 2}
 
 
-def told(model, tree):
+def told(model: Any, tree: dict[str, Any]) -> list[FieldError]:
     with pytest.raises(ValidationError) as refused:
         model.model_validate(tree)
     return field_errors(refused.value, tree)
 
 
-def test_pointers_escape_as_rfc_6901_says():
+def test_pointers_escape_as_rfc_6901_says() -> None:
     assert json_pointer(["a/b", "m~n", "0"]) == "/a~1b/m~0n/0"
 
 
-def test_a_rule_of_ours_is_told_in_its_own_words():
+def test_a_rule_of_ours_is_told_in_its_own_words() -> None:
     (fault,) = told(Trim, BACKWARDS)
     assert (fault.pointer, fault.code) == ("", "value-error")
     assert fault.detail == "the stop 2 must lie after the start 5"
 
 
-def test_a_fault_of_a_document_is_told_as_one_of_a_body():
+def test_a_fault_of_a_document_is_told_as_one_of_a_body() -> None:
     tree = {"schema": "marey/edit@1", "commands": [BACKWARDS | {"name/of~it": 1}]}
     with pytest.raises(InvalidProblem) as refused:
         documents.prepare_document(tree)
@@ -37,5 +40,5 @@ def test_a_fault_of_a_document_is_told_as_one_of_a_body():
     assert (first.pointer, first.code) == ("/commands/0/name~1of~0it", "extra-forbidden")
 
 
-def test_only_so_many_faults_are_told():
+def test_only_so_many_faults_are_told() -> None:
     assert len(told(Trim, {"command": "trim", **{f"f{number}": 1 for number in range(100)}})) == MAX_ERRORS

@@ -1,14 +1,19 @@
 """The check finds every kind of damage, and nothing where there is none."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import sqlalchemy
+from sqlalchemy import ScalarSelect
+from tests.support.store_fixtures import Lab
 
 from marey_schemas.encoding import blocks
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.store import blobs, fsck, items, uploads
 from marey_server.store.blobs import digest_of
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import (
     blob,
     blob_chunk,
@@ -25,25 +30,31 @@ from marey_server.store.tables import (
 FILE = b"HIERARCHY" * 1000
 
 
-@pytest.fixture
-def full(lab):
+class FullLab(Lab):
     """A lab with a bit of everything."""
-    lab.write(blobs.put_blob, FILE)
-    lab.rig = lab.add_skeleton()
-    lab.clip = lab.add_clip(lab.rig, collection="a/b", info={"source": {"file": digest_of(FILE)}}, tags=("t",))
-    lab.write(items.put_part, "lab", Kind.CLIP, lab.clip.id, "info", {"subject": "x"}, expected_rev=None)
-    study = {"schema": "marey/document@1", "x": np.arange(5.0), "blob": digest_of(FILE)}
-    lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="s", parts={"study": study}))
-    sent = lab.write(uploads.create_upload, 10)
-    lab.write(uploads.append, sent.id, 0, b"12345")
-    return lab
+
+    def __init__(self, database: Database) -> None:
+        super().__init__(database)
+        self.write(blobs.put_blob, FILE)
+        self.rig = self.add_skeleton()
+        clip = self.add_clip(self.rig, collection="a/b", info={"source": {"file": digest_of(FILE)}}, tags=("t",))
+        self.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", {"subject": "x"}, expected_rev=None)
+        study = {"schema": "marey/document@1", "x": np.arange(5.0), "blob": digest_of(FILE)}
+        self.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="s", parts={"study": study}))
+        sent = self.write(uploads.create_upload, 10)
+        self.write(uploads.append, sent.id, 0, b"12345")
 
 
-def findings(lab):
+@pytest.fixture
+def full(database: Database) -> FullLab:
+    return FullLab(database)
+
+
+def findings(lab: Lab) -> set[str]:
     return {finding.code for finding in fsck.check_store(lab.database)}
 
 
-def damage(lab, *statements):
+def damage(lab: Lab, *statements: Any) -> None:
     """Change rows behind the store's back, foreign keys or not."""
     with lab.database.engine.connect() as connection:
         driver = connection.connection.driver_connection
@@ -56,14 +67,14 @@ def damage(lab, *statements):
             driver.execute("PRAGMA foreign_keys = ON")
 
 
-def test_a_sound_store_has_no_findings(full):
+def test_a_sound_store_has_no_findings(full: FullLab) -> None:
     seen = []
     assert list(fsck.check_store(full.database, progress=lambda what, count: seen.append((what, count)))) == []
     assert dict(seen)["items"] == 3
     assert dict(seen).keys() == {"blobs", "documents", "items", "collections", "uploads"}
 
 
-def motion_blob():
+def motion_blob() -> ScalarSelect[Any]:
     digests = sqlalchemy.select(document_blob.c.blob_digest).where(document_blob.c.pointer == "/poses")
     return digests.scalar_subquery()
 
@@ -132,13 +143,13 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("name", DAMAGES)
-def test_each_kind_of_damage_is_found(full, name):
+def test_each_kind_of_damage_is_found(full: FullLab, name: str) -> None:
     code, statement = DAMAGES[name]
     damage(full, statement)
     assert code in findings(full)
 
 
-def test_lost_rows_that_others_refer_to_are_found_on_sqlite(full):
+def test_lost_rows_that_others_refer_to_are_found_on_sqlite(full: FullLab) -> None:
     if not full.database.is_sqlite:
         with pytest.raises(sqlalchemy.exc.IntegrityError):  # Postgres does not let it happen
             damage(full, sqlalchemy.delete(document))
@@ -147,14 +158,14 @@ def test_lost_rows_that_others_refer_to_are_found_on_sqlite(full):
     assert {"dangling-reference", "document-lost"} <= findings(full)
 
 
-def test_a_motion_whose_skeleton_is_gone_is_found(full):
+def test_a_motion_whose_skeleton_is_gone_is_found(full: FullLab) -> None:
     on_rig = (lineage, revision_part, revision)
     statements = [sqlalchemy.delete(table).where(table.c.item_id == full.rig.id) for table in on_rig[1:]]
     damage(full, *statements)
     assert "dangling-reference" in findings(full)
 
 
-def test_checking_changes_nothing_and_works_beside_writers(full):
+def test_checking_changes_nothing_and_works_beside_writers(full: FullLab) -> None:
     first = fsck.check_store(full.database)
     next(first, None)
     full.add_skeleton("another", joints=4)

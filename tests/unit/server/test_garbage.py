@@ -1,32 +1,40 @@
 """Garbage collection beside everything else: nothing that is referred to is ever deleted."""
 
 import threading
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import sqlalchemy
+from sqlalchemy import Table
+from tests.support.database_fixtures import AdjustableClock
+from tests.support.store_fixtures import Lab
 
-from marey_schemas.items import ItemCreate
+from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem
 from marey_server.store import blobs, documents, fsck, garbage, items
 from marey_server.store.blobs import GRACE_US, digest_of
 from marey_server.store.tables import attempt, blob, document, job, staged_output
+from marey_server.store.transaction import Transaction
 
 LONG_S = GRACE_US / 1e6 + 1
 FILE = b"a file"
 TREE = {"schema": "marey/document@1", "blob": digest_of(FILE)}
 
 
-def rows(lab, table):
+def rows(lab: Lab, table: Table[Any]) -> set[str]:
     return set(lab.read(lambda tx: tx.execute(sqlalchemy.select(table.c.digest)).scalars().all()))
 
 
-def publish_study(tx, name="s"):
+def publish_study(tx: Transaction, name: str = "s") -> Item:
     return items.create_item(tx, "lab", Kind.STUDY, ItemCreate(name=name, parts={"study": TREE}))
 
 
-def test_what_nothing_refers_to_goes_after_a_day_and_what_something_refers_to_stays(lab, clock):
+def test_what_nothing_refers_to_goes_after_a_day_and_what_something_refers_to_stays(
+    lab: Lab, clock: AdjustableClock
+) -> None:
     rig = lab.add_skeleton()
     clip = lab.add_clip(rig)
     lab.write(blobs.put_blob, FILE)
@@ -45,7 +53,9 @@ def test_what_nothing_refers_to_goes_after_a_day_and_what_something_refers_to_st
     assert list(fsck.check_store(lab.database)) == []
 
 
-def test_arrays_go_with_the_document_that_held_them_unless_another_holds_them_too(lab, clock):
+def test_arrays_go_with_the_document_that_held_them_unless_another_holds_them_too(
+    lab: Lab, clock: AdjustableClock
+) -> None:
     import numpy as np
 
     shared, own = np.arange(10.0), np.arange(20.0)
@@ -58,10 +68,10 @@ def test_arrays_go_with_the_document_that_held_them_unless_another_holds_them_to
     assert list(fsck.check_store(lab.database)) == []
 
 
-def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab, clock):
+def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab: Lab, clock: AdjustableClock) -> None:
     staged = lab.write(documents.store_document, {"schema": "marey/document@1", "n": 1})
 
-    def stage(tx):
+    def stage(tx: Transaction) -> None:
         project_id = tx.execute(sqlalchemy.text("SELECT id FROM project")).scalar_one()
         given = {"kind": "x", "params": {}, "inputs": {}, "time_limit_s": 60, "memory_limit_mb": 64, "run_at_us": 0}
         given |= {"id": "job_1", "project_id": project_id, "created_us": 0, "state": "running"}
@@ -82,7 +92,7 @@ def test_what_a_running_attempt_has_staged_stays_for_as_long_as_it_runs(lab, clo
     assert rows(lab, blob) == {digest_of(FILE)}
 
 
-def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab):
+def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab: Lab) -> None:
     lab.write(blobs.put_blob, FILE, who=lab.reader)
     with pytest.raises(ConflictProblem):
         lab.write(blobs.keep_for_job, "job_1", [digest_of(FILE)])
@@ -90,17 +100,19 @@ def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab):
 
 @pytest.mark.parametrize("taker", ["publish", "put"])
 @pytest.mark.parametrize("first", ["taker", "collector"])
-def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(lab, clock, open_database, taker, first):
+def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(
+    lab: Lab, clock: AdjustableClock, open_database: Callable[..., Any], taker: str, first: str
+) -> None:
     """Two connections: one acts and waits before it commits, the other starts meanwhile."""
     lab.write(blobs.put_blob, FILE)
     lab.write(documents.store_document, TREE)
     clock.advance(LONG_S)
     acted, outcome = threading.Event(), []
 
-    def take(tx):
+    def take(tx: Transaction) -> Any:
         return publish_study(tx) if taker == "publish" else blobs.put_blob(tx, FILE)
 
-    def collect(tx):
+    def collect(tx: Transaction) -> int:
         garbage.delete_documents(tx, sorted(rows_of_document))
         return garbage.delete_blobs(tx, [digest_of(FILE)])
 
@@ -108,13 +120,13 @@ def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(lab
     leads, follows = (take, collect) if first == "taker" else (collect, take)
     other = open_database()
 
-    def lead(tx):
+    def lead(tx: Transaction) -> Any:
         answer = leads(tx)
         acted.set()
         thread.join(0.3)
         return answer
 
-    def follow():
+    def follow() -> None:
         acted.wait(10)
         try:
             outcome.append(other.write(lab.owner if follows is take else SYSTEM, follows))
@@ -135,11 +147,11 @@ def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(lab
         assert not there
 
 
-def test_nothing_is_lost_while_everybody_is_busy(lab, clock):
+def test_nothing_is_lost_while_everybody_is_busy(lab: Lab, clock: AdjustableClock) -> None:
     """Publishers, senders and collectors at once, with a grace of nothing: what was published is whole."""
     errors = []
 
-    def publisher(number):
+    def publisher(number: int) -> None:
         for turn in range(6):
             try:
                 lab.write(blobs.put_blob, FILE)
@@ -148,7 +160,7 @@ def test_nothing_is_lost_while_everybody_is_busy(lab, clock):
                 if error.error_code != "missing-blobs":
                     errors.append(error)
 
-    def collector():
+    def collector() -> None:
         for _ in range(10):
             garbage.collect_garbage(lab.database, grace_us=0)
 
@@ -162,7 +174,7 @@ def test_nothing_is_lost_while_everybody_is_busy(lab, clock):
     assert list(fsck.check_store(lab.database)) == []
 
 
-def test_expired_keys_go(lab, clock):
+def test_expired_keys_go(lab: Lab, clock: AdjustableClock) -> None:
     from marey_server.store import idempotency
 
     lab.write(idempotency.begin, "k", "f")

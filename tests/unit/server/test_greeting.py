@@ -29,24 +29,24 @@ def database_with_administrator(database: Database) -> Database:
     return database
 
 
-def test_where_the_defaults_lead_here_the_next_command_is_short(folder: Path):
+def test_where_the_defaults_lead_here_the_next_command_is_short(folder: Path) -> None:
     assert next_command(Settings(), USUAL) == " in this folder: marey project create lab"
     assert next_command(Settings(host="0.0.0.0"), "http://0.0.0.0:8460") == next_command(Settings(), USUAL)
 
 
-def test_elsewhere_it_names_the_server_and_the_token_file(folder: Path):
+def test_elsewhere_it_names_the_server_and_the_token_file(folder: Path) -> None:
     told = next_command(Settings(), "http://127.0.0.1:9000")
     file = folder / "marey-data" / "admin.token"
     assert told == f": marey --server http://127.0.0.1:9000 --token-file {file} project create lab"
 
 
-def test_without_a_token_the_next_thing_is_to_log_in(folder: Path):
+def test_without_a_token_the_next_thing_is_to_log_in(folder: Path) -> None:
     assert next_command(Settings(data=Path("other")), USUAL) == f": marey login --server {USUAL}"
 
 
 def test_the_administrator_the_data_and_the_place_of_the_token_are_told_and_no_secret(
     folder: Path, database_with_administrator: Database
-):
+) -> None:
     told = "\n".join(greeting(Settings(), USUAL, database_with_administrator))
     for part in (
         f"listening on {USUAL}",
@@ -61,6 +61,6 @@ def test_the_administrator_the_data_and_the_place_of_the_token_are_told_and_no_s
     assert "marey db admin-token" in "\n".join(greeting(Settings(), USUAL, database_with_administrator))
 
 
-def test_where_a_database_is_is_told_without_its_passwords():
+def test_where_a_database_is_is_told_without_its_passwords() -> None:
     with closing(Database("postgresql://marey:geheim@db.internal/marey?sslpassword=geheim")) as database:
         assert database.shown == "postgresql+psycopg://marey:***@db.internal/marey"

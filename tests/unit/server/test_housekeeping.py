@@ -1,21 +1,28 @@
 """Periodic chores of a server."""
 
 import asyncio
+from pathlib import Path
+
+import pytest
 
 from marey_server.app import create_app
 from marey_server.process import housekeeping
+from marey_server.process.services import Services
 from marey_server.process.settings import Settings
+from marey_server.store.database.connections import Database
 
 
-def test_garbage_is_collected_soon_after_the_start_and_again_later(database, tmp_path, monkeypatch):
+def test_garbage_is_collected_soon_after_the_start_and_again_later(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(housekeeping, "FIRST_GARBAGE_S", 0.02)
     monkeypatch.setattr(housekeeping, "GARBAGE_EVERY_S", 0.02)
     app = create_app(Settings(data=tmp_path, port=0), database)
 
-    async def two_rounds():
+    async def two_rounds() -> list[str]:
         rounds, both_done = [], asyncio.Event()
 
-        async def noted(services, holder):
+        async def noted(services: Services, holder: str) -> None:
             rounds.append(holder)
             if len(rounds) == 2:
                 both_done.set()

@@ -1,7 +1,9 @@
 """Files of an import are stored together; one that cannot be stored harms no other."""
 
+from typing import Any
+
 import pytest
-from tests.support.store_fixtures import motion_tree, skeleton_tree
+from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
 
 from marey_schemas.imports import Refusal, refused_entry
 from marey_schemas.kinds import Kind
@@ -12,7 +14,7 @@ from marey_server.store import blobs, items
 from marey_server.store.items import Draft
 
 
-def read_file(name, *, joints=3, seed=0):
+def read_file(name: Any, *, joints: Any = 3, seed: Any = 0) -> Any:
     """A file that was read: a skeleton and a clip on it; the clip has `joints` of the skeleton's three."""
     rig = f"{name}#skeleton"
     motion = motion_tree({"output": rig}, joints=joints, seed=seed)
@@ -23,11 +25,11 @@ def read_file(name, *, joints=3, seed=0):
     return PreparedImport(name, drafts=drafts, frames=5)
 
 
-def store(lab, *files):
+def store(lab: Any, *files: Any) -> Any:
     return lab.write(importing.publish, "lab", files)
 
 
-def test_files_become_items_in_their_order_with_one_skeleton(lab):
+def test_files_become_items_in_their_order_with_one_skeleton(lab: Lab) -> None:
     entries = store(lab, *(read_file(f"walk{number}.bvh", seed=number) for number in range(6)))
     assert [entry.name for entry in entries] == [f"walk{number}.bvh" for number in range(6)]
     assert {entry.status for entry in entries} == {"created"}
@@ -36,7 +38,7 @@ def test_files_become_items_in_their_order_with_one_skeleton(lab):
     assert [clip.id for clip in clips] == [entry.item for entry in entries]
 
 
-def test_a_file_that_cannot_be_stored_harms_no_other(lab):
+def test_a_file_that_cannot_be_stored_harms_no_other(lab: Lab) -> None:
     refused = PreparedImport("c.bvh", entry=refused_entry("c.bvh", Refusal(code="empty", detail="no frames")))
     entries = store(lab, read_file("a.bvh"), read_file("b.bvh", joints=2), refused, read_file("d.bvh", seed=1))
     assert [(entry.name, entry.status) for entry in entries] == [
@@ -46,14 +48,14 @@ def test_a_file_that_cannot_be_stored_harms_no_other(lab):
     assert [clip.name for clip in lab.read(items.list_items, "lab", Kind.CLIP, sort="name").items] == ["a", "d"]
 
 
-def test_the_same_take_twice_in_one_request_is_one_revision(lab):
+def test_the_same_take_twice_in_one_request_is_one_revision(lab: Lab) -> None:
     first, again = store(lab, read_file("walk.bvh"), read_file("walk.npz"))
     assert (first.status, again.status) == ("created", "unchanged")
     assert (first.item, first.revision) == (again.item, again.revision)
 
 
-def test_a_failure_of_the_database_is_none_of_a_file(lab, monkeypatch):
-    def fail(*_args, **_kwargs):
+def test_a_failure_of_the_database_is_none_of_a_file(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: Any, **_kwargs: Any) -> None:
         raise UnavailableProblem("The database does not answer.")
 
     monkeypatch.setattr(blobs, "store_blobs", fail)

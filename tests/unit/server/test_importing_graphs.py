@@ -1,7 +1,11 @@
 """A graph finds the models of its nodes by their names."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import pytest
 from tests.support.predecessor_models import imported
+from tests.support.store_fixtures import Lab
 
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_motion.importing.items import ImportedGraph
@@ -10,14 +14,16 @@ from marey_server.errors import InvalidProblem
 from marey_server.motions.importing import graph_draft
 from marey_server.store import items, projects
 from marey_server.store.items import Draft
+from marey_server.store.items.drafts import Published
+from marey_server.store.transaction import Transaction
 
 
 @pytest.fixture(scope="module")
-def parts():
+def parts() -> tuple[Mapping[str, Any], dict[str, Any]]:
     return imported()
 
 
-def add_models(lab, parts, *paths):
+def add_models(lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], *paths: Any) -> dict[str, str]:
     """The same model in several places; ids by path."""
     found, hierarchy = parts
     model = {**found["model"], "skeleton": {"output": "rig"}, "provenance": {}}
@@ -26,14 +32,14 @@ def add_models(lab, parts, *paths):
         folder, _, name = path.rpartition("/")
         drafts.append(Draft(path, Kind.MODEL, name, {"model": model}, folder))
 
-    def run(tx):
+    def run(tx: Transaction) -> list[Published]:
         project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
 
     return {one.name: one.item for one in lab.write(run)}
 
 
-def models_of(lab, *names):
+def models_of(lab: Lab, *names: Any) -> list[str]:
     """Ids of the models that the nodes of a graph in the folder `g` get."""
     nodes = {("idle", name): GraphNode("?", "idle", (("idle", name),)) for name in names}
     graph = PredecessorGraph(nodes, ("idle", names[0]))
@@ -42,7 +48,9 @@ def models_of(lab, *names):
     return [group[name]["model"]["item"] for name in names]
 
 
-def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_names(lab, parts):
+def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_names(
+    lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]]
+) -> None:
     add_models(lab, parts, "g/stand")
     with pytest.raises(InvalidProblem, match=r"no model is called 'stan\*'"):
         models_of(lab, "stan*")
@@ -50,12 +58,16 @@ def test_a_node_whose_name_ends_in_an_asterisk_is_no_search_by_the_start_of_name
     assert models_of(lab, "stan*") == [ids["g/stan*"]]
 
 
-def test_the_model_beside_the_graph_is_taken_however_many_there_are_elsewhere(lab, parts):
+def test_the_model_beside_the_graph_is_taken_however_many_there_are_elsewhere(
+    lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]]
+) -> None:
     ids = add_models(lab, parts, "g/stand", *(f"other {number:03d}/stand" for number in range(101)))
     assert models_of(lab, "stand") == [ids["g/stand"]]
 
 
-def test_the_only_model_elsewhere_is_taken_and_one_of_several_is_not_guessed(lab, parts):
+def test_the_only_model_elsewhere_is_taken_and_one_of_several_is_not_guessed(
+    lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]]
+) -> None:
     ids = add_models(lab, parts, "far/stand")
     assert models_of(lab, "stand") == [ids["far/stand"]]
     add_models(lab, parts, "farther/stand")

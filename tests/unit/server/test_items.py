@@ -1,15 +1,18 @@
 """Items: creating, revising, moving, deleting and reading them."""
 
 import threading
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.store_fixtures import Lab, declared, motion_tree, skeleton_tree
 
+from marey_motion.arrays import AnyFloats
 from marey_schemas.encoding.arrays import EncodedArray
-from marey_schemas.items import CollectionChange, CollectionCreate, ItemChange, ItemCreate
+from marey_schemas.items import CollectionChange, CollectionCreate, Item, ItemChange, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.errors import (
     ConflictProblem,
@@ -20,30 +23,32 @@ from marey_server.errors import (
     UnauthenticatedProblem,
 )
 from marey_server.store import collections, items, projects
+from marey_server.store.database.connections import Database
+from marey_server.store.transaction import Transaction
 
 
 @pytest.fixture
-def rig(lab):
+def rig(lab: Lab) -> Item:
     return lab.add_skeleton()
 
 
-def read(lab, clip, **kwargs):
+def read(lab: Lab, clip: Item, **kwargs: Any) -> Item:
     return lab.read(items.read_item, "lab", Kind.CLIP, clip.id, **kwargs)
 
 
-def put_info(lab, clip, expected_rev, **info):
+def put_info(lab: Lab, clip: Item, expected_rev: int | None, **info: Any) -> Item:
     tree = {"schema": "marey/clip-info@1", **info}
     return lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", tree, expected_rev=expected_rev)
 
 
-def change(lab, clip, expected_rev=None, **fields):
+def change(lab: Lab, clip: Item, expected_rev: int | None = None, **fields: Any) -> Item:
     return lab.write(items.change_item, "lab", Kind.CLIP, clip.id, ItemChange(**fields), expected_rev=expected_rev)
 
 
 # -- what is written is read ------------------------------------------------------------------------------------------
 
 
-def test_a_clip_comes_back_exactly(lab, rig):
+def test_a_clip_comes_back_exactly(lab: Lab, rig: Item) -> None:
     motion = motion_tree(rig, frames=7)
     clip = lab.add_clip(rig, "walk", collection="raw/monday", tags=("b", "a"), frames=7)
     assert (clip.name, clip.collection, clip.tags, clip.revision, clip.rev) == ("walk", "raw/monday", ("a", "b"), 1, 1)
@@ -57,7 +62,7 @@ def test_a_clip_comes_back_exactly(lab, rig):
     assert encoded.tree["poses"].decode().tobytes() == motion["poses"].tobytes()
 
 
-def test_the_summary_tells_what_lists_show(lab, rig):
+def test_the_summary_tells_what_lists_show(lab: Lab, rig: Item) -> None:
     info = {"checks": [{"code": "foot-slide", "message": "m"}, {"code": "foot-slide", "message": "n"}]}
     clip = lab.add_clip(rig, frames=60, info=info)
     assert clip.summary == {
@@ -67,17 +72,17 @@ def test_the_summary_tells_what_lists_show(lab, rig):
     assert rig.summary == {"joints": 3}
 
 
-def cut_part(tx, kind, item_id, part, **cut):
+def cut_part(tx: Transaction, kind: Kind, item_id: str, part: str, **cut: Any) -> dict[str, Any]:
     """Some frames and joints of a part."""
     return items.load_part(tx, items.find_part(tx, "lab", kind, item_id, part), **cut)
 
 
-def plain(array):
+def plain(array: Any) -> AnyFloats:
     return array.decode() if isinstance(array, EncodedArray) else array
 
 
 @pytest.mark.parametrize("arrays", ["encoded", "decoded"])
-def test_slices_of_a_motion_equal_slices_of_the_array(lab, rig, arrays):
+def test_slices_of_a_motion_equal_slices_of_the_array(lab: Lab, rig: Item, arrays: str) -> None:
     clip = lab.add_clip(rig, frames=40, seed=3)
     poses = motion_tree(rig, frames=40, seed=3)["poses"]
     for frames in (None, slice(0, 1), slice(5, 17), slice(30, 400), slice(-3, None)):
@@ -92,13 +97,13 @@ def test_slices_of_a_motion_equal_slices_of_the_array(lab, rig, arrays):
 
 
 @pytest.mark.parametrize("arrays", ["encoded", "decoded"])
-def test_slices_cut_translations_along(lab, rig, arrays):
+def test_slices_cut_translations_along(lab: Lab, rig: Item, arrays: str) -> None:
     motion = motion_tree(rig, frames=6)
     motion["translations"] = np.arange(6 * 2 * 3, dtype="<f4").reshape(6, 2, 3)
     motion["translated_joints"] = ["j1", "j2"]
     clip = lab.write(items.create_item, "lab", Kind.CLIP, ItemCreate(name="w", parts={"motion": motion}))
 
-    def cut(**kwargs):
+    def cut(**kwargs: Any) -> dict[str, Any]:
         return lab.read(cut_part, Kind.CLIP, clip.id, "motion", arrays=arrays, **kwargs)
 
     np.testing.assert_array_equal(plain(cut(frames=slice(2, 4))["translations"]), motion["translations"][2:4])
@@ -113,13 +118,13 @@ def test_slices_cut_translations_along(lab, rig, arrays):
     "cut",
     [{"joints": ["nose"]}, {"joints": []}, {"joints": ["j0", "j0"]}, {"frames": slice(5, 9)}, {"frames": slice(3, 2)}],
 )
-def test_a_cut_that_makes_no_sense_is_refused(lab, rig, cut):
+def test_a_cut_that_makes_no_sense_is_refused(lab: Lab, rig: Item, cut: dict[str, Any]) -> None:
     clip = lab.add_clip(rig, frames=5)
     with pytest.raises(InvalidProblem):
         lab.read(cut_part, Kind.CLIP, clip.id, "motion", **cut)
 
 
-def test_only_motions_are_cut(lab, rig):
+def test_only_motions_are_cut(lab: Lab, rig: Item) -> None:
     with pytest.raises(InvalidProblem):
         lab.read(cut_part, Kind.SKELETON, rig.id, "hierarchy", frames=slice(0, 1))
 
@@ -127,7 +132,7 @@ def test_only_motions_are_cut(lab, rig):
 # -- revisions --------------------------------------------------------------------------------------------------------
 
 
-def test_a_new_part_makes_a_revision_and_shares_the_others(lab, rig):
+def test_a_new_part_makes_a_revision_and_shares_the_others(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     revised = put_info(lab, clip, clip.rev, subject="Ann")
     assert (revised.revision, revised.rev) == (2, 2)
@@ -136,7 +141,7 @@ def test_a_new_part_makes_a_revision_and_shares_the_others(lab, rig):
     assert [one.revision for one in lab.read(items.list_revisions, "lab", Kind.CLIP, clip.id).items] == [2, 1]
 
 
-def test_the_same_content_again_makes_no_revision(lab, rig):
+def test_the_same_content_again_makes_no_revision(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, info={"subject": "Ann"})
     again = put_info(lab, clip, clip.rev, subject="Ann")
     assert (again.revision, again.rev) == (1, 1)
@@ -145,11 +150,11 @@ def test_the_same_content_again_makes_no_revision(lab, rig):
     assert same.revision == 1
 
 
-def test_old_revisions_stay_readable(lab, rig):
+def test_old_revisions_stay_readable(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, info={"subject": "Ann"})
     put_info(lab, clip, None, subject="Ben")
 
-    def subject(**kwargs):
+    def subject(**kwargs: Any) -> str:
         return lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "info", **kwargs).tree["subject"]
 
     assert (subject(), subject(revision=1), subject(revision=2)) == ("Ben", "Ann", "Ben")
@@ -158,7 +163,7 @@ def test_old_revisions_stay_readable(lab, rig):
             subject(revision=number)
 
 
-def test_summaries_follow_the_newest_revision(lab, rig):
+def test_summaries_follow_the_newest_revision(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, frames=5)
     longer = lab.write(
         items.put_part, "lab", Kind.CLIP, clip.id, "motion", motion_tree(rig, frames=9), expected_rev=None
@@ -168,7 +173,7 @@ def test_summaries_follow_the_newest_revision(lab, rig):
     assert (checked.summary["frames"], checked.summary["warnings"]) == (9, ["jump"])
 
 
-def test_authors_and_messages_are_kept(lab, rig):
+def test_authors_and_messages_are_kept(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, who=lab.contributor)
     revision = lab.read(items.read_revision, "lab", Kind.CLIP, clip.id, 1)
     assert (revision.author, revision.job) == (lab.contributor.user_name, None)
@@ -177,7 +182,7 @@ def test_authors_and_messages_are_kept(lab, rig):
 # -- preconditions ----------------------------------------------------------------------------------------------------
 
 
-def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab, rig):
+def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     renamed = change(lab, clip, clip.rev, name="run")
     for attempt in (
@@ -194,18 +199,18 @@ def test_a_change_of_a_state_that_has_passed_is_refused_and_changes_nothing(lab,
 
 
 @pytest.mark.parametrize("second", ["part", "name", "delete"])
-def test_of_two_changes_at_once_one_wins(lab, rig, open_database, second):
+def test_of_two_changes_at_once_one_wins(lab: Lab, rig: Item, open_database: Callable[..., Any], second: str) -> None:
     """The first writes and waits before it commits; the second starts meanwhile, expecting the same state."""
     clip = lab.add_clip(rig)
     other = open_database()
     written, outcome = threading.Event(), []
 
-    def first(tx):
+    def first(tx: Transaction) -> None:
         items.change_item(tx, "lab", Kind.CLIP, clip.id, ItemChange(name="first"), expected_rev=clip.rev)
         written.set()
         thread.join(0.3)
 
-    def run_second():
+    def run_second() -> None:
         written.wait(10)
         try:
             if second == "part":
@@ -240,7 +245,7 @@ def test_of_two_changes_at_once_one_wins(lab, rig, open_database, second):
     assert (after.name, after.revision, after.rev) == ("first", 1, 2)
 
 
-def test_many_changes_at_once_without_a_precondition_all_happen(lab, rig):
+def test_many_changes_at_once_without_a_precondition_all_happen(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     futures = [
         lab.database.submit_write(
@@ -256,7 +261,7 @@ def test_many_changes_at_once_without_a_precondition_all_happen(lab, rig):
 # -- names and places -------------------------------------------------------------------------------------------------
 
 
-def test_a_name_stands_once_per_kind_and_collection(lab, rig):
+def test_a_name_stands_once_per_kind_and_collection(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk", collection="a")
     with pytest.raises(ConflictProblem) as taken:
         lab.add_clip(rig, "walk", collection="a", seed=9)
@@ -264,14 +269,15 @@ def test_a_name_stands_once_per_kind_and_collection(lab, rig):
     lab.add_clip(rig, "walk", collection="b")
     lab.add_skeleton("walk")
     other = lab.add_clip(rig, "run", collection="a")
-    for fields in ({"name": "walk"}, {"name": "walk", "collection": "a"}):
+    changes: tuple[dict[str, Any], ...] = ({"name": "walk"}, {"name": "walk", "collection": "a"})
+    for fields in changes:
         with pytest.raises(ConflictProblem):
             change(lab, other, **fields)
     with pytest.raises(ConflictProblem):
         change(lab, clip, collection="b")
 
 
-def test_two_creators_of_one_name_make_one_item(lab, rig):
+def test_two_creators_of_one_name_make_one_item(lab: Lab, rig: Item) -> None:
     futures = [
         lab.database.submit_write(
             lab.owner, items.create_item, "lab", Kind.CLIP, ItemCreate(name="walk", parts={"motion": motion_tree(rig)})
@@ -284,7 +290,7 @@ def test_two_creators_of_one_name_make_one_item(lab, rig):
     assert len(lab.read(items.list_items, "lab", Kind.CLIP).items) == 1
 
 
-def test_renaming_moving_and_tagging(lab, rig):
+def test_renaming_moving_and_tagging(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk", tags=("a",))
     moved = change(lab, clip, name="run", collection="x/y", tags=("c", "b", "c"))
     assert (moved.name, moved.collection, moved.tags, moved.revision, moved.rev) == ("run", "x/y", ("b", "c"), 1, 2)
@@ -292,7 +298,7 @@ def test_renaming_moving_and_tagging(lab, rig):
     assert [one.path for one in lab.read(collections.list_collections, "lab").items] == ["x", "x/y"]
 
 
-def test_a_deleted_item_is_gone_until_it_is_restored(lab, rig):
+def test_a_deleted_item_is_gone_until_it_is_restored(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk", collection="a")
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=clip.rev)
     with pytest.raises(NotFoundProblem):
@@ -306,7 +312,7 @@ def test_a_deleted_item_is_gone_until_it_is_restored(lab, rig):
     assert (back.id, back.name, back.revision, back.rev) == (clip.id, "walk", 1, 3)
 
 
-def test_restoring_needs_the_name(lab, rig):
+def test_restoring_needs_the_name(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk")
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
     lab.add_clip(rig, "walk", seed=5)
@@ -314,7 +320,7 @@ def test_restoring_needs_the_name(lab, rig):
         lab.write(items.restore_item, "lab", Kind.CLIP, clip.id)
 
 
-def test_collections_take_their_contents_along(lab, rig):
+def test_collections_take_their_contents_along(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk", collection="raw/a")
     gone_before = lab.add_clip(rig, "old", collection="raw/a")
     lab.write(items.delete_item, "lab", Kind.CLIP, gone_before.id, expected_rev=None)
@@ -332,7 +338,7 @@ def test_collections_take_their_contents_along(lab, rig):
     assert [one.name for one in lab.read(items.list_items, "lab", Kind.CLIP).items] == ["walk"]
 
 
-def test_an_item_whose_collection_is_gone_comes_back_with_it(lab, rig):
+def test_an_item_whose_collection_is_gone_comes_back_with_it(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, "walk", collection="raw")
     lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
     raw = lab.read(collections.list_collections, "lab").items[0]
@@ -340,7 +346,7 @@ def test_an_item_whose_collection_is_gone_comes_back_with_it(lab, rig):
     assert lab.write(items.restore_item, "lab", Kind.CLIP, clip.id).collection == "raw"
 
 
-def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(lab):
+def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(lab: Lab) -> None:
     folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="a/b"))
     futures = [
@@ -357,7 +363,7 @@ def test_a_folder_moved_by_two_at_once_without_a_precondition_ends_at_one_place(
     assert paths == [last.path, f"{last.path}/b"]
 
 
-def test_a_folder_moves_however_long_the_paths_of_others_are(lab):
+def test_a_folder_moves_however_long_the_paths_of_others_are(lab: Lab) -> None:
     folder = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="a/b"))
     deep = "/".join(["d" * 200] * 5)  # twenty characters remain
@@ -370,7 +376,7 @@ def test_a_folder_moves_however_long_the_paths_of_others_are(lab):
     assert {change.path, f"{change.path}/b", deep} < set(paths)
 
 
-def test_collections_refuse_what_would_tangle_them(lab):
+def test_collections_refuse_what_would_tangle_them(lab: Lab) -> None:
     a = lab.write(collections.create_collection, "lab", CollectionCreate(path="a"))
     lab.write(collections.create_collection, "lab", CollectionCreate(path="ab/c"))
     with pytest.raises(ConflictProblem):
@@ -390,14 +396,14 @@ def test_collections_refuse_what_would_tangle_them(lab):
 # -- what a document may say ------------------------------------------------------------------------------------------
 
 
-def refused(lab, kind, parts):
+def refused(lab: Lab, kind: Kind, parts: dict[str, Any]) -> InvalidProblem:
     with pytest.raises(InvalidProblem) as error:
         lab.write(items.create_item, "lab", kind, ItemCreate(name="x", parts=parts))
     assert lab.read(items.list_items, "lab", kind, items.ItemFilters(name="x")).items == ()
     return error.value
 
 
-def test_documents_are_checked_against_their_schema(lab, rig):
+def test_documents_are_checked_against_their_schema(lab: Lab, rig: Item) -> None:
     assert refused(lab, Kind.SKELETON, {"hierarchy": {"joints": []}}).errors[0].pointer.startswith("/joints")
     assert refused(lab, Kind.SKELETON, {"hierarchy": []})
     assert refused(lab, Kind.SKELETON, {"shape": skeleton_tree()}).error_code == "no-part"
@@ -410,7 +416,7 @@ def test_documents_are_checked_against_their_schema(lab, rig):
     assert refused(lab, Kind.STUDY, {"study": {"schema": "marey/document@1", "x": float("nan")}})
 
 
-def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab, rig, database):
+def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab: Lab, rig: Item, database: Database) -> None:
     unknown = motion_tree({"item": "skeleton_x", "revision": 1})
     assert refused(lab, Kind.CLIP, {"motion": unknown}).error_code == "no-skeleton"
     assert refused(lab, Kind.CLIP, {"motion": motion_tree({"item": rig.id, "revision": 2})})
@@ -422,7 +428,7 @@ def test_a_motion_names_a_skeleton_of_the_project_with_its_joints(lab, rig, data
     assert refused(lab, Kind.CLIP, {"motion": motion_tree(elsewhere)}).error_code == "no-skeleton"
 
 
-def test_an_annotation_stays_within_its_clip(lab, rig):
+def test_an_annotation_stays_within_its_clip(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig, frames=10)
     ref = {"item": clip.id, "revision": 1}
     fits = {"clip": ref, "segments": [{"label": "a", "start": 0, "end": 10}], "keyframes": [{"label": "k", "frame": 9}]}
@@ -431,7 +437,7 @@ def test_an_annotation_stays_within_its_clip(lab, rig):
         assert refused(lab, Kind.ANNOTATION, {"annotation": {"clip": ref, **beyond}}).error_code == "beyond-end"
 
 
-def test_nobody_refers_to_stored_arrays_by_their_digest(lab, rig):
+def test_nobody_refers_to_stored_arrays_by_their_digest(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     body = lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion", arrays="none").tree
     assert set(body["poses"]) == {"dtype", "shape", "content"}
@@ -440,7 +446,7 @@ def test_nobody_refers_to_stored_arrays_by_their_digest(lab, rig):
     assert refused(lab, Kind.STUDY, {"study": study}).errors[0].pointer == "/stolen/0"
 
 
-def test_documents_of_other_kinds_hold_anything(lab):
+def test_documents_of_other_kinds_hold_anything(lab: Lab) -> None:
     study = {"schema": "marey/document@1", "n": [1, 2.5, None, True, "é"], "big": 2**62}
     study["a/b~c"] = {"x": np.arange(4, dtype="<i8")}
     made = lab.write(items.create_item, "lab", Kind.STUDY, ItemCreate(name="s", parts={"study": study}))
@@ -453,7 +459,7 @@ def test_documents_of_other_kinds_hold_anything(lab):
 # -- who may ----------------------------------------------------------------------------------------------------------
 
 
-def test_readers_read_contributors_change_maintainers_delete(lab, rig):
+def test_readers_read_contributors_change_maintainers_delete(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     request = ItemChange(name="n")
     for who, can_read, can_change, can_delete in (
@@ -481,7 +487,7 @@ def test_readers_read_contributors_change_maintainers_delete(lab, rig):
         lab.write(items.restore_item, "lab", Kind.CLIP, clip.id, who=lab.contributor, required=restoring)
 
 
-def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):
+def test_guests_of_a_public_project_read_and_change_nothing(lab: Lab, rig: Item) -> None:
     clip = lab.add_clip(rig)
     lab.make_public()
     assert read(lab, clip, who=lab.anonymous).id == clip.id
@@ -491,7 +497,7 @@ def test_guests_of_a_public_project_read_and_change_nothing(lab, rig):
         lab.write(items.put_part, "lab", Kind.CLIP, clip.id, "info", {}, expected_rev=None, who=lab.stranger)
 
 
-def test_an_item_is_found_only_under_its_own_kind_and_project(lab, rig, database):
+def test_an_item_is_found_only_under_its_own_kind_and_project(lab: Lab, rig: Item, database: Database) -> None:
     elsewhere = Lab(database, "elsewhere")
     with pytest.raises(NotFoundProblem):
         lab.read(items.read_item, "lab", Kind.CLIP, rig.id)

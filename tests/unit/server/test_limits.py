@@ -6,7 +6,7 @@ from marey_server.errors import TooManyRequestsProblem
 from marey_server.process.services import NAMES_REMEMBERED, TryLimit
 
 
-def test_tries_are_limited_by_key_and_come_back_with_time():
+def test_tries_are_limited_by_key_and_come_back_with_time() -> None:
     now = [0.0]
     limit = TryLimit(3, clock=lambda: now[0])
     for _ in range(3):
@@ -21,7 +21,7 @@ def test_tries_are_limited_by_key_and_come_back_with_time():
         limit.take("ann")
 
 
-def test_guesses_at_many_names_do_not_fill_the_memory():
+def test_guesses_at_many_names_do_not_fill_the_memory() -> None:
     limit = TryLimit(1)
     for number in range(NAMES_REMEMBERED + 100):
         limit.take(str(number))

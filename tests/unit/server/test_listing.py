@@ -1,17 +1,22 @@
 """Lists of items: filters, order, cursors."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples
 
+from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, InvalidProblem
 from marey_server.store import items, listing
+from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
+from marey_server.store.transaction import Transaction
 
 CLIPS = (  # name, collection, tags, frames
     ("walk 1", "raw/a", ("walk",), 10),
@@ -23,16 +28,22 @@ CLIPS = (  # name, collection, tags, frames
 )
 
 
+class FilledLab(Lab):
+    """A lab with the clips above, of one skeleton."""
+
+    def __init__(self, database: Database) -> None:
+        super().__init__(database)
+        self.rig = self.add_skeleton()
+        for seed, (name, collection, tags, frames) in enumerate(CLIPS):
+            self.add_clip(self.rig, name, collection=collection, tags=tags, frames=frames, seed=seed)
+
+
 @pytest.fixture
-def filled(lab):
-    rig = lab.add_skeleton()
-    for seed, (name, collection, tags, frames) in enumerate(CLIPS):
-        lab.add_clip(rig, name, collection=collection, tags=tags, frames=frames, seed=seed)
-    lab.rig = rig
-    return lab
+def filled(database: Database) -> FilledLab:
+    return FilledLab(database)
 
 
-def names(lab, sort="name", **filters):
+def names(lab: Lab, sort: str = "name", **filters: Any) -> list[str]:
     return [one.name for one in lab.read(items.list_items, "lab", Kind.CLIP, ItemFilters(**filters), sort=sort).items]
 
 
@@ -69,7 +80,7 @@ FILTERS: tuple[tuple[dict[str, Any], set[str]], ...] = (
 )
 
 
-def test_filters_choose(filled):
+def test_filters_choose(filled: FilledLab) -> None:
     for filters, expected in FILTERS:
         found = names(filled, **filters)
         assert set(found) == expected, filters
@@ -78,33 +89,33 @@ def test_filters_choose(filled):
         assert counted.count == len(expected), filters
 
 
-def test_clips_are_found_by_their_skeleton(filled):
+def test_clips_are_found_by_their_skeleton(filled: FilledLab) -> None:
     assert len(names(filled, skeleton=filled.rig.id)) == len(CLIPS)
 
 
-def test_order_is_that_of_code_points_on_every_database(filled):
+def test_order_is_that_of_code_points_on_every_database(filled: FilledLab) -> None:
     assert names(filled, sort="name") == sorted(name for name, *_ in CLIPS)
     assert names(filled, sort="-name") == sorted((name for name, *_ in CLIPS), reverse=True)
 
 
-def test_keys_of_an_order_have_directions_of_their_own(filled):
+def test_keys_of_an_order_have_directions_of_their_own(filled: FilledLab) -> None:
     by_frames = sorted(((frames, name) for name, _, _, frames in CLIPS), key=lambda pair: (-pair[0], pair[1]))
     assert names(filled, sort="-frames,name") == [name for _, name in by_frames]
 
 
 @pytest.mark.parametrize("sort", ["nose", "name,nose", "name,-name", "-", ",,nose"])
-def test_unknown_orders_are_refused(filled, sort):
+def test_unknown_orders_are_refused(filled: FilledLab, sort: str) -> None:
     with pytest.raises(BadRequestProblem):
         names(filled, sort=sort)
 
 
 @pytest.mark.parametrize("limit", [0, -1, 1001])
-def test_limits_out_of_range_are_refused(filled, limit):
+def test_limits_out_of_range_are_refused(filled: FilledLab, limit: int) -> None:
     with pytest.raises(BadRequestProblem):
         filled.read(items.list_items, "lab", Kind.CLIP, limit=limit)
 
 
-def test_fields_choose_what_is_shown(filled):
+def test_fields_choose_what_is_shown(filled: FilledLab) -> None:
     page = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(name="walk 2"), fields=("id", "name", "tags"))
     assert page.items[0].keys() == {"id", "name", "tags"}
     assert page.items[0]["tags"] == ["slow", "walk"]
@@ -112,7 +123,7 @@ def test_fields_choose_what_is_shown(filled):
         filled.read(items.list_items, "lab", Kind.CLIP, fields=("nose",))
 
 
-def pages(lab, limit, **kwargs):
+def pages(lab: Lab, limit: int, **kwargs: Any) -> Iterator[list[str]]:
     cursor = None
     while True:
         page = lab.read(items.list_items, "lab", Kind.CLIP, cursor=cursor, limit=limit, **kwargs)
@@ -122,14 +133,14 @@ def pages(lab, limit, **kwargs):
             return
 
 
-def test_pages_put_together_are_the_list(filled):
+def test_pages_put_together_are_the_list(filled: FilledLab) -> None:
     for sort in ("id", "name", "-name", "frames", "-frames,name", "frames,-name", "-created_at", "updated_at"):
         whole = names(filled, sort=sort)
         for limit in (1, 2, 4, 6, 7):
             assert [name for page in pages(filled, limit, sort=sort) for name in page] == whole, (sort, limit)
 
 
-def test_pages_of_one_folder_put_together_are_its_list(filled):
+def test_pages_of_one_folder_put_together_are_its_list(filled: FilledLab) -> None:
     for number in range(5):
         filled.add_clip(filled.rig, f"take {number}", collection="raw", seed=30 + number)
     folder = ItemFilters(directly_in="raw")
@@ -139,7 +150,7 @@ def test_pages_of_one_folder_put_together_are_its_list(filled):
         assert [name for page in pages(filled, 2, sort=sort, filters=folder) for name in page] == whole
 
 
-def test_deleted_items_are_found_directly_in_the_folder_they_were_in(filled):
+def test_deleted_items_are_found_directly_in_the_folder_they_were_in(filled: FilledLab) -> None:
     (gone,) = filled.read(items.list_items, "lab", Kind.CLIP, ItemFilters(name="Walk 10")).items
     filled.write(items.delete_item, "lab", Kind.CLIP, gone.id, expected_rev=None)
     assert names(filled, directly_in="raw") == []
@@ -147,7 +158,7 @@ def test_deleted_items_are_found_directly_in_the_folder_they_were_in(filled):
     assert names(filled, path="raw/Walk 10", deleted=True) == ["Walk 10"]
 
 
-def test_what_is_inserted_meanwhile_neither_repeats_nor_hides_anything(filled):
+def test_what_is_inserted_meanwhile_neither_repeats_nor_hides_anything(filled: FilledLab) -> None:
     seen = []
     for number, page in enumerate(pages(filled, 2, sort="name")):
         seen += page
@@ -159,8 +170,8 @@ def test_what_is_inserted_meanwhile_neither_repeats_nor_hides_anything(filled):
     assert [name for name in seen if not name.startswith("zz")] == sorted(name for name, *_ in CLIPS)
 
 
-def test_a_cursor_serves_only_the_list_it_came_from(filled):
-    def ask(cursor, **kwargs):
+def test_a_cursor_serves_only_the_list_it_came_from(filled: FilledLab) -> None:
+    def ask(cursor: str, **kwargs: Any) -> Page:
         return filled.read(items.list_items, "lab", Kind.CLIP, cursor=cursor, **kwargs)
 
     cursor = filled.read(items.list_items, "lab", Kind.CLIP, limit=2, sort="name").next_cursor
@@ -178,10 +189,10 @@ def test_a_cursor_serves_only_the_list_it_came_from(filled):
             wrong()
 
 
-def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
+def test_cursors_of_one_server_are_worth_nothing_on_another(filled: FilledLab) -> None:
     cursor = filled.read(items.list_items, "lab", Kind.CLIP, limit=2).next_cursor
 
-    def forget(tx):
+    def forget(tx: Transaction) -> None:
         tx.connection.exec_driver_sql("DELETE FROM server_state WHERE key = 'cursor_key'")
         listing.make_cursor_key(tx)
 
@@ -192,10 +203,10 @@ def test_cursors_of_one_server_are_worth_nothing_on_another(filled):
 
 @given(text=st.text(max_size=8), number=st.integers(-(2**70), 2**70))
 @settings(max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_filter_value_breaks_a_list(filled, text, number):
-    texts = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
+def test_no_filter_value_breaks_a_list(filled: FilledLab, text: str, number: int) -> None:
+    texts: list[dict[str, Any]] = [{"q": text}, {"name": text}, {"name": f"{text}*"}, {"path": text}, {"tags": (text,)}]
     texts += [{"directly_in": text}]
-    numbers = [{"frames_gte": number}, {"frames_lte": number}]
-    for filters in (*texts, {"collection": text}, {"skeleton": text}, *numbers):
+    texts += [{"collection": text}, {"skeleton": text}, {"frames_gte": number}, {"frames_lte": number}]
+    for filters in texts:
         with suppress(InvalidProblem):
             assert set(names(filled, **filters)) <= {name for name, *_ in CLIPS}

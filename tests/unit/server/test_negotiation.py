@@ -8,19 +8,19 @@ from marey_server.http.negotiation import BSON, DOCUMENT_FORMS, JSON, MODEL_FORM
 
 
 @pytest.mark.parametrize("accept", [None, "", "*/*", "application/*", "text/html, */*;q=0.1"])
-def test_a_caller_without_a_preference_gets_json(accept):
+def test_a_caller_without_a_preference_gets_json(accept: str | None) -> None:
     assert choose(accept, DOCUMENT_FORMS) is JSON
 
 
-def test_the_highest_quality_wins_over_the_order_of_the_header():
+def test_the_highest_quality_wins_over_the_order_of_the_header() -> None:
     assert choose("application/json;q=0.2, application/bson;q=0.9, application/msgpack;q=0.5", MODEL_FORMS) is BSON
 
 
-def test_a_specific_range_overrides_a_general_one():
+def test_a_specific_range_overrides_a_general_one() -> None:
     assert choose("*/*, application/json;q=0", MODEL_FORMS) is MSGPACK
 
 
-def test_blocks_are_sent_only_to_those_who_ask_for_them():
+def test_blocks_are_sent_only_to_those_who_ask_for_them() -> None:
     assert choose("application/msgpack", DOCUMENT_FORMS) is MSGPACK
     assert choose("application/msgpack; arrays=blocks", DOCUMENT_FORMS) is MSGPACK_BLOCKS
     assert (
@@ -28,34 +28,34 @@ def test_blocks_are_sent_only_to_those_who_ask_for_them():
     )
 
 
-def test_a_caller_who_accepts_nothing_on_offer_is_told_what_is():
+def test_a_caller_who_accepts_nothing_on_offer_is_told_what_is() -> None:
     with pytest.raises(NotAcceptableProblem) as refusal:
         choose("image/png, application/json;q=0, application/msgpack;q=0, application/bson;q=0", MODEL_FORMS)
     assert refusal.value.context["offered"] == ["application/json", "application/msgpack", "application/bson"]
 
 
 @pytest.mark.parametrize("accept", ["application/json;q=high", "json", ";;;", "application/json;q=-1"])
-def test_malformed_ranges_match_nothing(accept):
+def test_malformed_ranges_match_nothing(accept: str) -> None:
     with pytest.raises(NotAcceptableProblem):
         choose(accept, MODEL_FORMS)
 
 
-def test_a_body_without_a_type_is_json():
+def test_a_body_without_a_type_is_json() -> None:
     assert negotiation.body_type(None) == "application/json"
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/xml", "application/json; charset=latin-1"])
-def test_other_bodies_are_refused(content_type):
+def test_other_bodies_are_refused(content_type: str) -> None:
     with pytest.raises(UnsupportedMediaTypeProblem):
         negotiation.body_type(content_type)
 
 
-def test_compressed_bodies_are_refused():
+def test_compressed_bodies_are_refused() -> None:
     with pytest.raises(UnsupportedMediaTypeProblem):
         negotiation.require_plain_encoding("gzip")
 
 
-def test_only_bearer_tokens_are_credentials():
+def test_only_bearer_tokens_are_credentials() -> None:
     assert negotiation.bearer_token("bearer abc") == "abc"
     assert negotiation.bearer_token(None) is None
     for header in ("Basic dXNlcjpwdw==", "Bearer", "Bearer  ", "token"):

@@ -13,7 +13,7 @@ def record(message: str, **extra: object) -> logging.LogRecord:
     return logging.getLogger("marey").makeRecord("marey", logging.INFO, "f", 1, message, (), None, extra=extra)
 
 
-def test_a_log_line_is_one_json_object_whatever_it_says():
+def test_a_log_line_is_one_json_object_whatever_it_says() -> None:
     line = JsonFormatter().format(record('two\nlines "quoted"', request_id="abc", status=200, unknown="x"))
     assert "\n" not in line
     told = json.loads(line)
@@ -22,22 +22,22 @@ def test_a_log_line_is_one_json_object_whatever_it_says():
     assert "unknown" not in told
 
 
-def test_a_line_for_people_ends_with_the_request_id():
+def test_a_line_for_people_ends_with_the_request_id() -> None:
     assert TextFormatter().format(record("hello", request_id="abc")).endswith("hello [abc]")
 
 
 @pytest.mark.parametrize("given", [None, "", "short", "x" * 200, "with space here", "line\nfeed-feed", "<script>12345"])
-def test_an_id_that_is_not_sane_is_replaced(given):
+def test_an_id_that_is_not_sane_is_replaced(given: str | None) -> None:
     made = request_id(given)
     assert made != given
     assert len(made) == 24
 
 
-def test_a_sane_id_is_kept():
+def test_a_sane_id_is_kept() -> None:
     assert request_id("0123-abcd.EF:1_2") == "0123-abcd.EF:1_2"
 
 
-def test_metrics_of_two_servers_in_one_process_are_their_own():
+def test_metrics_of_two_servers_in_one_process_are_their_own() -> None:
     one, two = Metrics(), Metrics()
     one.count_request("GET", "/healthz", 200, 0.1, 5)
     assert b'route="/healthz"' in one.exposition()[0]

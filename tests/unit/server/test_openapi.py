@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ OPERATIONS = [
 ]
 
 
-def test_every_route_is_described_once_and_nothing_else_is():
+def test_every_route_is_described_once_and_nothing_else_is() -> None:
     described = {(path, method.upper()) for path, method, _ in OPERATIONS}
     assert described == {(route.template, route.operation.method) for route in ROUTES}
     names = [operation["operationId"] for _, _, operation in OPERATIONS]
@@ -29,7 +30,7 @@ def test_every_route_is_described_once_and_nothing_else_is():
 
 
 @pytest.mark.parametrize(("path", "operation"), [(path, operation) for path, _, operation in OPERATIONS])
-def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path, operation):
+def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path: str, operation: dict[str, Any]) -> None:
     assert operation["summary"]
     assert operation["x-access"]
     assert "default" in operation["responses"]
@@ -41,34 +42,34 @@ def test_an_operation_says_what_it_does_who_may_and_what_can_go_wrong(path, oper
     assert {parameter["name"] for parameter in DOCUMENT["paths"][path]["parameters"]} == variables
 
 
-def test_models_are_offered_in_every_form():
+def test_models_are_offered_in_every_form() -> None:
     content = DOCUMENT["paths"]["/api/v1/projects/{project}"]["get"]["responses"]["200"]["content"]
     assert set(content) == set(MEDIA_TYPES)
     part = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}/{item}/parts/{part}"]["get"]["responses"]["200"]
     assert "application/msgpack; arrays=blocks" in part["content"]
 
 
-def test_preconditions_and_keys_are_parameters():
+def test_preconditions_and_keys_are_parameters() -> None:
     patch = DOCUMENT["paths"]["/api/v1/projects/{project}"]["patch"]["parameters"]
     assert {parameter["name"]: parameter["required"] for parameter in patch} == {"If-Match": True}
     post = DOCUMENT["paths"]["/api/v1/projects"]["post"]["parameters"]
     assert [parameter["name"] for parameter in post] == ["Idempotency-Key"]
 
 
-def test_every_reference_leads_somewhere():
+def test_every_reference_leads_somewhere() -> None:
     references = set(re.findall(r'"#/components/(\w+)/([^"]+)"', json.dumps(DOCUMENT)))
     assert references
     for section, name in references:
         assert name in DOCUMENT["components"][section]
 
 
-def test_lists_that_can_show_some_fields_are_described_so():
+def test_lists_that_can_show_some_fields_are_described_so() -> None:
     schema = DOCUMENT["paths"]["/api/v1/projects/{project}/{kind}"]["get"]["responses"]["200"]["content"]
     element = schema["application/json"]["schema"]["properties"]["items"]["items"]["$ref"].rpartition("/")[2]
     assert "required" not in DOCUMENT["components"]["schemas"][element]
 
 
-def test_the_page_shows_every_operation_and_asks_nobody_else():
+def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
     page = render_page(DOCUMENT).decode()
     for path, _, operation in OPERATIONS:
         assert path in page
@@ -79,6 +80,6 @@ def test_the_page_shows_every_operation_and_asks_nobody_else():
     assert "id='problem-precondition-required'" in page
 
 
-def test_no_two_resources_share_an_address():
+def test_no_two_resources_share_an_address() -> None:
     with pytest.raises(ValueError, match="twice"):
         RouteTable(None, [*RESOURCES, RESOURCES[0]])

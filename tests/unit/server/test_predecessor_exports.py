@@ -1,6 +1,8 @@
 """Exports to the predecessor's formats: unchanged originals and newly written files."""
 
 import json
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -11,16 +13,20 @@ from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 
+Part = Literal["model", "tree", "alignment"]
+
 
 @pytest.fixture(scope="module")
-def stored():
+def stored() -> tuple[Mapping[str, Any], dict[str, Any]]:
     """The parts of a model with its tree, as they are stored when they are imported, and the skeleton's hierarchy."""
     parts, hierarchy = models.imported()
     model = {**parts["model"], "skeleton": {"item": "skeleton_1", "revision": 1}}
     return {"model": model, "tree": {**parts["tree"], "model_digest": FILE}}, hierarchy
 
 
-def test_unchanged_parts_are_given_back_as_their_files(stored):
+def test_unchanged_parts_are_given_back_as_their_files(
+    stored: tuple[Mapping[str, Any], dict[str, Any]],
+) -> None:
     parts, _ = stored
     model = unchanged_original(Kind.MODEL, parts, PredecessorOptions())
     tree = unchanged_original(Kind.MODEL, parts, PredecessorOptions(part="tree"))
@@ -28,7 +34,7 @@ def test_unchanged_parts_are_given_back_as_their_files(stored):
     assert (tree.name, tree.blob) == ("walk_cluster_tree.json", TREE_FILE)
 
 
-def test_a_changed_part_and_another_layout_are_not(stored):
+def test_a_changed_part_and_another_layout_are_not(stored: tuple[Mapping[str, Any], dict[str, Any]]) -> None:
     parts, _ = stored
     changed = {**parts, "model": {**parts["model"], "keyframes": {"contact": 3}}}
     assert unchanged_original(Kind.MODEL, changed, PredecessorOptions()) is None
@@ -38,7 +44,9 @@ def test_a_changed_part_and_another_layout_are_not(stored):
 
 
 @pytest.mark.parametrize("layout", [None, "2", "3"])
-def test_a_model_is_written_in_the_layout_asked_for(stored, layout):
+def test_a_model_is_written_in_the_layout_asked_for(
+    stored: tuple[Mapping[str, Any], dict[str, Any]], layout: Literal["2", "3"] | None
+) -> None:
     parts, hierarchy = stored
     name, data = write_predecessor(Kind.MODEL, "walk", parts, hierarchy, PredecessorOptions(layout=layout))
     document = json.loads(data)
@@ -48,7 +56,9 @@ def test_a_model_is_written_in_the_layout_asked_for(stored, layout):
     np.testing.assert_allclose(mean, models.layout_3()["sspm"]["mean"], atol=1e-9)
 
 
-def test_a_tree_is_written_with_the_spatial_part_of_its_samples(stored):
+def test_a_tree_is_written_with_the_spatial_part_of_its_samples(
+    stored: tuple[Mapping[str, Any], dict[str, Any]],
+) -> None:
     parts, hierarchy = stored
     name, data = write_predecessor(Kind.MODEL, "walk", parts, hierarchy, PredecessorOptions(part="tree"))
     document = json.loads(data)
@@ -59,7 +69,7 @@ def test_a_tree_is_written_with_the_spatial_part_of_its_samples(stored):
         write_predecessor(Kind.MODEL, "walk", {"model": parts["model"]}, hierarchy, PredecessorOptions(part="tree"))
 
 
-def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames():
+def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames() -> None:
     info = {
         "schema": "marey/alignment@1", "frame_rate_hz": 60.0, "source_frames": 5,
         "time_function": np.array([0.0, 1.4, 2.6, 4.0]), "keyframes": {"contact": 2},
@@ -73,7 +83,7 @@ def test_the_time_function_beside_an_aligned_clip_is_written_in_whole_frames():
     }
 
 
-def test_other_kinds_have_no_file_of_the_predecessor():
+def test_other_kinds_have_no_file_of_the_predecessor() -> None:
     with pytest.raises(InvalidProblem, match="exported as json"):
         write_predecessor(Kind.STUDY, "s", {"study": {}}, None, PredecessorOptions())
 
@@ -92,7 +102,9 @@ def test_other_kinds_have_no_file_of_the_predecessor():
     ],
 )
 @pytest.mark.parametrize("part", ["model", "tree"])
-def test_a_model_that_an_older_server_took_with_odd_notes_is_written_anew(stored, predecessor, part):
+def test_a_model_that_an_older_server_took_with_odd_notes_is_written_anew(
+    stored: tuple[Mapping[str, Any], dict[str, Any]], predecessor: Any, part: Part
+) -> None:
     parts, hierarchy = stored
     noted = {"provenance": {"predecessor": predecessor}, "training": {"examples": 5}}
     parts = {**parts, "model": {**parts["model"], **noted}}
@@ -101,7 +113,7 @@ def test_a_model_that_an_older_server_took_with_odd_notes_is_written_anew(stored
     assert json.loads(write_predecessor(Kind.MODEL, "walk", parts, hierarchy, options)[1])
 
 
-def test_a_tree_whose_nodes_are_none_is_refused(stored):
+def test_a_tree_whose_nodes_are_none_is_refused(stored: tuple[Mapping[str, Any], dict[str, Any]]) -> None:
     parts, hierarchy = stored
     parts = {**parts, "tree": {**parts["tree"], "children": np.ones_like(parts["tree"]["children"])}}
     with pytest.raises(InvalidProblem) as refused:
@@ -113,7 +125,7 @@ def test_a_tree_whose_nodes_are_none_is_refused(stored):
     ("kind", "part"),
     [(Kind.MODEL, "alignment"), (Kind.PROCESSED, "tree"), (Kind.CLIP, "model"), (Kind.ANNOTATION, "alignment")],
 )
-def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind, part):
+def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind: Kind, part: Part) -> None:
     with pytest.raises(InvalidProblem, match=f"{kind} has no part '{part}'") as refused:
         PredecessorOptions(part=part).require_part_of(kind)
     assert refused.value.error_code == "no-part"
@@ -121,5 +133,5 @@ def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind, part):
 
 
 @pytest.mark.parametrize(("kind", "part"), [(Kind.MODEL, "model"), (Kind.MODEL, "tree"), (Kind.PROCESSED, "alignment")])
-def test_a_part_that_items_of_a_kind_have_may_be_asked_for(kind, part):
+def test_a_part_that_items_of_a_kind_have_may_be_asked_for(kind: Kind, part: Part) -> None:
     PredecessorOptions(part=part).require_part_of(kind)

@@ -1,51 +1,56 @@
 """Results of imports and jobs become items: together, once, and with references between them."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any, Literal
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import event
 from tests.support.predecessor_models import imported
-from tests.support.store_fixtures import motion_tree, skeleton_tree
+from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
 from tests.support.tiers import examples
 
+from marey_schemas.items import Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import documents, events, items, projects
 from marey_server.store.database import prepared
 from marey_server.store.items import Draft, StoredDocument, publishing, references
+from marey_server.store.items.drafts import Published
+from marey_server.store.transaction import Transaction
 
 
-def publish(lab, *drafts, **kwargs):
-    def run(tx):
+def publish(lab: Lab, *drafts: Any, **kwargs: Any) -> list[Published]:
+    def run(tx: Transaction) -> list[Published]:
         project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id, **kwargs)
 
     return lab.write(run)
 
 
-def rig_draft(name="rig", reuse="by_content", **kwargs):
+def rig_draft(name: str = "rig", reuse: Literal["by_name", "by_content", "new"] = "by_content", **kwargs: Any) -> Draft:
     return Draft(name, Kind.SKELETON, name, {"hierarchy": skeleton_tree(**kwargs)}, reuse=reuse)
 
 
-def clip_draft(name="walk", rig="rig", **kwargs):
+def clip_draft(name: str = "walk", rig: str = "rig", **kwargs: Any) -> Draft:
     motion = motion_tree({"output": rig}, **kwargs)
     return Draft(name, Kind.CLIP, name, {"motion": motion}, collection="raw", tags=("new",))
 
 
-def listed(lab, kind):
+def listed(lab: Lab, kind: Kind) -> tuple[Any, ...]:
     return lab.read(items.list_items, "lab", kind, sort="name").items
 
 
-def test_drafts_refer_to_each_other_whatever_their_order(lab):
+def test_drafts_refer_to_each_other_whatever_their_order(lab: Lab) -> None:
     clip, rig = publish(lab, clip_draft(), rig_draft())
     part = lab.read(items.read_part, "lab", Kind.CLIP, clip.item, "motion")
     assert part.tree["skeleton"] == {"item": rig.item, "revision": 1}
     assert (clip.name, clip.created, rig.created) == ("walk", True, True)
 
 
-def test_publishing_the_same_again_makes_nothing_new(lab):
+def test_publishing_the_same_again_makes_nothing_new(lab: Lab) -> None:
     first = publish(lab, clip_draft(), rig_draft())
     again = publish(lab, clip_draft(), rig_draft())
     assert [(one.item, one.revision) for one in again] == [(one.item, one.revision) for one in first]
@@ -53,14 +58,14 @@ def test_publishing_the_same_again_makes_nothing_new(lab):
     assert len(listed(lab, Kind.CLIP)) == len(listed(lab, Kind.SKELETON)) == 1
 
 
-def test_other_content_under_a_name_is_its_next_revision(lab):
+def test_other_content_under_a_name_is_its_next_revision(lab: Lab) -> None:
     publish(lab, clip_draft(), rig_draft())
     clip, _ = publish(lab, clip_draft(seed=1, frames=9), rig_draft())
     assert (clip.revision, clip.created) == (2, True)
     assert listed(lab, Kind.CLIP)[0].summary["frames"] == 9
 
 
-def test_equal_content_is_found_under_any_name_even_after_its_other_parts_were_edited(lab):
+def test_equal_content_is_found_under_any_name_even_after_its_other_parts_were_edited(lab: Lab) -> None:
     (rig,) = publish(lab, rig_draft("rig"))
     mapping = {"joints": {"hips": "j0"}}
     lab.write(items.put_part, "lab", Kind.SKELETON, rig.item, "mapping", mapping, expected_rev=None)
@@ -68,7 +73,7 @@ def test_equal_content_is_found_under_any_name_even_after_its_other_parts_were_e
     assert (found.item, found.revision, found.created) == (rig.item, 2, False)
 
 
-def test_other_content_under_a_taken_name_is_numbered(lab):
+def test_other_content_under_a_taken_name_is_numbered(lab: Lab) -> None:
     publish(
         lab,
         rig_draft(bone_m=0.5),
@@ -78,14 +83,14 @@ def test_other_content_under_a_taken_name_is_numbered(lab):
     assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig-2", "rig-3"]
 
 
-def test_a_new_item_refuses_a_taken_name_and_nothing_is_published(lab):
+def test_a_new_item_refuses_a_taken_name_and_nothing_is_published(lab: Lab) -> None:
     publish(lab, rig_draft())
     with pytest.raises(ConflictProblem):
         publish(lab, clip_draft(), rig_draft(reuse="new"))
     assert listed(lab, Kind.CLIP) == ()
 
 
-def test_one_bad_draft_and_nothing_is_published(lab):
+def test_one_bad_draft_and_nothing_is_published(lab: Lab) -> None:
     with pytest.raises(InvalidProblem):
         publish(lab, rig_draft(), clip_draft("good"), clip_draft("bad", joints=2))
     assert listed(lab, Kind.SKELETON) == listed(lab, Kind.CLIP) == ()
@@ -94,30 +99,30 @@ def test_one_bad_draft_and_nothing_is_published(lab):
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar() == 0
 
 
-def test_names_within_a_batch_are_unique(lab):
+def test_names_within_a_batch_are_unique(lab: Lab) -> None:
     with pytest.raises(InvalidProblem):
         publish(lab, rig_draft(), rig_draft())
 
 
-def test_drafts_with_one_target_become_its_revisions_in_order(lab):
+def test_drafts_with_one_target_become_its_revisions_in_order(lab: Lab) -> None:
     drafts = [Draft(f"d{i}", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree(bone_m=i + 1)}) for i in range(3)]
     assert [(one.revision, one.created) for one in publish(lab, *drafts)] == [(1, True), (2, True), (3, True)]
 
 
-def test_drafts_of_one_name_keep_their_order_where_they_refer_to_others(lab):
+def test_drafts_of_one_name_keep_their_order_where_they_refer_to_others(lab: Lab) -> None:
     later = Draft("later", Kind.CLIP, "walk", {"motion": motion_tree({"output": "rig"}, frames=9)}, collection="raw")
     clip, _, second = publish(lab, clip_draft(), rig_draft(), later)
     assert (clip.revision, second.revision, second.item) == (1, 2, clip.item)
 
 
-def test_equal_content_within_a_batch_is_one_item(lab):
+def test_equal_content_within_a_batch_is_one_item(lab: Lab) -> None:
     rigs = publish(lab, rig_draft("a"), rig_draft("b", bone_m=0.7), rig_draft("c"))
     assert rigs[0].item == rigs[2].item != rigs[1].item
     assert [one.created for one in rigs] == [True, True, False]
     assert [one.name for one in listed(lab, Kind.SKELETON)] == ["a", "b"]
 
 
-def test_other_content_under_one_name_within_a_batch_is_numbered_in_order(lab):
+def test_other_content_under_one_name_within_a_batch_is_numbered_in_order(lab: Lab) -> None:
     rigs = [replace(rig_draft(f"file {i}", bone_m=0.5 + i % 3), item_name="rig") for i in range(5)]
     made = publish(lab, *rigs)
     assert [one.name for one in listed(lab, Kind.SKELETON)] == ["rig", "rig-2", "rig-3"]
@@ -125,19 +130,19 @@ def test_other_content_under_one_name_within_a_batch_is_numbered_in_order(lab):
     assert [one.item for one in made[3:]] == [one.item for one in made[:2]]
 
 
-def test_ids_of_a_batch_are_in_the_order_of_its_drafts(lab):
+def test_ids_of_a_batch_are_in_the_order_of_its_drafts(lab: Lab) -> None:
     made = publish(lab, rig_draft(), *(clip_draft(f"walk {number}", seed=number) for number in range(20)))
     assert sorted(one.item for one in made[1:]) == [one.item for one in made[1:]]
 
 
 @pytest.fixture
-def statements(lab, monkeypatch):
+def statements(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The statements that were run, those with many sets of values once."""
     run: list[str] = []
     event.listen(lab.database.engine, "before_cursor_execute", lambda *given: run.append(given[2]))
     straight = prepared._run
 
-    def recorded(connection, text, *args, **kwargs):
+    def recorded(connection: Any, text: Any, *args: Any, **kwargs: Any) -> Any:
         run.append(text)
         return straight(connection, text, *args, **kwargs)
 
@@ -145,7 +150,7 @@ def statements(lab, monkeypatch):
     return run
 
 
-def batch_of(count, *, start=0, name="walk"):
+def batch_of(count: Any, *, start: Any = 0, name: Any = "walk") -> Any:
     """Drafts of a skeleton, and of clips with a source each."""
     drafts = [replace(rig_draft(), item_name=f"rig of {name}")]
     for number in range(start, start + count):
@@ -153,13 +158,13 @@ def batch_of(count, *, start=0, name="walk"):
     return drafts
 
 
-def count_statements(lab, statements, *drafts, **kwargs):
+def count_statements(lab: Any, statements: Any, *drafts: Any, **kwargs: Any) -> Any:
     statements.clear()
     publish(lab, *drafts, **kwargs)
     return len([text for text in statements if "server_state" not in text])  # the clock is saved once a second
 
 
-def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab, statements):
+def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab: Lab, statements: Any) -> None:
     publish(lab, *batch_of(1))
     few = count_statements(lab, statements, *batch_of(2, start=10))
     many = count_statements(lab, statements, *batch_of(60, start=20))
@@ -167,11 +172,13 @@ def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab, stat
     assert len(listed(lab, Kind.CLIP)) == 50  # a page
 
 
-def test_staged_documents_of_a_large_batch_are_published_with_the_statements_of_a_small_one(lab, statements):
+def test_staged_documents_of_a_large_batch_are_published_with_the_statements_of_a_small_one(
+    lab: Lab, statements: Any
+) -> None:
     rig, *_ = publish(lab, rig_draft())
 
-    def staged(start, count):
-        def store(tx):
+    def staged(start: Any, count: Any) -> Any:
+        def store(tx: Any) -> Any:
             trees = [motion_tree({"output": "rig"}, seed=number) for number in range(start, start + count)]
             return [documents.store_document(tx, tree) for tree in trees]
 
@@ -187,8 +194,8 @@ def test_staged_documents_of_a_large_batch_are_published_with_the_statements_of_
     assert many == few
 
 
-def test_a_failure_in_the_middle_of_a_batch_leaves_nothing(lab, monkeypatch):
-    def fail(*_args, **_kwargs):
+def test_a_failure_in_the_middle_of_a_batch_leaves_nothing(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_args: Any, **_kwargs: Any) -> None:
         raise RuntimeError("cut off")
 
     monkeypatch.setattr(publishing, "write_revisions", fail)
@@ -199,14 +206,14 @@ def test_a_failure_in_the_middle_of_a_batch_leaves_nothing(lab, monkeypatch):
             assert connection.exec_driver_sql(f"SELECT count(*) FROM {table}").scalar() == 0
 
 
-def test_a_batch_larger_than_one_statement_takes_is_published_whole(lab, monkeypatch):
+def test_a_batch_larger_than_one_statement_takes_is_published_whole(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publishing, "DRAFTS_TOGETHER", 3)
     made = publish(lab, *batch_of(10))
     assert [one.created for one in made] == [True] * 11
     assert len({one.item for one in made}) == 11
 
 
-def test_staged_documents_with_references_keep_their_arrays(lab):
+def test_staged_documents_with_references_keep_their_arrays(lab: Lab) -> None:
     motion = motion_tree({"output": "rig"}, frames=6)
     staged = lab.write(documents.store_document, motion)
     draft = Draft("walk", Kind.CLIP, "walk", {"motion": StoredDocument(staged)})
@@ -216,7 +223,7 @@ def test_staged_documents_with_references_keep_their_arrays(lab):
     assert part.tree["skeleton"] == {"item": rig.item, "revision": 1}
 
 
-def test_sources_become_lineage_in_both_directions(lab):
+def test_sources_become_lineage_in_both_directions(lab: Lab) -> None:
     clip, rig = publish(lab, clip_draft(), rig_draft())
     sources = {"clip": [(clip.item, 1)], "skeleton": [(rig.item, 1)]}
     (made,) = publish(lab, Draft("out", Kind.STUDY, "out", {"study": {"n": 1}}, sources=sources))
@@ -228,14 +235,14 @@ def test_sources_become_lineage_in_both_directions(lab):
     assert [(edge.item, edge.revision, edge.role) for edge in back.outputs] == [(made.item, 1, "clip")]
 
 
-def test_what_was_made_from_something_that_changed_is_stale_through_any_number_of_steps(lab):
+def test_what_was_made_from_something_that_changed_is_stale_through_any_number_of_steps(lab: Lab) -> None:
     clip, _ = publish(lab, clip_draft(), rig_draft())
     steps = [clip]
     for step in range(3):
         draft = Draft("o", Kind.STUDY, f"s{step}", {"study": {"step": step}}, sources={"in": [(steps[-1].item, 1)]})
         steps += publish(lab, draft)
 
-    def staleness():
+    def staleness() -> Staleness:
         return lab.read(items.read_staleness, "lab", Kind.STUDY, steps[-1].item)
 
     assert not staleness().stale
@@ -244,7 +251,7 @@ def test_what_was_made_from_something_that_changed_is_stale_through_any_number_o
     assert [(edge.item, edge.revision) for edge in staleness().because] == [(clip.item, 1)]
 
 
-def item_that_was_added_to(lab):
+def item_that_was_added_to(lab: Lab) -> tuple[Published, Published]:
     """A clip, what was made of it, and a clip made of that which got a further part because of itself."""
     clip, _ = publish(lab, clip_draft(), rig_draft())
     (step,) = publish(lab, Draft("s", Kind.STUDY, "step", {"study": {"n": 1}}, sources={"clips": [(clip.item, 1)]}))
@@ -255,13 +262,13 @@ def item_that_was_added_to(lab):
     return clip, made
 
 
-def test_what_was_added_to_an_item_because_of_itself_is_not_stale(lab):
+def test_what_was_added_to_an_item_because_of_itself_is_not_stale(lab: Lab) -> None:
     _, made = item_that_was_added_to(lab)
     staleness = lab.read(items.read_staleness, "lab", Kind.CLIP, made.item)
     assert (staleness.revision, staleness.stale, staleness.because) == (2, False, ())
 
 
-def test_a_changed_input_is_told_through_what_was_added_to_an_item_later(lab):
+def test_a_changed_input_is_told_through_what_was_added_to_an_item_later(lab: Lab) -> None:
     clip, made = item_that_was_added_to(lab)
     lab.write(items.put_part, "lab", Kind.CLIP, clip.item, "info", {"subject": "x"}, expected_rev=None)
     staleness = lab.read(items.read_staleness, "lab", Kind.CLIP, made.item)
@@ -269,7 +276,7 @@ def test_a_changed_input_is_told_through_what_was_added_to_an_item_later(lab):
     assert [(edge.item, edge.revision, edge.role) for edge in staleness.because] == [(clip.item, 1, "clips")]
 
 
-def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab):
+def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab: Lab) -> None:
     _, made = item_that_was_added_to(lab)
     users = [
         Draft(f"u{n}", Kind.STUDY, f"user{n}", {"study": {"n": n}}, sources={"clip": [(made.item, n)]}) for n in (1, 2)
@@ -279,15 +286,15 @@ def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab):
     assert not lab.read(items.read_staleness, "lab", Kind.STUDY, new.item).stale
 
 
-def test_the_event_of_a_revision_names_it_and_its_place(lab):
+def test_the_event_of_a_revision_names_it_and_its_place(lab: Lab) -> None:
     (clip, _), _ = (publish(lab, clip_draft(seed=seed), rig_draft()) for seed in range(2))
     told = [(one.kind, one.body) for one in lab.read(events.list_events, "lab", after=0) if one.subject == clip.item]
     body = {"item_kind": "clip", "name": "walk", "collection": "raw", "job": None}
     assert told == [("item.created", {**body, "revision": 1}), ("item.revised", {**body, "revision": 2})]
 
 
-def test_many_publishers_of_one_skeleton_make_one(lab):
-    def run(tx, number):
+def test_many_publishers_of_one_skeleton_make_one(lab: Lab) -> None:
+    def run(tx: Transaction, number: int) -> list[Published]:
         project_row = projects.require(tx, "lab")
         drafts = [rig_draft(), clip_draft(f"walk {number}", seed=number)]
         return items.publish(tx, project_row, drafts, author_id=tx.principal.user_id)
@@ -298,7 +305,9 @@ def test_many_publishers_of_one_skeleton_make_one(lab):
     assert len(listed(lab, Kind.SKELETON)) == 1
 
 
-def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(lab, monkeypatch):
+def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     publish(lab, rig_draft(), clip_draft())
     monkeypatch.setattr(publishing, "write_head", lambda *_args: False)
     with pytest.raises(ConflictProblem, match="'walk' is being changed") as refused:
@@ -306,10 +315,10 @@ def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(lab, monk
     assert refused.value.error_code == "contended"
 
 
-def test_many_publishers_of_one_name_make_its_revisions(lab):
+def test_many_publishers_of_one_name_make_its_revisions(lab: Lab) -> None:
     publish(lab, rig_draft())
 
-    def run(tx, number):
+    def run(tx: Transaction, number: int) -> Published:
         project_row = projects.require(tx, "lab")
         return items.publish(tx, project_row, [rig_draft(), clip_draft(seed=number)], author_id=tx.principal.user_id)[1]
 
@@ -323,7 +332,7 @@ names = st.sampled_from("abcdef")
 
 @given(st.dictionaries(names, st.lists(names, max_size=3)))
 @settings(max_examples=examples(300))
-def test_references_are_followed_before_what_refers(refers):
+def test_references_are_followed_before_what_refers(refers: dict[str, Any]) -> None:
     try:
         order = references.in_order(refers)
     except InvalidProblem:
@@ -338,7 +347,7 @@ def test_references_are_followed_before_what_refers(refers):
         assert all(order.index(other) < order.index(name) for other in others if other in refers)
 
 
-def model_drafts(**changes):
+def model_drafts(**changes: Any) -> Iterator[Draft]:
     """A model with its tree, and their skeleton."""
     parts, hierarchy = imported()
     model = {**parts["model"], "skeleton": {"output": "rig"}, "provenance": {}, **changes}
@@ -346,7 +355,7 @@ def model_drafts(**changes):
     yield Draft("rig", Kind.SKELETON, "rig", {"hierarchy": hierarchy})
 
 
-def test_a_tree_gets_the_digest_of_the_model_it_comes_with(lab):
+def test_a_tree_gets_the_digest_of_the_model_it_comes_with(lab: Lab) -> None:
     publish(lab, *model_drafts())
     (model,) = listed(lab, Kind.MODEL)
     tree = lab.read(items.read_part, "lab", Kind.MODEL, model.id, "tree").tree
@@ -356,21 +365,21 @@ def test_a_tree_gets_the_digest_of_the_model_it_comes_with(lab):
 @pytest.mark.parametrize(
     "notes", [{"provenance": {"digest_of": ["x"]}}, {"headline": {"digest_of": "tree"}}, {"options": {"digest_of": 5}}]
 )
-def test_nothing_but_the_model_of_a_tree_is_replaced_by_a_digest(lab, notes):
+def test_nothing_but_the_model_of_a_tree_is_replaced_by_a_digest(lab: Lab, notes: dict[str, Any]) -> None:
     publish(lab, *model_drafts(**notes))
     (found,) = listed(lab, Kind.MODEL)
     model = lab.read(items.read_part, "lab", Kind.MODEL, found.id, "model").tree
     assert {name: model[name] for name in notes} == notes
 
 
-def test_a_tree_of_another_part_than_the_model_is_refused(lab):
+def test_a_tree_of_another_part_than_the_model_is_refused(lab: Lab) -> None:
     parts, _ = imported()
     with pytest.raises(InvalidProblem, match="model_digest"):
         publish(lab, Draft("walk", Kind.MODEL, "walk", {"tree": {**parts["tree"], "model_digest": {"digest_of": "x"}}}))
 
 
-def test_what_a_batch_refers_to_within_itself_is_not_read_again(lab, monkeypatch):
-    def look_up(_self, *key):
+def test_what_a_batch_refers_to_within_itself_is_not_read_again(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(_self: object, *key: object) -> None:
         raise AssertionError(f"read {key}")
 
     monkeypatch.setattr(references.ReferenceCheck, "_look_up", look_up)

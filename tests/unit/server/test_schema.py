@@ -1,16 +1,21 @@
 """The tables in the code and the tables that migrations make are the same, on both databases."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 import sqlalchemy
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from sqlalchemy import Connection, quoted_name
 
 from marey_server.store.database import schema
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
+from marey_server.store.transaction import Transaction
 
 
-def test_migrations_make_exactly_the_tables_of_the_code(database):
+def test_migrations_make_exactly_the_tables_of_the_code(database: Database) -> None:
     over_expressions = {
         index.name
         for table in metadata.tables.values()
@@ -18,7 +23,7 @@ def test_migrations_make_exactly_the_tables_of_the_code(database):
         if len(index.columns) < len(index.expressions)
     }  # Alembic cannot compare these; the next test does
 
-    def comparable(_thing, name, kind, _reflected, _other):
+    def comparable(_thing: Any, name: quoted_name, kind: str, _reflected: bool, _other: Any) -> bool:
         return kind != "index" or name not in over_expressions
 
     with database.engine.connect() as connection:
@@ -28,8 +33,8 @@ def test_migrations_make_exactly_the_tables_of_the_code(database):
         assert compare_metadata(context, metadata) == []
 
 
-def test_indexes_over_expressions_are_migrated_too(database):
-    def indexes(connection):
+def test_indexes_over_expressions_are_migrated_too(database: Database) -> None:
+    def indexes(connection: Connection) -> dict[str, str]:
         catalogue = (
             "SELECT name, sql FROM sqlite_master WHERE type = 'index' AND sql IS NOT NULL"
             if connection.dialect.name == "sqlite"
@@ -47,7 +52,7 @@ def test_indexes_over_expressions_are_migrated_too(database):
         assert indexes(connection) == migrated
 
 
-def test_a_database_is_at_head_only_after_the_upgrade(database, tmp_path):
+def test_a_database_is_at_head_only_after_the_upgrade(database: Database, tmp_path: Path) -> None:
     with database.engine.connect() as connection:
         assert schema.schema_at_head(connection)
     empty = Database(f"sqlite:///{tmp_path}/empty.db")
@@ -56,7 +61,7 @@ def test_a_database_is_at_head_only_after_the_upgrade(database, tmp_path):
     empty.close()
 
 
-def test_upgrading_again_keeps_everything(database, database_url):
+def test_upgrading_again_keeps_everything(database: Database, database_url: str) -> None:
     keys = sqlalchemy.select(metadata.tables["server_state"]).where(
         metadata.tables["server_state"].c.key.in_(["mine", "cursor_key"])
     )
@@ -69,8 +74,8 @@ def test_upgrading_again_keeps_everything(database, database_url):
         assert connection.execute(keys).all() == before
 
 
-def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path, monkeypatch):
-    def fail(_tx):
+def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_tx: Transaction) -> None:
         raise RuntimeError("power cut")
 
     monkeypatch.setattr(schema, "make_cursor_key", fail)

@@ -1,6 +1,7 @@
 """Sources of settings and their precedence."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -8,7 +9,7 @@ from pydantic import ValidationError
 from marey_server.process.settings import Settings, misspelt_variables
 
 
-def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "marey.toml").write_text('port = 1111\nhost = "10.0.0.1"\nlog_level = "error"\n')
     monkeypatch.setenv("MAREY_HOST", "10.0.0.2")
@@ -17,7 +18,7 @@ def test_flags_win_over_variables_and_variables_over_the_file(tmp_path: Path, mo
     assert (chosen.port, chosen.host, chosen.log_level) == (1111, "10.0.0.2", "debug")
 
 
-def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "marey.toml").write_text("prot = 1111\n")
     with pytest.raises(ValidationError, match="prot"):
@@ -25,21 +26,21 @@ def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize("given", [{"lease_ttl_s": 20}, {"heartbeat_s": 31}, {"lease_ttl_s": 1, "heartbeat_s": 0.6}])
-def test_leases_that_would_run_out_between_two_heartbeats_are_refused(given):
+def test_leases_that_would_run_out_between_two_heartbeats_are_refused(given: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"heartbeat_s\n.* at most half of lease_ttl_s, which is"):
         Settings(**given)
 
 
-def test_leases_of_two_heartbeats_are_taken():
+def test_leases_of_two_heartbeats_are_taken() -> None:
     assert Settings(lease_ttl_s=30).heartbeat_s == 15
 
 
-def test_every_setting_is_documented():
+def test_every_setting_is_documented() -> None:
     undocumented = {name for name, field in Settings.model_fields.items() if not field.description}
     assert undocumented <= {"log_level"}
 
 
-def test_a_misspelt_variable_is_told_with_the_one_that_was_meant():
+def test_a_misspelt_variable_is_told_with_the_one_that_was_meant() -> None:
     given = {"MAREY_LEASE_TLL_S": "3", "MAREY_PROT": "1", "MAREY_DATA_DIR": "x", "MAREY_PORT": "1", "marey_host": "x"}
     others = {"MAREY_URL": "x", "MAREY_TOKEN": "x", "MAREY_FAULT": "x", "MAREY_TEST_DATABASE_URL": "x", "PORT": "1"}
     assert misspelt_variables(given | others) == {

@@ -1,9 +1,14 @@
 """Users, passwords, tokens."""
 
+from datetime import datetime
+from typing import Any
+
 import pytest
 import sqlalchemy
+from tests.support.database_fixtures import AdjustableClock
+from tests.support.store_fixtures import Lab
 
-from marey_schemas.access import TokenCreate, UserChange, UserCreate
+from marey_schemas.access import NewToken, TokenCreate, UserChange, UserCreate
 from marey_schemas.jobs import JobState
 from marey_server.access import passwords
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
@@ -17,33 +22,35 @@ from marey_server.errors import (
     UnauthenticatedProblem,
 )
 from marey_server.store import projects, tokens, users
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import attempt, job
+from marey_server.store.transaction import Transaction
 
 
 @pytest.fixture(autouse=True)
-def cheap_hashes(monkeypatch):
+def cheap_hashes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(passwords, "LOG2_N", 4)
 
 
 @pytest.fixture
-def chief(database):
+def chief(database: Database) -> Principal:
     made = database.write(SYSTEM, users.ensure_first_administrator)
     assert made is not None
     return database.read(SYSTEM, users.administrator_principal)
 
 
-def sign_up(database, chief, name, password=None):
+def sign_up(database: Database, chief: Principal, name: str, password: str | None = None) -> Principal:
     hashed = passwords.hash_password(password) if password else None
     made = database.write(chief, users.create_user, UserCreate(name=name), password_hash=hashed)
     return Principal("user", made.id, name, scopes=("read", "write", "jobs"))
 
 
-def test_the_first_administrator_is_made_once(database, chief):
+def test_the_first_administrator_is_made_once(database: Database, chief: Principal) -> None:
     assert chief.administrator
     assert database.write(SYSTEM, users.ensure_first_administrator) is None
 
 
-def test_only_administrators_make_and_list_users(database, chief):
+def test_only_administrators_make_and_list_users(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann")
     weak_chief = Principal("user", chief.user_id, "admin", administrator=True, scopes=("read", "write"))
     for who in (ann, weak_chief):
@@ -56,20 +63,20 @@ def test_only_administrators_make_and_list_users(database, chief):
     assert [found.name for found in database.read(chief, users.list_users).items] == ["admin", "ann"]
 
 
-def test_names_of_users_are_unique(database, chief):
+def test_names_of_users_are_unique(database: Database, chief: Principal) -> None:
     sign_up(database, chief, "ann")
     with pytest.raises(ConflictProblem):
         sign_up(database, chief, "ann")
 
 
-def test_users_see_themselves_and_nobody_else(database, chief):
+def test_users_see_themselves_and_nobody_else(database: Database, chief: Principal) -> None:
     ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
     assert database.read(ann, users.find_user, "ann").name == "ann"
     with pytest.raises(NotFoundProblem):
         database.read(ben, users.find_user, "ann")
 
 
-def test_signing_in_needs_the_password(database, chief):
+def test_signing_in_needs_the_password(database: Database, chief: Principal) -> None:
     sign_up(database, chief, "ann", "correct horse")
     sign_up(database, chief, "silent")
     principal = database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
@@ -81,7 +88,7 @@ def test_signing_in_needs_the_password(database, chief):
         assert refused.value.detail == "The name or the password is wrong."
 
 
-def test_a_user_changes_the_password_with_the_current_one(database, chief):
+def test_a_user_changes_the_password_with_the_current_one(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann", "correct horse")
     change = UserChange(password="battery staple", current_password="correct horse")
     new = passwords.hash_password("battery staple")
@@ -94,14 +101,14 @@ def test_a_user_changes_the_password_with_the_current_one(database, chief):
         database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
 
 
-def test_users_cannot_raise_themselves(database, chief):
+def test_users_cannot_raise_themselves(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann")
     with pytest.raises(ForbiddenProblem):
         database.write(ann, users.change_user, "ann", UserChange(administrator=True), expected_rev=None)
     assert not database.read(ann, users.find_user, "ann").administrator
 
 
-def test_somebody_stays_administrator(database, chief):
+def test_somebody_stays_administrator(database: Database, chief: Principal) -> None:
     with pytest.raises(ConflictProblem):
         database.write(chief, users.delete_user, "admin", expected_rev=None)
     with pytest.raises(ConflictProblem):
@@ -109,11 +116,11 @@ def test_somebody_stays_administrator(database, chief):
     assert database.read(chief, users.find_user, "admin").administrator
 
 
-def make_token(database, who, **kwargs):
+def make_token(database: Database, who: Principal, **kwargs: Any) -> NewToken:
     return database.write(who, tokens.create_token, TokenCreate(name="mine", **kwargs))
 
 
-def test_a_token_stands_for_its_user_until_it_is_revoked(database, chief):
+def test_a_token_stands_for_its_user_until_it_is_revoked(database: Database, chief: Principal) -> None:
     ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
     made = make_token(database, ann, scopes=("read",))
     found = database.read(ANONYMOUS, tokens.resolve_token, made.secret)
@@ -126,7 +133,7 @@ def test_a_token_stands_for_its_user_until_it_is_revoked(database, chief):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
-def test_a_token_expires(database, chief, clock):
+def test_a_token_expires(database: Database, chief: Principal, clock: AdjustableClock) -> None:
     made = make_token(database, chief, expires_in_s=60)
     clock.advance(59)
     assert database.read(ANONYMOUS, tokens.resolve_token, made.secret).user_name == "admin"
@@ -135,7 +142,7 @@ def test_a_token_expires(database, chief, clock):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
-def test_tokens_of_a_disabled_user_are_worth_nothing(database, chief):
+def test_tokens_of_a_disabled_user_are_worth_nothing(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann", "correct horse")
     made = make_token(database, ann)
     database.write(chief, users.delete_user, "ann", expected_rev=None)
@@ -149,18 +156,18 @@ def test_tokens_of_a_disabled_user_are_worth_nothing(database, chief):
     "text",
     ["", "marey_", "marey_abc", "marey__x", "mareyjob_", "mareyjob_0", "Bearer x", "marey_\ud800_\x00", "x" * 5000],
 )
-def test_what_is_no_token_is_refused(database, text):
+def test_what_is_no_token_is_refused(database: Database, text: str) -> None:
     with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, text)
 
 
-def test_a_wrong_secret_behind_a_right_prefix_is_refused(database, chief):
+def test_a_wrong_secret_behind_a_right_prefix_is_refused(database: Database, chief: Principal) -> None:
     made = make_token(database, chief)
     with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret[:-1] + ("0" if made.secret[-1] != "0" else "1"))
 
 
-def test_no_secret_is_stored(database, chief):
+def test_no_secret_is_stored(database: Database, chief: Principal) -> None:
     made = make_token(database, chief)
     secret = made.secret.rpartition("_")[2]
     with database.engine.connect() as connection:
@@ -170,7 +177,7 @@ def test_no_secret_is_stored(database, chief):
             assert secret not in str(rows)
 
 
-def test_a_token_never_makes_a_stronger_one(database, chief):
+def test_a_token_never_makes_a_stronger_one(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann")
     weak = Principal("user", ann.user_id, "ann", scopes=("read", "write", "jobs!project=walk"))
     for scope in ("admin", "work", "jobs", "jobs!project=run"):
@@ -181,10 +188,10 @@ def test_a_token_never_makes_a_stronger_one(database, chief):
         make_token(database, Principal("user", ann.user_id, "ann", scopes=("read",)), scopes=("read",))
 
 
-def test_use_of_a_token_is_noted_once_an_hour(database, chief, clock):
+def test_use_of_a_token_is_noted_once_an_hour(database: Database, chief: Principal, clock: AdjustableClock) -> None:
     made = make_token(database, chief)
 
-    def last_used():
+    def last_used() -> datetime:
         return database.read(chief, tokens.list_tokens).items[0].last_used_at
 
     database.write(SYSTEM, tokens.note_use, made.id)
@@ -198,12 +205,12 @@ def test_use_of_a_token_is_noted_once_an_hour(database, chief, clock):
 
 
 @pytest.fixture
-def running(lab):
+def running(lab: Lab) -> str:
     """A job of the lab's contributor with a running attempt, and the attempt's token."""
     project_id = lab.read(projects.read_project, "lab").id
     issued = issue_attempt_token()
 
-    def insert(tx):
+    def insert(tx: Transaction) -> None:
         row = {
             "kind": "retarget",
             "params": {},
@@ -222,24 +229,24 @@ def running(lab):
     return issued.text
 
 
-def change_job(lab, **values):
+def change_job(lab: Lab, **values: Any) -> None:
     lab.write(lambda tx: tx.execute(sqlalchemy.update(job).values(**values)))
 
 
-def test_the_token_of_an_attempt_reads_its_project(lab, running):
+def test_the_token_of_an_attempt_reads_its_project(lab: Lab, running: str) -> None:
     found = lab.read(tokens.resolve_token, running)
     assert (found.kind, found.job_id, found.fence, found.scopes) == ("attempt", "job_1", 3, ("read",))
     assert lab.read(projects.read_project, "lab", who=found).name == "lab"
 
 
-def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab, running):
+def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab: Lab, running: str) -> None:
     change_job(lab, fence=4)
     with pytest.raises(LeaseLostProblem):
         lab.read(tokens.resolve_token, running)
 
 
 @pytest.mark.parametrize("state", [state for state in JobState if state is not JobState.RUNNING])
-def test_the_token_of_an_attempt_that_is_over_reads_nothing(lab, running, state):
+def test_the_token_of_an_attempt_that_is_over_reads_nothing(lab: Lab, running: str, state: JobState) -> None:
     change_job(lab, state=state)
     found = lab.read(tokens.resolve_token, running)
     with pytest.raises(NotFoundProblem):

@@ -1,6 +1,7 @@
 """Query parameters and bodies against their models."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +21,11 @@ class Query(PageQuery):
     tag_in: CommaSeparated = Field((), alias="tag.in")
 
 
-def pointers(refusal) -> set[str]:
+def pointers(refusal: pytest.ExceptionInfo[Any]) -> set[str]:
     return {error.pointer for error in refusal.value.errors}
 
 
-def test_parameters_are_read_by_the_names_they_have_in_addresses():
+def test_parameters_are_read_by_the_names_they_have_in_addresses() -> None:
     query = parse_query(Query, {"limit": [b"7"], "tag.in": [b"a,b"]})
     assert (query.limit, query.tag_in) == (7, ("a", "b"))
 
@@ -41,19 +42,19 @@ def test_parameters_are_read_by_the_names_they_have_in_addresses():
         ({"tag.in": [b"," * 300]}, {"tag.in"}),
     ],
 )
-def test_each_wrong_parameter_is_named(arguments, wrong):
+def test_each_wrong_parameter_is_named(arguments: dict[str, list[bytes]], wrong: set[str]) -> None:
     with pytest.raises(BadRequestProblem) as refusal:
         parse_query(Query, arguments)
     assert pointers(refusal) == wrong
 
 
-def test_where_nothing_can_be_asked_every_parameter_is_unknown():
+def test_where_nothing_can_be_asked_every_parameter_is_unknown() -> None:
     assert parse_query(None, {}) is None
     with pytest.raises(BadRequestProblem):
         parse_query(None, {"limit": [b"1"]})
 
 
-def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel_is_invalid():
+def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel_is_invalid() -> None:
     with pytest.raises(BadRequestProblem):
         decode_body(b"{", "application/json")
     with pytest.raises(BadRequestProblem):
@@ -62,14 +63,14 @@ def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel
         decode_body(b'{"a": NaN}', "application/json")
 
 
-def test_a_whole_number_is_an_integer_however_it_is_spelt():
+def test_a_whole_number_is_an_integer_however_it_is_spelt() -> None:
     assert validate_body(UploadCreate, json.loads('{"length": 5.0}')).length == 5
     for spelling in ("5", True, 5.5, None):
         with pytest.raises(InvalidProblem):
             validate_body(UploadCreate, {"length": spelling})
 
 
-def test_faults_point_into_the_body_even_inside_alternatives():
+def test_faults_point_into_the_body_even_inside_alternatives() -> None:
     with pytest.raises(InvalidProblem) as refusal:
         validate_body(JobCreate, {"kind": "x", "inputs": {"clips": [{"item": "a", "revision": 0}]}, "priority": 1000})
     assert "/priority" in pointers(refusal)
@@ -77,19 +78,19 @@ def test_faults_point_into_the_body_even_inside_alternatives():
     assert not any("ItemInput" in pointer for pointer in pointers(refusal))
 
 
-def test_a_missing_field_is_pointed_at_where_it_should_be():
+def test_a_missing_field_is_pointed_at_where_it_should_be() -> None:
     with pytest.raises(InvalidProblem) as refusal:
         validate_body(ProjectCreate, {})
     assert pointers(refusal) == {"/name"}
 
 
-def test_arrays_pass_through_untouched():
+def test_arrays_pass_through_untouched() -> None:
     array = np.zeros((2, 3), "<f4")
     made = validate_body(ItemCreate, {"name": "n", "parts": {"motion": {"poses": array}}})
     assert made.parts["motion"]["poses"] is array
 
 
-def test_nul_is_found_however_deep():
+def test_nul_is_found_however_deep() -> None:
     with pytest.raises(InvalidProblem) as refusal:
         validate_body(ItemCreate, {"name": "n", "parts": {"a/b": {"c": ["ok", "no\0"]}}})
     assert pointers(refusal) == {"/parts/a~1b/c/1"}

@@ -1,33 +1,37 @@
 """Writes that wait for each other, and then share a commit."""
 
 import threading
-from concurrent.futures import CancelledError
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from typing import Any
 
 import pytest
 import sqlalchemy
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem
+from marey_server.store.database.connections import Database
 from marey_server.store.tables import user
+from marey_server.store.transaction import Transaction
 
 pytestmark = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 
 
-def add_user(tx, name):
+def add_user(tx: Transaction, name: str) -> str:
     row = {"id": f"user_{name}", "name": name, "administrator": False, "disabled": False, "created_us": 0, "rev": 1}
     tx.execute(sqlalchemy.insert(user).values(**row))
     return name
 
 
-def user_names(database):
+def user_names(database: Database) -> list[str]:
     return database.read(SYSTEM, lambda tx: sorted(tx.execute(sqlalchemy.select(user.c.name)).scalars()))
 
 
 @pytest.fixture
-def submit_all(database):
+def submit_all(database: Database) -> Callable[..., Any]:
     """Submits writes while another one holds the lane, so that they wait together; their futures."""
 
-    def submit(*functions):
+    def submit(*functions: Any) -> list[Future[Any]]:
         let_go = threading.Event()
         holding = database.submit_write(SYSTEM, lambda tx: let_go.wait(30))
         futures = [database.submit_write(SYSTEM, function) for function in functions]
@@ -38,18 +42,22 @@ def submit_all(database):
     return submit
 
 
-def adding(name):
+def adding(name: str) -> Callable[..., Any]:
     return lambda tx: add_user(tx, name)
 
 
-def test_writes_that_waited_all_happen_and_each_hears_its_own_answer(database, submit_all):
+def test_writes_that_waited_all_happen_and_each_hears_its_own_answer(
+    database: Database, submit_all: Callable[..., Any]
+) -> None:
     names = [f"u{number:02d}" for number in range(40)]
     assert [future.result(30) for future in submit_all(*map(adding, names))] == names
     assert user_names(database) == names
 
 
-def test_a_refused_write_leaves_nothing_and_disturbs_no_other(database, submit_all):
-    def refused(tx):
+def test_a_refused_write_leaves_nothing_and_disturbs_no_other(
+    database: Database, submit_all: Callable[..., Any]
+) -> None:
+    def refused(tx: Transaction) -> None:
         add_user(tx, "refused")
         raise ConflictProblem("not you")
 
@@ -60,8 +68,10 @@ def test_a_refused_write_leaves_nothing_and_disturbs_no_other(database, submit_a
     assert user_names(database) == ["a", "b"]
 
 
-def test_a_write_that_breaks_leaves_nothing_and_the_others_happen_once(database, submit_all):
-    def broken(tx):
+def test_a_write_that_breaks_leaves_nothing_and_the_others_happen_once(
+    database: Database, submit_all: Callable[..., Any]
+) -> None:
+    def broken(tx: Transaction) -> None:
         add_user(tx, "broken")
         raise KeyError("a fault of ours")
 
@@ -72,11 +82,13 @@ def test_a_write_that_breaks_leaves_nothing_and_the_others_happen_once(database,
     assert user_names(database) == ["a", "b"]
 
 
-def test_what_follows_a_commit_sees_it_and_follows_no_refusal(database, submit_all):
+def test_what_follows_a_commit_sees_it_and_follows_no_refusal(
+    database: Database, submit_all: Callable[..., Any]
+) -> None:
     heard = []
 
-    def heard_of(name, *, refuse=False):
-        def write(tx):
+    def heard_of(name: str, *, refuse: bool = False) -> Callable[..., Any]:
+        def write(tx: Transaction) -> None:
             tx.after_commit(lambda: heard.append((name, user_names(database))))
             add_user(tx, name)
             if refuse:
@@ -90,13 +102,13 @@ def test_what_follows_a_commit_sees_it_and_follows_no_refusal(database, submit_a
     assert heard == [("a", ["a", "c"]), ("c", ["a", "c"])]
 
 
-def test_a_failure_after_the_commit_writes_nothing_twice(database, submit_all):
+def test_a_failure_after_the_commit_writes_nothing_twice(database: Database, submit_all: Callable[..., Any]) -> None:
     tries: list[int] = []
 
     def fail() -> None:
         raise KeyError("nothing")
 
-    def write(tx):
+    def write(tx: Transaction) -> None:
         tries.append(1)
         add_user(tx, "a")
         tx.after_commit(fail)
@@ -108,7 +120,7 @@ def test_a_failure_after_the_commit_writes_nothing_twice(database, submit_all):
     assert (user_names(database), len(tries)) == (["a", "b"], 1)
 
 
-def test_a_write_that_was_cancelled_while_it_waited_does_not_happen(database):
+def test_a_write_that_was_cancelled_while_it_waited_does_not_happen(database: Database) -> None:
     let_go = threading.Event()
     holding = database.submit_write(SYSTEM, lambda tx: let_go.wait(30))
     cancelled, kept = (database.submit_write(SYSTEM, adding(name)) for name in ("cancelled", "kept"))

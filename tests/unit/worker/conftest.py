@@ -10,8 +10,10 @@ import sys
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,26 +29,26 @@ BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
 class FakeServer:
     """Jobs to hand out, documents to read, and everything workers said, by job."""
 
-    def __init__(self):
-        self.jobs = []
-        self.documents = {}
-        self.blobs = {}
-        self.results = {}
-        self.reads = []
-        self.heartbeats = defaultdict(list)
-        self.logs = defaultdict(bytes)
-        self.staged = defaultdict(list)
-        self.completed = {}
-        self.failed = {}
-        self.cancelled = set()
-        self.lost = set()
-        self.silent = set()
-        self.started = []
-        self.completing = set()
+    def __init__(self) -> None:
+        self.jobs: list[Any] = []
+        self.documents: dict[tuple[str, int, str], Any] = {}
+        self.blobs: dict[str, bytes] = {}
+        self.results: dict[str, list[Any]] = {}
+        self.reads: list[tuple[str, int, str]] = []
+        self.heartbeats: defaultdict[str, list[Any]] = defaultdict(list)
+        self.logs: defaultdict[str, bytes] = defaultdict(bytes)
+        self.staged: defaultdict[str, list[Any]] = defaultdict(list)
+        self.completed: dict[str, Any] = {}
+        self.failed: dict[str, Any] = {}
+        self.cancelled: set[str] = set()
+        self.lost: set[str] = set()
+        self.silent: set[str] = set()
+        self.started: list[str] = []
+        self.completing: set[str] = set()
         self.may_complete = threading.Event()
         self.may_complete.set()
         self.ttl_s, self.heartbeat_s = 60.0, 15.0
-        self.tokens_seen = set()
+        self.tokens_seen: set[str] = set()
         self._claims = 0
         self._lock = threading.Lock()
         self.http = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
@@ -54,27 +56,27 @@ class FakeServer:
         threading.Thread(target=self.http.serve_forever, daemon=True).start()
 
     @property
-    def url(self):
+    def url(self) -> str:
         return f"http://127.0.0.1:{self.http.server_address[1]}"
 
     def submit(
         self,
-        kind,
-        params=None,
-        inputs=None,
+        kind: str,
+        params: dict[str, Any] | None = None,
+        inputs: Any = None,
         *,
-        time_limit_s=60,
-        memory_limit_mb=4096,
-        job=None,
-        position=None,
-        size=None,
-    ):
+        time_limit_s: int = 60,
+        memory_limit_mb: int = 4096,
+        job: str | None = None,
+        position: int | None = None,
+        size: int | None = None,
+    ) -> str:
         with self._lock:
             job = job or f"job{len(self.jobs) + 1}x{self._claims}"
             self.jobs.append((job, kind, params or {}, inputs or {}, time_limit_s, memory_limit_mb, position, size))
         return job
 
-    def claim(self, wanted):
+    def claim(self, wanted: dict[str, Any]) -> list[dict[str, Any]]:
         deadline = time.monotonic() + min(wanted["wait_s"], 2)
         while time.monotonic() < deadline:
             with self._lock:
@@ -87,13 +89,23 @@ class FakeServer:
             time.sleep(0.01)
         return []
 
-    def read(self, places):
+    def read(self, places: list[dict[str, Any]]) -> bytes:
         """Documents as the server sends them: at most three at once, so that workers have to ask again."""
         keys = [(place["item"], place["revision"], place["part"]) for place in places[:3]]
         self.reads += keys
         return encode_tree({"documents": [self.documents.get(key) for key in keys]}, MSGPACK, arrays="blocks")
 
-    def _lease(self, job, kind, params, inputs, time_limit_s, memory_limit_mb, position, size):
+    def _lease(
+        self,
+        job: str,
+        kind: str,
+        params: dict[str, Any],
+        inputs: dict[str, Any],
+        time_limit_s: int,
+        memory_limit_mb: int,
+        position: int | None,
+        size: int | None,
+    ) -> dict[str, Any]:
         return {
             "job": job, "project": "lab", "kind": kind, "params": params, "inputs": inputs, "into": "out", "seed": 0,
             "resources": {"time_limit_s": time_limit_s, "memory_limit_mb": memory_limit_mb}, "fence": self._claims,
@@ -101,39 +113,39 @@ class FakeServer:
             "heartbeat_s": self.heartbeat_s, "position": position, "size": size,
         }  # fmt: skip
 
-    def until(self, condition, timeout_s=60):
+    def until(self, condition: Callable[[], object], timeout_s: int = 60) -> None:
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, f"waited in vain; failed: {self.failed}, completed: {self.completed}"
             time.sleep(0.01)
 
-    def ended(self, job, timeout_s=60):
+    def ended(self, job: str, timeout_s: int = 60) -> dict[str, Any]:
         self.until(lambda: job in self.completed or job in self.failed, timeout_s)
         return self.completed.get(job) or self.failed[job]
 
 
-def _handler(server):
+def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
-        def log_message(self, *_):
+        def log_message(self, *_: Any) -> None:
             pass
 
-        def reply(self, status, body=b"", media_type="application/json"):
+        def reply(self, status: int, body: bytes = b"", media_type: str = "application/json") -> None:
             self.send_response(status)
             self.send_header("Content-Type", media_type)
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
 
-        def problem(self, status, code, **context):
+        def problem(self, status: int, code: str, **context: Any) -> None:
             told = {"type": "", "title": "", "status": status, "detail": code, "instance": "r1", "code": code}
             self.reply(status, json.dumps({**told, "context": context}).encode(), "application/problem+json")
 
-        def body(self):
+        def body(self) -> bytes:
             return self.rfile.read(int(self.headers.get("Content-Length", 0)))
 
-        def do_POST(self):
+        def do_POST(self) -> None:
             body = self.body()
             server.tokens_seen.add(self.headers["Authorization"])
             if self.path == "/api/v1/leases":
@@ -147,32 +159,32 @@ def _handler(server):
                 return self.problem(503, "unavailable")
             return getattr(self, f"on_{what}")(job, body)
 
-        def on_heartbeat(self, job, body):
+        def on_heartbeat(self, job: str, body: bytes) -> None:
             server.heartbeats[job].append(json.loads(body).get("progress"))
             answer = {"lease_ttl_s": server.ttl_s, "cancel_requested": job in server.cancelled}
             self.reply(200, json.dumps(answer).encode())
 
-        def on_log(self, job, body):
+        def on_log(self, job: str, body: bytes) -> None:
             if int(self.headers["Upload-Offset"]) != len(server.logs[job]):
                 return self.problem(409, "offset", offset=len(server.logs[job]))
             server.logs[job] += body
             return self.reply(200, json.dumps({"offset": len(server.logs[job])}).encode())
 
-        def on_outputs(self, job, body):
+        def on_outputs(self, job: str, body: bytes) -> None:
             server.staged[job] += decode_tree(body, MSGPACK)["outputs"]
             self.reply(204)
 
-        def on_complete(self, job, body):
+        def on_complete(self, job: str, body: bytes) -> None:
             server.completing.add(job)
             server.may_complete.wait(60)
             server.completed[job] = json.loads(body)
             self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
 
-        def on_fail(self, job, body):
+        def on_fail(self, job: str, body: bytes) -> None:
             server.failed[job] = json.loads(body)
             self.reply(200, json.dumps({"job": job, "state": "queued"}).encode())
 
-        def do_GET(self):
+        def do_GET(self) -> None:
             if found := RESULTS.match(self.path):
                 told = [
                     {"job": f"task{n}", "position": n, "state": "succeeded", "result": result}
@@ -182,7 +194,7 @@ def _handler(server):
             data = server.blobs.get(BLOB.fullmatch(self.path)[1])
             return self.problem(404, "not-found") if data is None else self.reply(200, data)
 
-        def do_PUT(self):
+        def do_PUT(self) -> None:
             data = self.body()
             digest = BLOB.fullmatch(self.path)[1]
             assert digest == f"sha256:{hashlib.sha256(data).hexdigest()}"
@@ -193,7 +205,7 @@ def _handler(server):
 
 
 @pytest.fixture
-def server():
+def server() -> Iterator[FakeServer]:
     fake = FakeServer()
     yield fake
     fake.http.shutdown()
@@ -203,7 +215,7 @@ def server():
 class Worker:
     """A worker process, as `marey serve` starts one."""
 
-    def __init__(self, server, folder, *options, env=None):
+    def __init__(self, server: FakeServer, folder: Path, *options: str, env: dict[str, str] | None = None) -> None:
         paths = [str(THIRD_PARTY), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **(env or {})}
         command = [sys.executable, "-m", "marey_worker", "--attached", "--server", server.url]
@@ -213,16 +225,16 @@ class Worker:
         self.process.stdin.write(b"marey_worker_token\n")
         self.process.stdin.flush()
 
-    def stop(self):
+    def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(30)
 
 
 @pytest.fixture
-def start_worker(server, tmp_path):
+def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[Callable[..., Worker]]:
     workers = []
 
-    def start(*options, env=None):
+    def start(*options: str, env: dict[str, str] | None = None) -> Worker:
         workers.append(Worker(server, tmp_path, *options, env=env))
         return workers[-1]
 

@@ -1,5 +1,8 @@
 """The function behind `align`, with a project in memory instead of a server."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from tests.support.alignment_examples import walk, warped_walks
@@ -24,12 +27,12 @@ NAMES = ("a", "b", "c", "d")
 class Project(ProjectInMemory):
     """A project in memory that keeps what a job logs."""
 
-    def log(self, text):
+    def log(self, text: str) -> None:
         self.told.append(text)
 
 
 @pytest.fixture
-def project(tmp_path):
+def project(tmp_path: Path) -> Project:
     """Four examples of one walk, of different lengths."""
     made = Project(tmp_path)
     examples, _ = warped_walks(4)
@@ -38,7 +41,15 @@ def project(tmp_path):
     return made
 
 
-def annotate(project, name, *, layer="steps", revision=1, segments=(), keyframes=()):
+def annotate(
+    project: Project,
+    name: str,
+    *,
+    layer: str = "steps",
+    revision: int = 1,
+    segments: tuple[Any, ...] = (),
+    keyframes: tuple[Any, ...] = (),
+) -> None:
     item = f"annotation_{name}_{layer}_{revision}"
     document = Annotation(
         clip={"item": f"clip_{name}", "revision": revision}, layer=layer, segments=segments, keyframes=keyframes
@@ -48,15 +59,15 @@ def annotate(project, name, *, layer="steps", revision=1, segments=(), keyframes
     project.inputs["annotations"] = (*project.inputs.get("annotations", ()), pin)
 
 
-def keyframe(frame, label="down"):
+def keyframe(frame: int, label: str = "down") -> tuple[dict[str, Any]]:
     return ({"label": label, "frame": frame},)
 
 
-def infos(project):
+def infos(project: Project) -> dict[str, AlignmentInfo]:
     return {output.item_name: AlignmentInfo.model_validate(output.parts["info"]) for output in project.staged}
 
 
-def test_every_clip_becomes_an_aligned_one_with_the_way_back(project):
+def test_every_clip_becomes_an_aligned_one_with_the_way_back(project: Project) -> None:
     result = align.run(project, AlignParams(reference="clip_a", suffix=" aligned", tags=("walk",)))
     assert result["clips"] == 4
     assert result["reference"] == "walks/a"
@@ -78,7 +89,7 @@ def test_every_clip_becomes_an_aligned_one_with_the_way_back(project):
         assert {source.item for source in output.sources["clips"]} == {info.clip.item, "clip_a"}
 
 
-def test_what_is_staged_makes_up_the_aligned_set_again(project):
+def test_what_is_staged_makes_up_the_aligned_set_again(project: Project) -> None:
     align.run(project, AlignParams())
     examples = [
         StoredExample(
@@ -93,7 +104,7 @@ def test_what_is_staged_makes_up_the_aligned_set_again(project):
     assert back.poses.shape == (4, back.frame_count, 3 + 4 * walk().skeleton.joint_count)
 
 
-def test_the_same_bytes_are_staged_for_any_number_of_threads(project):
+def test_the_same_bytes_are_staged_for_any_number_of_threads(project: Project) -> None:
     digests = []
     for threads in (1, 2):
         project.threads, project.staged = threads, []
@@ -102,7 +113,7 @@ def test_the_same_bytes_are_staged_for_any_number_of_threads(project):
     assert digests[0] == digests[1]
 
 
-def test_annotated_keyframes_are_matched_exactly(project):
+def test_annotated_keyframes_are_matched_exactly(project: Project) -> None:
     frames = {"a": 20, "b": 18, "c": 24, "d": 22}
     for name, frame in frames.items():
         annotate(project, name, keyframes=keyframe(frame))
@@ -114,7 +125,7 @@ def test_annotated_keyframes_are_matched_exactly(project):
     assert project.staged[0].sources["annotations"][0].item == "annotation_a_steps_1"
 
 
-def test_only_labels_that_are_asked_for_cut(project):
+def test_only_labels_that_are_asked_for_cut(project: Project) -> None:
     for name in NAMES:
         said = (*keyframe(20), *keyframe(30, f"of {name}"))
         annotate(project, name, keyframes=said)
@@ -123,7 +134,7 @@ def test_only_labels_that_are_asked_for_cut(project):
     assert result["refused"] == []
 
 
-def test_an_annotation_of_the_clips_own_revision_goes_before_others(project):
+def test_an_annotation_of_the_clips_own_revision_goes_before_others(project: Project) -> None:
     for name in NAMES:
         annotate(project, name, keyframes=keyframe(20))
     annotate(project, "b", revision=2, keyframes=keyframe(25))
@@ -131,7 +142,7 @@ def test_an_annotation_of_the_clips_own_revision_goes_before_others(project):
     assert infos(project)["b"].time_function[20] == 20.0
 
 
-def test_clips_that_do_not_fit_are_refused_with_reasons_and_the_others_are_aligned(project):
+def test_clips_that_do_not_fit_are_refused_with_reasons_and_the_others_are_aligned(project: Project) -> None:
     add_clip(project, "short", walk().sliced(0, 3))
     add_clip(project, "other", generate_gait(1.3, 0.2, 1.0, stature_m=1.5), skeleton="skeleton_b")
     add_clip(project, "mute", walk())
@@ -157,7 +168,7 @@ def test_clips_that_do_not_fit_are_refused_with_reasons_and_the_others_are_align
     assert len(project.staged) == 4
 
 
-def test_mirrored_twins_are_named_after_their_clips(project):
+def test_mirrored_twins_are_named_after_their_clips(project: Project) -> None:
     result = align.run(project, AlignParams(mirroring="add"))
     assert result["clips"] == 8
     assert sorted(output.item_name for output in project.staged) == sorted(
@@ -166,14 +177,14 @@ def test_mirrored_twins_are_named_after_their_clips(project):
     assert infos(project)["b mirrored"].clip.mirrored
 
 
-def test_weights_may_go_by_standard_names(project):
+def test_weights_may_go_by_standard_names(project: Project) -> None:
     plain = align.run(project, AlignParams(reference="clip_a"))
     weighed = align.run(project, AlignParams(reference="clip_a", weights={"left_wrist": 0.0, "LeftFoot": 5.0}))
     assert weighed["aligned"][1]["cost"] != plain["aligned"][1]["cost"]
     assert weighed["set"] != plain["set"]
 
 
-def refusal(project, **params):
+def refusal(project: Project, **params: Any) -> JobRefused:
     with pytest.raises(JobRefused) as refused:
         align.run(project, AlignParams(**params))
     assert project.staged == []
@@ -188,20 +199,20 @@ def refusal(project, **params):
         ({"layer": "steps"}, "no-annotations", "none are given"),
     ],
 )
-def test_what_cannot_be_done_refuses_the_job(project, params, code, said):
+def test_what_cannot_be_done_refuses_the_job(project: Project, params: dict[str, Any], code: str, said: str) -> None:
     refused = refusal(project, **params)
     assert refused.code == code
     assert said in refused.detail
 
 
-def test_names_of_results_that_would_be_too_long_refuse_the_job(project):
+def test_names_of_results_that_would_be_too_long_refuse_the_job(project: Project) -> None:
     first, *others = project.inputs["clips"]
     project.inputs["clips"] = (first.model_copy(update={"name": 250 * "n"}), *others)
     refused = refusal(project, suffix="-aligned")
     assert (refused.code, refused.detail[-25:]) == ("name-too-long", "has 258 of 255 characters")
 
 
-def test_clips_that_cannot_be_read_refuse_the_job(project):
+def test_clips_that_cannot_be_read_refuse_the_job(project: Project) -> None:
     for pin in project.inputs["clips"]:
         place = (pin.item, pin.revision, "motion")
         motion = project.parts[place]
@@ -211,7 +222,7 @@ def test_clips_that_cannot_be_read_refuse_the_job(project):
     assert "clips can be read" in refused.detail
 
 
-def test_a_job_that_is_left_with_one_clip_says_why_the_others_do_not_fit(project):
+def test_a_job_that_is_left_with_one_clip_says_why_the_others_do_not_fit(project: Project) -> None:
     for name in NAMES:
         clip = walk() if name == "a" else walk().sliced(0, 2)
         add_clip(project, name, clip)
@@ -221,14 +232,14 @@ def test_a_job_that_is_left_with_one_clip_says_why_the_others_do_not_fit(project
     assert "1 of 4 clips are left" in refused.detail
 
 
-def test_clips_of_which_none_is_annotated_are_refused_with_the_first_reason(project):
+def test_clips_of_which_none_is_annotated_are_refused_with_the_first_reason(project: Project) -> None:
     annotate(project, "z", keyframes=keyframe(5))
     refused = refusal(project)
     assert refused.code == "too-few-clips"
     assert "walks/a: none of the annotations belongs to this clip" in refused.detail
 
 
-def test_an_input_rig_of_another_skeleton_is_refused(project):
+def test_an_input_rig_of_another_skeleton_is_refused(project: Project) -> None:
     pin = PinnedInput(item="skeleton_z", revision=3, kind=Kind.SKELETON, name="z", collection="rigs")
     project.inputs["rig"] = (pin,)
     assert refusal(project).code == "wrong-rig"

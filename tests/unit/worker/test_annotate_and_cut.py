@@ -1,6 +1,8 @@
 """The functions behind `annotate` and `cut`, with a project in memory instead of a server."""
 
 from math import radians
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
     """A walk ahead and one backward; nothing is kept of earlier tests."""
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
@@ -29,7 +31,7 @@ def project(tmp_path, monkeypatch):
     return made
 
 
-def annotated(project, **said):
+def annotated(project: ProjectInMemory, **said: Any) -> ProjectInMemory:
     """The project with one annotation of its walk as the input of `cut`."""
     document = Annotation.model_validate({"clip": {"item": "clip_walk", "revision": 1}, "layer": "mine", **said})
     number = len(project.inputs.get("annotations", ()))
@@ -41,7 +43,7 @@ def annotated(project, **said):
     return project
 
 
-def test_what_is_found_becomes_a_layer_beside_the_clip_at_the_revision_that_was_read(project):
+def test_what_is_found_becomes_a_layer_beside_the_clip_at_the_revision_that_was_read(project: ProjectInMemory) -> None:
     result = annotate.run(project, STEPS)
     (output,) = project.staged
     assert (result["annotations"], result["empty"], result["refused"]) == (1, ["walks/backward"], [])
@@ -52,7 +54,7 @@ def test_what_is_found_becomes_a_layer_beside_the_clip_at_the_revision_that_was_
     assert sum(result["segments"].values()) == len(document.segments) >= 6
 
 
-def test_joints_of_pauses_are_named_as_in_the_skeleton_or_as_standard_joints(project):
+def test_joints_of_pauses_are_named_as_in_the_skeleton_or_as_standard_joints(project: ProjectInMemory) -> None:
     staged = []
     for name in ("RightHand", "right_wrist"):
         params = {"proposal": {"method": "velocity_minima", "joints": [name]}, "layer": "pauses"}
@@ -67,7 +69,7 @@ def test_joints_of_pauses_are_named_as_in_the_skeleton_or_as_standard_joints(pro
     assert "tail" in result["refused"][0]["detail"]
 
 
-def test_a_piece_is_the_frames_of_its_segment_with_its_margins_and_keyframes(project):
+def test_a_piece_is_the_frames_of_its_segment_with_its_margins_and_keyframes(project: ProjectInMemory) -> None:
     said = {
         "segments": [{"label": "a", "start": 60, "end": 100}, {"label": "b", "start": 100, "end": 130}],
         "keyframes": [{"label": "middle", "frame": 80}, {"label": "late", "frame": 110}],
@@ -91,7 +93,7 @@ def test_a_piece_is_the_frames_of_its_segment_with_its_margins_and_keyframes(pro
     assert document["keyframes"] == [{"label": "middle", "frame": 50}]
 
 
-def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out(project):
+def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out(project: ProjectInMemory) -> None:
     annotated(
         project,
         segments=[
@@ -106,14 +108,14 @@ def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out
     assert len(clip.parts["motion"]["poses"]) == 70
 
 
-def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project):
+def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project: ProjectInMemory) -> None:
     annotated(project, segments=[{"label": "a", "start": 0, "end": 10}])
     with pytest.raises(JobRefused, match="the labels there are: a") as refused:
         cut.run(project, CutParams(labels=("b",)))
     assert refused.value.code == "nothing-to-cut"
 
 
-def test_layers_that_would_make_pieces_of_one_name_are_refused(project):
+def test_layers_that_would_make_pieces_of_one_name_are_refused(project: ProjectInMemory) -> None:
     for layer in ("mine", "yours"):
         annotated(project, segments=[{"label": "a", "start": 0, "end": 10}], layer=layer)
     with pytest.raises(JobRefused, match="2 pieces would be walks/walk_a_01") as refused:
@@ -122,7 +124,7 @@ def test_layers_that_would_make_pieces_of_one_name_are_refused(project):
     assert cut.run(project, CutParams(layer="yours"))["clips"] == 1
 
 
-def test_an_annotation_that_goes_beyond_its_clip_keeps_no_other_from_being_cut(project):
+def test_an_annotation_that_goes_beyond_its_clip_keeps_no_other_from_being_cut(project: ProjectInMemory) -> None:
     annotated(project, segments=[{"label": "a", "start": 0, "end": 9999}])
     annotated(project, segments=[{"label": "b", "start": 0, "end": 10}])
     result = cut.run(project, CutParams())
@@ -131,10 +133,10 @@ def test_an_annotation_that_goes_beyond_its_clip_keeps_no_other_from_being_cut(p
 
 
 @pytest.mark.parametrize("name", ["{clip}", "{clip} {label}", "{clip} {label} {number} {x}", "{clip}/{label} {number}"])
-def test_a_pattern_that_names_pieces_alike_or_something_unknown_is_refused(name):
+def test_a_pattern_that_names_pieces_alike_or_something_unknown_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=r"name"):
         CutParams(name=name)
 
 
-def test_names_count_with_as_many_digits_as_asked_for():
+def test_names_count_with_as_many_digits_as_asked_for() -> None:
     assert CutParams(name="{label}-{number:4} of {clip}").piece_name("c", "a/b", 12) == "a-b-0012 of c"

@@ -1,6 +1,7 @@
 """The function behind `evaluate`, with a project in memory instead of a server."""
 
 from math import radians
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from marey_worker.kinds import evaluate
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
     """Three walks; nothing is kept of earlier tests."""
     monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = ProjectInMemory(tmp_path)
@@ -27,7 +28,7 @@ def project(tmp_path, monkeypatch):
     return made
 
 
-def test_the_trials_of_all_tasks_together_are_the_suite_whatever_their_number(project):
+def test_the_trials_of_all_tasks_together_are_the_suite_whatever_their_number(project: ProjectInMemory) -> None:
     whole = evaluate.gather(project, PARAMS, [evaluate.run(project, PARAMS)])
     results = []
     for position in range(3):
@@ -41,7 +42,9 @@ def test_the_trials_of_all_tasks_together_are_the_suite_whatever_their_number(pr
     np.testing.assert_array_equal(first["positions"], second["positions"])
 
 
-def test_the_database_is_built_once_for_all_tasks_of_an_evaluation(project, monkeypatch):
+def test_the_database_is_built_once_for_all_tasks_of_an_evaluation(
+    project: ProjectInMemory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     built: list[MatchingDatabase] = []
 
     def build(*given: Any, **more: Any) -> MatchingDatabase:
@@ -57,45 +60,45 @@ def test_the_database_is_built_once_for_all_tasks_of_an_evaluation(project, monk
     assert len(built) == 2
 
 
-def test_progress_is_told_trial_by_trial(project):
+def test_progress_is_told_trial_by_trial(project: ProjectInMemory) -> None:
     project.task = Task(1, 3)
     evaluate.run(project, PARAMS)
     trials = [(done, total) for done, total, _ in project.told if total is not None]
     assert trials == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_clips_of_several_skeletons_are_refused_with_their_names(project):
+def test_clips_of_several_skeletons_are_refused_with_their_names(project: ProjectInMemory) -> None:
     add_clip(project, "stranger", generate_gait(1.0, 0.0, 3.0), skeleton="skeleton_b")
     with pytest.raises(JobRefused, match=r"3 of 4 move rigs/SKELETON_A, but not walks/stranger") as refused:
         evaluate.run(project, PARAMS)
     assert refused.value.code == "several-skeletons"
 
 
-def test_trials_of_one_name_are_refused_although_other_tasks_have_them(project):
+def test_trials_of_one_name_are_refused_although_other_tasks_have_them(project: ProjectInMemory) -> None:
     project.task = Task(0, 12)
     with pytest.raises(JobRefused, match="two trials are called circle v=1 w=-50"):
         evaluate.run(project, PARAMS.model_copy(update={"speeds_m_s": (1.0, 1.0 + 1e-9)}))
     assert project.told == []
 
 
-def test_a_trial_that_is_not_in_the_suite_is_refused_before_anything_is_read(project):
+def test_a_trial_that_is_not_in_the_suite_is_refused_before_anything_is_read(project: ProjectInMemory) -> None:
     with pytest.raises(JobRefused, match="'circle v=9 w=0'; a name is like 'circle v=1 w=-50'"):
         evaluate.run(project, PARAMS.model_copy(update={"trial_figures": ("circle v=9 w=0",)}))
     assert project.told == []
 
 
-def test_what_the_mathematics_refuses_is_not_tried_again(project):
+def test_what_the_mathematics_refuses_is_not_tried_again(project: ProjectInMemory) -> None:
     project.inputs["clips"] = project.inputs["clips"][:1] * 2
     with pytest.raises(JobRefused, match="the same uid"):
         evaluate.run(project, PARAMS)
 
 
-def test_the_headline_counts_the_clips_and_those_that_no_trial_plays():
+def test_the_headline_counts_the_clips_and_those_that_no_trial_plays() -> None:
     headline = evaluate.headline_of(synthetic_result(clips=6, unused=2))
     assert (headline["clips"], headline["unused_clips"]) == (6, 2)
 
 
-def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project):
+def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project: ProjectInMemory) -> None:
     wanted = PARAMS.model_copy(update={"report": True, "trial_figures": ("switching v=1 w=50",)})
     evaluate.gather(project, wanted, [evaluate.run(project, wanted)])
     report = project.staged[0].parts["report"]

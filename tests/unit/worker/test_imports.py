@@ -2,7 +2,7 @@
 
 import hashlib
 from math import radians
-from typing import cast
+from pathlib import Path
 
 from tests.support.project_in_memory import ProjectInMemory
 
@@ -10,11 +10,10 @@ from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.job_params import ImportParams
 from marey_schemas.kinds import Kind
-from marey_worker.context import Context
 from marey_worker.kinds import imports
 
 
-def test_the_result_counts_the_clips_and_frames_that_were_imported(tmp_path):
+def test_the_result_counts_the_clips_and_frames_that_were_imported(tmp_path: Path) -> None:
     project = ProjectInMemory(tmp_path)
     walk, turn = generate_gait(1.2, 0.0, 0.5), generate_gait(1.2, radians(40), 1.0)
     given = {"walk.bvh": write_bvh(walk), "turn.bvh": write_bvh(turn), "broken.bvh": b"HIERARCHY"}
@@ -23,7 +22,7 @@ def test_the_result_counts_the_clips_and_frames_that_were_imported(tmp_path):
         digest = f"sha256:{hashlib.sha256(data).hexdigest()}"
         project.blobs[digest] = data
         files.append({"name": name, "blob": digest})
-    result = imports.run(cast(Context, project), ImportParams.model_validate({"files": files}))
+    result = imports.run(project, ImportParams.model_validate({"files": files}))
     assert [entry["status"] for entry in result["entries"]] == ["created", "created", "failed"]
     assert (result["clips"], result["frames"]) == (2, walk.frame_count + turn.frame_count)
     assert sorted(one.item_name for one in project.staged if one.kind is Kind.CLIP) == ["turn", "walk"]

@@ -3,10 +3,13 @@
 import json
 from dataclasses import replace
 from math import radians
+from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 
+from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
 from marey_schemas.encoding.codecs import JSON, decode_tree
 from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
@@ -21,12 +24,12 @@ from marey_worker.kinds import compare, evaluate, optimise, suggest, sweep
 class LoggedProject(ProjectInMemory):
     """A project that keeps what jobs log."""
 
-    def log(self, text):
+    def log(self, text: str) -> None:
         self.lines = [*getattr(self, "lines", []), text]
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoggedProject:
     """Three walks and one that no trial asks for; nothing is kept of earlier tests."""
     monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = LoggedProject(tmp_path)
@@ -35,7 +38,7 @@ def project(tmp_path, monkeypatch):
     return made
 
 
-def evaluated(project, name, clips):
+def evaluated(project: LoggedProject, name: str, clips: tuple[Any, ...]) -> PinnedInput:
     """An evaluation of some clips, as the project keeps it."""
     every = project.inputs.get("clips", ())
     project.inputs["clips"] = clips
@@ -46,18 +49,18 @@ def evaluated(project, name, clips):
     return PinnedInput(item=name, revision=1, kind=Kind.EVALUATION, name=name, collection="results")
 
 
-def of_taller_person(clip):
+def of_taller_person(clip: Clip) -> Clip:
     """The same motion with longer bones."""
     poses = clip.poses.copy()
     poses[:, 1] *= 1.1  # the hips' height; the path on the ground stays
     return replace(clip, skeleton=replace(clip.skeleton, offsets=clip.skeleton.offsets * 1.1), poses=poses)
 
 
-def document_of(project, result):
+def document_of(project: LoggedProject, result: dict[str, Any]) -> dict[str, Any]:
     return decode_tree(project.blobs[result["document"]["blob"]], JSON)
 
 
-def test_an_evaluation_and_itself_differ_in_nothing(project):
+def test_an_evaluation_and_itself_differ_in_nothing(project: LoggedProject) -> None:
     own = evaluated(project, "first", project.inputs["clips"])
     project.inputs = {"before": (own,), "after": (own,)}
     result = compare.run(project, CompareParams(report=False))
@@ -66,7 +69,7 @@ def test_an_evaluation_and_itself_differ_in_nothing(project):
     assert document_of(project, result)["names"] == {"before": "results/first", "after": "results/first"}
 
 
-def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project):
+def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     first, second = evaluated(project, "first", clips), evaluated(project, "second", clips[:2])
     project.inputs = {"before": (first,), "after": (second,)}
@@ -75,7 +78,7 @@ def test_evaluations_under_two_normalisers_are_refused_with_what_to_type(project
     assert refused.value.code == "not-comparable"
 
 
-def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted(project):
+def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])
     add_clip(project, "tall", of_taller_person(generate_gait(1.25, radians(50), 5.0)), skeleton="skeleton_b")
@@ -88,7 +91,7 @@ def test_what_can_go_is_named_and_clips_of_other_skeletons_need_to_be_retargeted
     assert result["needing_retarget"] == 1
 
 
-def test_every_step_of_an_optimisation_is_logged_and_kept(project):
+def test_every_step_of_an_optimisation_is_logged_and_kept(project: LoggedProject) -> None:
     clips = project.inputs["clips"]
     own = evaluated(project, "first", clips[1:2])
     project.inputs = {"evaluation": (own,), "candidates": clips}
@@ -101,7 +104,7 @@ def test_every_step_of_an_optimisation_is_logged_and_kept(project):
     assert objectives[-1] < objectives[0]
 
 
-def test_a_sweep_is_the_same_however_many_tasks_it_is_spread_over(project):
+def test_a_sweep_is_the_same_however_many_tasks_it_is_spread_over(project: LoggedProject) -> None:
     own = evaluated(project, "first", project.inputs["clips"])
     project.inputs = {"evaluation": (own,)}
     params = SweepParams(factors=(0.5,))

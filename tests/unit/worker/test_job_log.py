@@ -1,11 +1,15 @@
 """What a job prints arrives once and in order, whatever happens on the way."""
 
+from pathlib import Path
+from typing import cast
+
 import pytest
 
 from marey_client.errors import Unreachable
 from marey_schemas.worker_protocol import LogAnswer
 from marey_worker import attempt
 from marey_worker.attempt import LogUploader
+from marey_worker.attempt_api import AttemptApi
 
 ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is lost"
 
@@ -13,13 +17,13 @@ ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is 
 class Api:
     """Keeps a log as the server does; `fates` says what becomes of the next pieces."""
 
-    def __init__(self, limit=1000):
+    def __init__(self, limit: int = 1000) -> None:
         self.log = b""
-        self.fates = []
+        self.fates: list[str] = []
         self.pieces = 0
         self.limit = limit
 
-    def append_log(self, offset, piece):
+    def append_log(self, offset: int, piece: bytes) -> LogAnswer:
         self.pieces += 1
         fate = self.fates.pop(0) if self.fates else ARRIVES
         if fate == NEVER_ARRIVES:
@@ -32,19 +36,21 @@ class Api:
 
 
 @pytest.fixture
-def api(monkeypatch):
+def api(monkeypatch: pytest.MonkeyPatch) -> Api:
     monkeypatch.setattr(attempt, "LOG_PIECE_BYTES", 10)
     return Api()
 
 
 @pytest.fixture
-def printed(api, tmp_path):
-    return LogUploader(api, tmp_path / "log")
+def printed(api: Api, tmp_path: Path) -> LogUploader:
+    return LogUploader(cast(AttemptApi, api), tmp_path / "log")
 
 
 @pytest.mark.parametrize("fate", [NEVER_ARRIVES, ANSWER_IS_LOST])
 @pytest.mark.parametrize("before", [0, 1])
-def test_a_log_that_was_cut_off_goes_on_where_the_server_has_it(api, printed, fate, before):
+def test_a_log_that_was_cut_off_goes_on_where_the_server_has_it(
+    api: Api, printed: LogUploader, fate: str, before: int
+) -> None:
     printed.path.write_bytes(b"0123456789abcdefghij")
     api.fates = [ARRIVES] * before + [fate]
     with pytest.raises(Unreachable):
@@ -55,7 +61,7 @@ def test_a_log_that_was_cut_off_goes_on_where_the_server_has_it(api, printed, fa
     assert api.log == b"0123456789abcdefghijand the end" == printed.path.read_bytes()
 
 
-def test_nothing_is_sent_to_a_log_that_is_full(api, printed):
+def test_nothing_is_sent_to_a_log_that_is_full(api: Api, printed: LogUploader) -> None:
     api.limit = 15
     printed.path.write_bytes(b"x" * 100)
     for _ in range(3):

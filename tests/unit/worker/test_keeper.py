@@ -2,6 +2,8 @@
 
 import threading
 import time
+from collections.abc import Callable, Iterator
+from typing import cast
 
 import httpx
 import pytest
@@ -13,6 +15,7 @@ from marey_schemas.jobs import Progress, Resources
 from marey_schemas.problems import Problem
 from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker import attempt_api, heartbeats
+from marey_worker.attempt_api import AttemptApi
 from marey_worker.heartbeats import LeaseKeeper
 
 LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance="r", code="lease-lost"))
@@ -21,13 +24,13 @@ LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance=
 class Api:
     """Answers heartbeats; `answers` says with what."""
 
-    def __init__(self):
-        self.heard = []
-        self.error = None
+    def __init__(self) -> None:
+        self.heard: list[Progress | None] = []
+        self.error: Exception | None = None
         self.cancel = False
         self.beat = threading.Event()
 
-    def heartbeat(self, progress, *, patiently=False):
+    def heartbeat(self, progress: Progress | None, *, patiently: bool = False) -> HeartbeatAnswer:
         self.heard.append(progress)
         self.beat.set()
         if self.error is not None:
@@ -35,7 +38,7 @@ class Api:
         return HeartbeatAnswer(lease_ttl_s=60.0, cancel_requested=self.cancel)
 
 
-def lease(*, heartbeat_s=0.01, ttl_s=60.0):
+def lease(*, heartbeat_s: float = 0.01, ttl_s: float = 60.0) -> Lease:
     return Lease(
         job="job_1", project="lab", kind="add", params={}, inputs={}, into="", seed=0, resources=Resources(), fence=1,
         attempt=1, attempt_token="t", lease_ttl_s=ttl_s, heartbeat_s=heartbeat_s,
@@ -43,18 +46,18 @@ def lease(*, heartbeat_s=0.01, ttl_s=60.0):
 
 
 @pytest.fixture
-def api(monkeypatch):
+def api(monkeypatch: pytest.MonkeyPatch) -> Api:
     monkeypatch.setattr(heartbeats, "TICK_S", 0.005)
     monkeypatch.setattr(heartbeats, "RETRY_S", 0.01)
     return Api()
 
 
 @pytest.fixture
-def keep(api):
+def keep(api: Api) -> Iterator[Callable[..., LeaseKeeper]]:
     started = []
 
-    def keep(**figures):
-        started.append(LeaseKeeper(api, lease(**figures)))
+    def keep(**figures: float) -> LeaseKeeper:
+        started.append(LeaseKeeper(cast(AttemptApi, api), lease(**figures)))
         return started[-1]
 
     yield keep
@@ -62,7 +65,7 @@ def keep(api):
         one.stop()
 
 
-def test_heartbeats_go_on_until_stopped(api, keep):
+def test_heartbeats_go_on_until_stopped(api: Api, keep: Callable[..., LeaseKeeper]) -> None:
     one = keep()
     while len(api.heard) < 5:
         assert api.beat.wait(5)
@@ -73,14 +76,16 @@ def test_heartbeats_go_on_until_stopped(api, keep):
     assert len(api.heard) == heard
 
 
-def test_progress_is_told_before_the_next_heartbeat_is_due(api, keep, monkeypatch):
+def test_progress_is_told_before_the_next_heartbeat_is_due(
+    api: Api, keep: Callable[..., LeaseKeeper], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(heartbeats, "PROGRESS_EVERY_S", 0.02)
     keep(heartbeat_s=1000).tell(Progress(done=1, total=2))
     assert api.beat.wait(5)
     assert api.heard[0].done == 1
 
 
-def test_a_lost_lease_ends_the_heartbeats(api, keep):
+def test_a_lost_lease_ends_the_heartbeats(api: Api, keep: Callable[..., LeaseKeeper]) -> None:
     api.error = LOST
     one = keep()
     assert one.lost.wait(5)
@@ -91,12 +96,14 @@ def test_a_lost_lease_ends_the_heartbeats(api, keep):
         one.confirm(patiently=False)
 
 
-def test_a_request_to_cancel_is_heard(api, keep):
+def test_a_request_to_cancel_is_heard(api: Api, keep: Callable[..., LeaseKeeper]) -> None:
     api.cancel = True
     assert keep().cancelled.wait(5)
 
 
-def test_a_server_that_is_away_is_asked_again_and_the_lease_is_not_given_up(api, keep):
+def test_a_server_that_is_away_is_asked_again_and_the_lease_is_not_given_up(
+    api: Api, keep: Callable[..., LeaseKeeper]
+) -> None:
     api.error = Unreachable("away")
     one = keep()
     while len(api.heard) < 3:
@@ -106,7 +113,7 @@ def test_a_server_that_is_away_is_asked_again_and_the_lease_is_not_given_up(api,
     one.confirm(patiently=False)
 
 
-def test_nothing_is_confirmed_after_a_long_silence_without_asking(api, keep):
+def test_nothing_is_confirmed_after_a_long_silence_without_asking(api: Api, keep: Callable[..., LeaseKeeper]) -> None:
     one = keep(heartbeat_s=1000, ttl_s=0.03)
     time.sleep(0.05)
     one.confirm(patiently=False)
@@ -116,10 +123,12 @@ def test_nothing_is_confirmed_after_a_long_silence_without_asking(api, keep):
 
 
 @pytest.mark.parametrize("patiently", [True, False])
-def test_a_result_waits_longer_for_a_server_that_is_away_than_a_failure_does(monkeypatch, patiently):
+def test_a_result_waits_longer_for_a_server_that_is_away_than_a_failure_does(
+    monkeypatch: pytest.MonkeyPatch, patiently: bool
+) -> None:
     asked = []
 
-    def server(request):
+    def server(request: httpx.Request) -> httpx.Response:
         asked.append(request.url.path)
         if len(asked) < 20:
             return httpx.Response(503)

@@ -12,7 +12,7 @@ print(*(name for name in ("scipy.stats", "scipy.signal", "sklearn", "matplotlib"
 """
 
 
-def test_a_worker_waits_for_no_statistics_and_no_drawing_before_its_first_job():
+def test_a_worker_waits_for_no_statistics_and_no_drawing_before_its_first_job() -> None:
     told = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
     assert (told.stdout.strip(), told.stderr) == ("", "")
 
@@ -39,6 +39,6 @@ print(max(searched) < gc.get_freeze_count() / 20, *(one() for one in left))
 """
 
 
-def test_garbage_of_jobs_is_freed_without_a_search_of_loaded_modules():
+def test_garbage_of_jobs_is_freed_without_a_search_of_loaded_modules() -> None:
     told = subprocess.run([sys.executable, "-c", COLLECTING], capture_output=True, text=True, check=True)
     assert (told.stdout.split(), told.stderr) == (["True", "None", "None"], "")

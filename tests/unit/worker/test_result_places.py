@@ -2,7 +2,10 @@
 
 import io
 import zipfile
+from collections.abc import Callable
 from math import radians
+from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
@@ -23,7 +26,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
     """Two walks of one skeleton; nothing is kept of earlier tests."""
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
@@ -35,13 +38,13 @@ def project(tmp_path, monkeypatch):
     return made
 
 
-def move(project, into, **of_all):
+def move(project: ProjectInMemory, into: str, **of_all: Any) -> None:
     """Let every clip be what another job made."""
     project.into = into
     project.inputs["clips"] = tuple(pin.model_copy(update=of_all) for pin in project.inputs["clips"])
 
 
-def again(project, position, **changes):
+def again(project: ProjectInMemory, position: int, **changes: Any) -> None:
     """Let one of the clips be there once more, with these changes."""
     pin = project.inputs["clips"][position]
     twin = pin.model_copy(update=changes)
@@ -49,7 +52,7 @@ def again(project, position, **changes):
     project.inputs["clips"] = (*project.inputs["clips"], twin)
 
 
-def codes(result):
+def codes(result: dict[str, Any]) -> list[str]:
     return [one["code"] for one in result["refused"]]
 
 
@@ -60,7 +63,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_results_that_would_replace_what_they_are_made_of_are_refused(project, kind):
+def test_results_that_would_replace_what_they_are_made_of_are_refused(project: ProjectInMemory, kind: str) -> None:
     move(project, "game", collection="game", below="")
     result = KINDS[kind](project)
     assert (result["clips"], codes(result), project.staged) == (0, ["own-input"] * 2, [])
@@ -70,30 +73,31 @@ def test_results_that_would_replace_what_they_are_made_of_are_refused(project, k
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_result_that_would_replace_another_input_is_refused(project, kind):
+def test_a_result_that_would_replace_another_input_is_refused(project: ProjectInMemory, kind: str) -> None:
     again(project, 0, item="clip_other", name="left-short")
     move(project, "", below=None)
     result = KINDS[kind](project, suffix="-short")
     assert (result["clips"], codes(result)) == (2, ["own-input"])
 
 
-def test_an_edit_in_place_replaces_its_clips(project):
-    project.item = lambda kind, item: next(
-        pin.model_copy() for pin in project.inputs["clips"] if (pin.kind, pin.item) == (kind, item)
-    )
+def test_an_edit_in_place_replaces_its_clips(project: ProjectInMemory, monkeypatch: pytest.MonkeyPatch) -> None:
+    def pinned(kind: Kind, item: str) -> Any:
+        return next(pin.model_copy() for pin in project.inputs["clips"] if (pin.kind, pin.item) == (kind, item))
+
+    monkeypatch.setattr(project, "item", pinned)
     result = KINDS["edit"](project, in_place=True)
     assert (result["clips"], result["refused"]) == (2, [])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_two_revisions_of_a_clip_the_second_is_refused(project, kind):
+def test_of_two_revisions_of_a_clip_the_second_is_refused(project: ProjectInMemory, kind: str) -> None:
     again(project, 0, revision=2)
     project.into = "out"
     result = KINDS[kind](project)
     assert (result["clips"], codes(result)) == (2, ["same-name"])
 
 
-def add_annotation(project, clip="clip_left", revision=1):
+def add_annotation(project: ProjectInMemory, clip: str = "clip_left", revision: int = 1) -> None:
     document = Annotation.model_validate(
         {"clip": {"item": clip, "revision": revision}, "segments": [{"label": "a", "start": 0, "end": 30}]}
     )
@@ -102,7 +106,7 @@ def add_annotation(project, clip="clip_left", revision=1):
     project.inputs["annotations"] = (PinnedInput(**pin),)
 
 
-def test_a_piece_that_would_replace_an_input_is_refused(project):
+def test_a_piece_that_would_replace_an_input_is_refused(project: ProjectInMemory) -> None:
     add_annotation(project)
     again(project, 1, item="clip_piece", name="left_a_01")
     result = cut.run(project, CutParams())
@@ -111,7 +115,7 @@ def test_a_piece_that_would_replace_an_input_is_refused(project):
     assert cut.run(project, CutParams())["clips"] == 1
 
 
-def test_pieces_are_named_after_the_clips_that_are_given_at_any_revision(project):
+def test_pieces_are_named_after_the_clips_that_are_given_at_any_revision(project: ProjectInMemory) -> None:
     add_annotation(project, revision=2)
     project.parts["clip_left", 2, "motion"] = project.parts["clip_left", 1, "motion"]
     cut.run(project, CutParams())
@@ -124,14 +128,18 @@ def test_pieces_are_named_after_the_clips_that_are_given_at_any_revision(project
 @pytest.mark.parametrize(
     ("run", "params"), [(annotate.run, STEPS), (align.run, AlignParams(suffix=" aligned"))], ids=["annotate", "align"]
 )
-def test_results_that_would_get_one_name_are_refused_before_any_is_computed(project, run, params):
+def test_results_that_would_get_one_name_are_refused_before_any_is_computed(
+    project: ProjectInMemory, run: Callable[..., Any], params: Any
+) -> None:
     again(project, 0, revision=2)
     with pytest.raises(JobRefused, match="2 results would be walks/left") as refused:
         run(project, params)
     assert (refused.value.code, project.told) == ("same-name", [])
 
 
-def test_a_clip_called_like_the_mirrored_twin_of_another_is_refused_before_any_is_computed(project):
+def test_a_clip_called_like_the_mirrored_twin_of_another_is_refused_before_any_is_computed(
+    project: ProjectInMemory,
+) -> None:
     again(project, 1, item="clip_twin", name="left mirrored")
     with pytest.raises(JobRefused, match="2 results would be walks/left mirrored"):
         align.run(project, AlignParams(mirroring="add"))
@@ -140,7 +148,7 @@ def test_a_clip_called_like_the_mirrored_twin_of_another_is_refused_before_any_i
     assert len({output.name for output in project.staged}) == len(project.staged) == 6
 
 
-def test_a_second_result_of_one_name_is_refused_and_does_not_replace_the_first(project):
+def test_a_second_result_of_one_name_is_refused_and_does_not_replace_the_first(project: ProjectInMemory) -> None:
     results = StagedResults(project)
     one = StagedOutput(name="a", kind=Kind.CLIP, item_name="a", parts={"motion": {}})
     results.add(one)
@@ -149,12 +157,14 @@ def test_a_second_result_of_one_name_is_refused_and_does_not_replace_the_first(p
         results.add(one)
 
 
-def annotated(project):
+def annotated(project: ProjectInMemory) -> dict[str, Any]:
     return annotate.run(project, STEPS)
 
 
 @pytest.mark.parametrize("run", [*KINDS.values(), annotated], ids=[*KINDS, "annotate"])
-def test_a_clip_whose_skeleton_was_deleted_keeps_no_other_from_being_made(project, run):
+def test_a_clip_whose_skeleton_was_deleted_keeps_no_other_from_being_made(
+    project: ProjectInMemory, run: Callable[..., Any]
+) -> None:
     add_clip(project, "odd", generate_gait(1.2, 0.0, 3.0), skeleton="skeleton_gone")
     del project.parts["skeleton_gone", 1, "hierarchy"]
     project.into = "out"
@@ -164,14 +174,16 @@ def test_a_clip_whose_skeleton_was_deleted_keeps_no_other_from_being_made(projec
 
 
 @pytest.mark.parametrize("run", [*KINDS.values(), annotated], ids=[*KINDS, "annotate"])
-def test_a_clip_that_was_deleted_while_the_job_waited_keeps_no_other_from_being_made(project, run):
+def test_a_clip_that_was_deleted_while_the_job_waited_keeps_no_other_from_being_made(
+    project: ProjectInMemory, run: Callable[..., Any]
+) -> None:
     del project.parts["clip_left", 1, "motion"]
     project.into = "out"
     result = run(project)
     assert (len(project.staged), codes(result)) == (1, ["no-clip"])
 
 
-def test_a_target_skeleton_that_cannot_be_used_refuses_the_job_with_its_name(project):
+def test_a_target_skeleton_that_cannot_be_used_refuses_the_job_with_its_name(project: ProjectInMemory) -> None:
     mapping = {"schema": "marey/skeleton-mapping@1", "joints": {"pelvis": "Sphere"}}
     project.parts["skeleton_a", 1, "mapping"] = mapping
     with pytest.raises(JobRefused, match=r"skeleton a: .*Sphere"):
@@ -179,7 +191,7 @@ def test_a_target_skeleton_that_cannot_be_used_refuses_the_job_with_its_name(pro
     assert project.staged == []
 
 
-def test_clips_with_the_same_place_have_files_of_their_own_in_an_archive(project):
+def test_clips_with_the_same_place_have_files_of_their_own_in_an_archive(project: ProjectInMemory) -> None:
     again(project, 0, item="clip_other")
     again(project, 0, revision=2)
     again(project, 0, revision=3)
@@ -191,7 +203,7 @@ def test_clips_with_the_same_place_have_files_of_their_own_in_an_archive(project
     assert (len(names), result["clips"]) == (5, 5)
 
 
-def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project):
+def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project: ProjectInMemory) -> None:
     add_clip(project, "odd", generate_gait(1.2, 0.0, 3.0), skeleton="skeleton_gone")
     del project.parts["skeleton_gone", 1, "hierarchy"]
     result = export.run(project, ExportParams())
@@ -200,6 +212,6 @@ def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project):
 
 @pytest.mark.parametrize("params", [AlignParams, EditParams, RetargetParams])
 @pytest.mark.parametrize("suffix", ["/a", "\n", "x" * 65])
-def test_a_suffix_that_no_name_may_have_is_refused_before_the_job(params, suffix):
+def test_a_suffix_that_no_name_may_have_is_refused_before_the_job(params: Any, suffix: str) -> None:
     with pytest.raises(ValueError, match="suffix"):
         params.model_validate({"suffix": suffix})

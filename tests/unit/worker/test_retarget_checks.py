@@ -1,29 +1,31 @@
 """Checks of a retargeted clip whose source has joint translations."""
 
 from dataclasses import replace
-from typing import cast
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion import retargeting
+from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
-from marey_motion.moved_bones import follow_moved_bones
+from marey_motion.moved_bones import FollowedBones, follow_moved_bones
 from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.worker_protocol import PinnedInput
-from marey_worker.context import Context
 from marey_worker.job_io import skeleton_cache
 from marey_worker.kinds import retarget
 
 
-def counted_follows(monkeypatch):
+def counted_follows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Count the calls of the function that computes where bones point."""
     calls = []
 
-    def follow(clip, joints):
+    def follow(clip: Clip, joints: dict[str, int]) -> FollowedBones:
         calls.append(clip)
         return follow_moved_bones(clip, joints)
 
@@ -31,7 +33,9 @@ def counted_follows(monkeypatch):
     return calls
 
 
-def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path, monkeypatch):
+def test_the_checks_of_a_result_name_the_bones_that_translations_moved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     project = ProjectInMemory(tmp_path)
@@ -46,7 +50,7 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(tmp_path,
 
     follows = counted_follows(monkeypatch)
     project.into = "out"
-    result = retarget.run(cast(Context, project), RetargetParams())
+    result = retarget.run(project, RetargetParams())
     assert (result["clips"], result["refused"]) == (2, [])
     checks = {output.item_name: output.parts["info"].get("checks", []) for output in project.staged}
     assert checks["plain"] == []

@@ -1,18 +1,23 @@
 """Format of a worker's log."""
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from marey_client.errors import MareyError
 from marey_worker.commands import _form_named, _level_of
 
 
-def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise():
+def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise() -> None:
     assert _form_named(None) == "json"
     assert _form_named("text") == "text"
 
 
 @pytest.mark.parametrize("form", ["json", "text"])
-def test_a_worker_logs_in_the_form_that_its_environment_names(server, start_worker, capfd, form):
+def test_a_worker_logs_in_the_form_that_its_environment_names(
+    server: Any, start_worker: Callable[..., Any], capfd: pytest.CaptureFixture[str], form: str
+) -> None:
     worker = start_worker(env={"MAREY_LOG_FORM": form})
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     assert worker.stop() == 0
@@ -21,7 +26,7 @@ def test_a_worker_logs_in_the_form_that_its_environment_names(server, start_work
     assert {line.startswith("{") for line in lines} == {form == "json"}
 
 
-def test_a_form_or_a_level_that_is_none_is_refused_with_those_there_are():
+def test_a_form_or_a_level_that_is_none_is_refused_with_those_there_are() -> None:
     with pytest.raises(MareyError, match="MAREY_LOG_FORM is 'xml'; it must be json or text"):
         _form_named("xml")
     with pytest.raises(MareyError, match="MAREY_LOG_LEVEL is 'loud'; it must be debug"):

@@ -5,6 +5,7 @@ import os
 import resource
 import sys
 import time
+from typing import Any
 
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
@@ -23,13 +24,13 @@ class MisbehaveParams(Request):
     seconds: float = 0.0
 
 
-def add(context, params):
+def add(context: Any, params: Any) -> Any:
     context.log(f"adding {params.a} and {params.b}")
     context.progress(1, 2, "half way")
     return {"sum": params.a + params.b, "pid": os.getpid()}
 
 
-def misbehave(context, params):
+def misbehave(context: Any, params: Any) -> Any:
     return {
         "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat, "hoard": _hoard,
         "fork-and-raise": _fork_and_raise,
@@ -39,27 +40,27 @@ def misbehave(context, params):
     }[params.how]()  # fmt: skip
 
 
-def _raise():
+def _raise() -> None:
     raise ArithmeticError("the numbers do not add up")
 
 
-def _refuse():
+def _refuse() -> None:
     raise JobRefused("not-today", "this cannot be done")
 
 
-def _segfault():
+def _segfault() -> None:
     ctypes.string_at(0)
 
 
-def _exit():
+def _exit() -> None:
     os._exit(7)
 
 
-def _eat():
+def _eat() -> Any:
     return {"bytes": len(bytearray(8 << 30))}
 
 
-def _hoard():
+def _hoard() -> None:
     """Memory in small helpings, which no single allocation gives away; in a process of its own that lifts its limit."""
     if os.fork() == 0:
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
@@ -70,7 +71,7 @@ def _hoard():
     time.sleep(60)
 
 
-def _fork_and_raise():
+def _fork_and_raise() -> Any:
     """The copy of this process gets as far as its end, and must not be taken for the job."""
     if os.fork() == 0:
         raise ArithmeticError("raised in a copy")
@@ -78,25 +79,25 @@ def _fork_and_raise():
     return {"survived": True}
 
 
-def _sleep(seconds):
+def _sleep(seconds: Any) -> Any:
     time.sleep(seconds)
     return {"slept": True}
 
 
-def _ignore_term(seconds):
+def _ignore_term(seconds: Any) -> Any:
     import signal
 
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return _sleep(seconds)
 
 
-def _shout():
+def _shout() -> Any:
     print("said on standard output")
     print("said on standard error", file=sys.stderr)
     return {}
 
 
-def _give_up_early(context):
+def _give_up_early(context: Any) -> None:
     """Fail while answers are still on their way."""
     pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
     reading = context.documents([pin] * 20, "motion")
@@ -104,7 +105,7 @@ def _give_up_early(context):
     raise ArithmeticError("enough")
 
 
-def _put(context):
+def _put(context: Any) -> Any:
     path = context.scratch / "result.bin"
     path.write_bytes(b"bytes that a job made")
     return {"digest": context.put_file(path)}
@@ -114,11 +115,11 @@ class TallyParams(Request):
     tasks: int
 
 
-def tally(context, params):
+def tally(context: Any, params: Any) -> Any:
     return {"task": list(context.task), "threads": context.threads}
 
 
-def gather_tally(context, params, results):
+def gather_tally(context: Any, params: Any, results: Any) -> Any:
     return {"seen": [result["task"] for result in results]}
 
 
