@@ -435,7 +435,9 @@ def test_security_headers_are_on_every_answer(owner: httpx.Client) -> None:
         assert "Access-Control-Allow-Origin" not in answer.headers
 
 
-def test_a_large_answer_is_sent_from_the_memory_that_holds_it(owner: httpx.Client, monkeypatch: pytest.MonkeyPatch):
+def test_a_large_answer_is_sent_from_the_memory_that_holds_it(
+    owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
     skeleton = make(owner, "skeletons", "three joints", hierarchy=HIERARCHY)
     path = f"/projects/lab/clips/{make(owner, 'clips', 'long', motion=motion(skeleton['id'], 4000))['id']}/parts/motion"
     bodies: list[bytes] = []
