@@ -10,7 +10,7 @@ from marey_motion.arrays import Floats
 from marey_motion.editing.annotations.contacts import Stance, find_stances
 from marey_motion.editing.placement import shifted
 from marey_motion.editing.take import EditFinding, Take
-from marey_motion.importing.checks import sole_points
+from marey_motion.importing.tracks import sole_points
 from marey_motion.kinematics import forward_kinematics
 from marey_schemas.editing.commands import FindContacts, FindGround, MoveToGround
 from marey_schemas.options.annotations import ContactOptions

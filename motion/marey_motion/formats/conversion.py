@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.errors import ClipError, FormatError, SkeletonError
 from marey_motion.importing import checks
-from marey_motion.importing.anatomy import KEPT_SKELETONS, Anatomy, anatomy_of
+from marey_motion.importing.anatomy import Anatomy, anatomy_of
 from marey_motion.importing.checks import CheckWarning
+from marey_motion.importing.landmarks import KEPT_SKELETONS
 from marey_motion.importing.source import ImportedMotion, SourceInfo, SourceMotion
 from marey_motion.importing.units import infer_conversion
 from marey_motion.skeleton import EndSite, Skeleton

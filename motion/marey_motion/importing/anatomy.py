@@ -12,12 +12,10 @@ import numpy as np
 from marey_motion.clip import Clip
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.errors import MappingError
-from marey_motion.importing.landmarks import Landmarks, find_landmarks
+from marey_motion.importing.landmarks import KEPT_SKELETONS, Landmarks, find_landmarks, path_length
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
 from marey_motion.skeleton import Skeleton
 from marey_schemas.lru import LruCache
-
-KEPT_SKELETONS = 256
 
 
 class Anatomy:
@@ -35,6 +33,14 @@ class Anatomy:
     def landmarks(self) -> Landmarks:
         """The joints that give the upward direction, the stature and the ground."""
         return find_landmarks(self.skeleton, self.mapping)
+
+    @cached_property
+    def leg(self) -> float | None:
+        """Mean length of the legs, from hips to ankle in the skeleton's unit; None without two feet or bones."""
+        landmarks = self.landmarks
+        if not landmarks.feet or landmarks.hips is None:
+            return None
+        return float(np.mean([path_length(self.skeleton, landmarks.hips, foot) for foot in landmarks.feet])) or None
 
     @cached_property
     def hierarchy(self) -> dict[str, Any]:

@@ -6,16 +6,14 @@ The checks never change anything; `without_rest_pose` and `on_the_floor` make a 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from marey_motion.clip import Clip
-from marey_motion.importing.landmarks import Landmarks, common_ancestor, find_landmarks, path_length
-from marey_motion.kinematics import forward_kinematics
-from marey_motion.skeleton import Skeleton
+from marey_motion.importing.landmarks import Landmarks
+from marey_motion.importing.tracks import Tracks, track
 from marey_schemas.wording import counted
 
 # Every code a warning may carry, and what it means to the reader of an import report.
@@ -60,7 +58,8 @@ SKATE_SPEED_M_S = 0.6
 IN_PLACE_FOOT_SPEED_M_S = 0.4
 TELEPORT_SPEED_M_S = 15.0
 JUMP_RAD = np.radians(60.0)
-_FRAMES_PER_BLOCK = 4096
+# Cosine of half an angle a little smaller, beyond any rounding of the one that is compared.
+_SURELY_NO_JUMP = np.cos(JUMP_RAD / 2) + 1e-3
 
 
 @dataclass(frozen=True)
@@ -92,34 +91,6 @@ class CheckWarning:
         return {**asdict(self), "joints": list(self.joints), "frames": list(self.frames) if self.frames else None}
 
 
-@dataclass(frozen=True)
-class _Tracks:
-    """Positions of the points that the checks use.
-
-    `positions` (F, k, 3) in metres; `column` finds a joint in them; `soles` are the columns of each foot: the joints
-    and end sites from the ankle down.
-    """
-
-    landmarks: Landmarks
-    positions: NDArray[np.float32]
-    column: dict[int, int]
-    soles: tuple[NDArray[np.intp], ...]
-
-    def of(self, *joints: int) -> NDArray[np.float32]:
-        return self.positions[:, [self.column[joint] for joint in joints]]
-
-    @cached_property
-    def lowest(self) -> NDArray[np.float32]:
-        """Heights (F,) of the lowest point of both feet."""
-        lowest: NDArray[np.float32] = self.positions[:, np.concatenate(self.soles), 1].min(axis=1)
-        return lowest
-
-    @cached_property
-    def floor_height(self) -> float:
-        """The height at which the lower foot rests."""
-        return float(np.quantile(self.lowest, 0.05))
-
-
 def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWarning, ...]:
     """Check a clip for defects and peculiarities.
 
@@ -132,9 +103,9 @@ def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWar
     -------
     tuple of CheckWarning    the findings
     """
-    tracks = _track(clip, landmarks)
+    tracks = track(clip, landmarks)
     warnings = [_position_channels(clip), *_rest_poses(clip, tracks)]
-    if tracks.soles:
+    if tracks.body.soles:
         warnings += [_floor_offset(tracks), _floor_penetration(tracks), *_gait(clip, tracks)]
     warnings += [_teleports(clip), _rotation_jumps(clip), _dead_joints(clip, tracks)]
     return tuple(warning for warning in warnings if warning is not None)
@@ -152,7 +123,7 @@ def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
     clip : Clip    the frames between
     dropped : (int, int)    numbers of frames removed at the start and at the end
     """
-    start, end = _rest_pose_frames(clip, _track(clip))
+    start, end = _rest_pose_frames(clip, track(clip))
     if start + end == 0 or start == clip.frame_count:
         return clip, (0, 0)
     return clip.sliced(start, clip.frame_count - end), (start, end)
@@ -170,56 +141,13 @@ def on_the_floor(clip: Clip) -> tuple[Clip, float]:
     clip : Clip    the moved clip; unchanged without feet
     shift_m : float    metres added to every height
     """
-    tracks = _track(clip)
-    if not tracks.soles:
+    tracks = track(clip)
+    if not tracks.body.soles:
         return clip, 0.0
     shift_m = -tracks.floor_height
     poses = clip.poses.copy()
     poses[:, 1] += np.float32(shift_m)
     return replace(clip, poses=poses), shift_m
-
-
-def _track(clip: Clip, landmarks: Landmarks | None = None) -> _Tracks:
-    skeleton = clip.skeleton
-    landmarks = landmarks or find_landmarks(skeleton)
-    soles = tuple(sole_points(skeleton, foot) for foot in landmarks.feet or ())
-    bodies = [joint for pair in (landmarks.hands, landmarks.feet) if pair for joint in pair]
-    points = sorted({0, landmarks.hips or 0, *bodies, *(point for sole in soles for point in sole)})
-    positions = np.empty((clip.frame_count, len(points), 3), np.float32)
-    # In blocks, so that a clip of an hour needs no more memory than its own.
-    for start in range(0, clip.frame_count, _FRAMES_PER_BLOCK):
-        block = slice(start, start + _FRAMES_PER_BLOCK)
-        everything = forward_kinematics(
-            skeleton,
-            clip.poses[block],
-            translations=None if clip.translations is None else clip.translations[block],
-            translated_joints=clip.translated_joints,
-            end_sites=True,
-        )
-        positions[block] = everything[:, points]
-    column = {point: index for index, point in enumerate(points)}
-    return _Tracks(landmarks, positions, column, tuple(np.array([column[p] for p in sole]) for sole in soles))
-
-
-def sole_points(skeleton: Skeleton, foot: int) -> list[int]:
-    """List the points of a foot that may touch the ground.
-
-    Parameters
-    ----------
-    skeleton : Skeleton    J joints
-    foot : int    index of the ankle
-
-    Returns
-    -------
-    list of int    the joints from the ankle down, and their end sites as the points that `end_sites` appends after the
-        joints
-    """
-    below = {foot}
-    for joint in range(foot + 1, skeleton.joint_count):
-        if int(skeleton.parents[joint]) in below:
-            below.add(joint)
-    tips = [skeleton.joint_count + index for index, site in enumerate(skeleton.end_sites) if site.joint in below]
-    return [*sorted(below), *tips]
 
 
 def _position_channels(clip: Clip) -> CheckWarning | None:
@@ -239,7 +167,7 @@ def _position_channels(clip: Clip) -> CheckWarning | None:
 # Rest pose
 
 
-def _rest_poses(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
+def _rest_poses(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
     start, end = _rest_pose_frames(clip, tracks)
     found = []
     for place, first, last in (("begins", 0, start), ("ends", clip.frame_count - end, clip.frame_count)):
@@ -250,34 +178,38 @@ def _rest_poses(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     return found
 
 
-def _rest_pose_frames(clip: Clip, tracks: _Tracks) -> tuple[int, int]:
+def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
     """Count the frames of a rest pose at the start and at the end: every joint at rest, or arms held out in a T."""
-    resting = _at_rest(clip) | _in_t_pose(clip, tracks)
+    ends = slice(None, None, max(1, clip.frame_count - 1))
+    # Most motions neither begin nor end at rest; then the frames between need no look.
+    if not (_at_rest(clip, ends) | _in_t_pose(tracks, ends)).any():
+        return 0, 0
+    everything = slice(None)
+    resting = _at_rest(clip, everything) | _in_t_pose(tracks, everything)
     if resting.all():
         return clip.frame_count, 0
     return int(np.argmin(resting)), int(np.argmin(resting[::-1]))
 
 
-def _at_rest(clip: Clip) -> NDArray[np.bool_]:
+def _at_rest(clip: Clip, frames: slice) -> NDArray[np.bool_]:
     """Find the frames (F,) in which 19 of 20 joints below the root are turned as in the skeleton's rest pose."""
-    rotations = clip.rotations[:, 1:]
+    rotations = clip.rotations[frames, 1:]
     if rotations.shape[1] == 0:
-        return np.zeros(clip.frame_count, np.bool_)
+        return np.zeros(len(rotations), np.bool_)
     rest = clip.skeleton.rest_rotations[1:].astype(np.float32)
     cosines = np.abs(np.einsum("fjc,jc->fj", rotations, rest))
     resting: NDArray[np.bool_] = (cosines >= np.cos(REST_TOLERANCE_RAD / 2)).mean(axis=1) >= 0.95
     return resting
 
 
-def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
+def _in_t_pose(tracks: Tracks, frames: slice) -> NDArray[np.bool_]:
     """Find the frames (F,) with both arms stretched out level and the legs straight."""
-    landmarks = tracks.landmarks
+    landmarks = tracks.body.landmarks
+    seen = Tracks(tracks.body, tracks.positions[frames])
     if landmarks.hands is None or landmarks.feet is None or landmarks.hips is None:
-        return np.zeros(clip.frame_count, np.bool_)
-    chest = common_ancestor(clip.skeleton.parents, landmarks.hands)
-    span = sum(path_length(clip.skeleton, chest, hand) for hand in landmarks.hands)
-    leg = path_length(clip.skeleton, landmarks.hips, landmarks.feet[0])
-    hands, feet, hips = tracks.of(*landmarks.hands), tracks.of(*landmarks.feet), tracks.of(landmarks.hips)
+        return np.zeros(len(seen.positions), np.bool_)
+    span, leg = tracks.body.span_m, tracks.body.leg_m
+    hands, feet, hips = seen.of(*landmarks.hands), seen.of(*landmarks.feet), seen.of(landmarks.hips)
     across = hands[:, 0] - hands[:, 1]
     apart = np.hypot(across[:, 0], across[:, 2]) > 0.9 * span
     level = np.abs(across[:, 1]) < 0.1 * span
@@ -289,7 +221,7 @@ def _in_t_pose(clip: Clip, tracks: _Tracks) -> NDArray[np.bool_]:
 # Feet and ground
 
 
-def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
+def _floor_offset(tracks: Tracks) -> CheckWarning | None:
     height = tracks.floor_height
     if abs(height) <= FLOOR_TOLERANCE_M:
         return None
@@ -300,7 +232,7 @@ def _floor_offset(tracks: _Tracks) -> CheckWarning | None:
     )
 
 
-def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
+def _floor_penetration(tracks: Tracks) -> CheckWarning | None:
     depths = tracks.floor_height - tracks.lowest
     below = np.flatnonzero(depths > PENETRATION_M)
     if below.size == 0:
@@ -314,7 +246,7 @@ def _floor_penetration(tracks: _Tracks) -> CheckWarning | None:
     )
 
 
-def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
+def _gait(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
     """Find feet that slide under a body that travels (skating), or under one that does not (walking in place).
 
     The slide of a standing foot is weighted 2 − 2^(h/H) by its height h above the ground up to H = 2.5 cm (Zhang et
@@ -322,7 +254,7 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
     """
     if clip.frame_count < 3:
         return []
-    soles = tracks.positions[:, np.concatenate(tracks.soles)]
+    soles = tracks.soles
     heights = soles[1:, :, 1] - tracks.floor_height
     weights = 2.0 - 2.0 ** (np.clip(heights, 0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
     standing = float(weights.sum())
@@ -330,7 +262,7 @@ def _gait(clip: Clip, tracks: _Tracks) -> list[CheckWarning]:
         return []
     steps = np.linalg.norm(np.diff(soles[..., [0, 2]], axis=0), axis=2)
     slide_m_s = float((steps * weights).sum()) / standing * clip.frame_rate_hz
-    travel_m_s = _travel_speed(tracks.of(tracks.landmarks.hips or 0)[:, 0], clip.frame_rate_hz)
+    travel_m_s = _travel_speed(tracks.of(tracks.body.landmarks.hips or 0)[:, 0], clip.frame_rate_hz)
     values = {"slide_m_s": slide_m_s, "travel_m_s": travel_m_s}
     if slide_m_s > IN_PLACE_FOOT_SPEED_M_S and travel_m_s < 0.2 * slide_m_s:
         message = f"standing feet slide at {slide_m_s:.2f} m/s while the body travels {travel_m_s:.2f} m/s"
@@ -366,7 +298,10 @@ def _teleports(clip: Clip) -> CheckWarning | None:
 
 
 def _rotation_jumps(clip: Clip) -> CheckWarning | None:
-    angles = 2.0 * np.arccos(np.clip(_step_cosines(clip.rotations), 0.0, 1.0))
+    cosines = _step_cosines(clip.rotations)
+    if cosines.size == 0 or cosines.min() > _SURELY_NO_JUMP:
+        return None
+    angles = 2.0 * np.arccos(np.clip(cosines, 0.0, 1.0))
     jumps = angles > JUMP_RAD
     if not jumps.any():
         return None
@@ -383,19 +318,18 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
     )
 
 
-def _dead_joints(clip: Clip, tracks: _Tracks) -> CheckWarning | None:
+def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
     """Warn of limbs of which no joint ever turns, while other joints do."""
-    landmarks, skeleton = tracks.landmarks, clip.skeleton
-    if clip.frame_count < 2 or not (landmarks.hands and landmarks.feet):
+    rotations, limbs = clip.rotations, tracks.body.limbs
+    if clip.frame_count < 2 or not limbs:
         return None
-    chest = common_ancestor(skeleton.parents, landmarks.hands)
-    ends = [(chest, hand) for hand in landmarks.hands] + [(landmarks.hips or 0, foot) for foot in landmarks.feet]
-    paths = [skeleton.path_to_root(end)[: skeleton.path_to_root(end).index(top)] for top, end in ends]
-    limbs = [list(path) for path in paths if (clip.rotations[:, path] == clip.rotations[0, path]).all()]
-    dead = sorted(joint for limb in limbs for joint in limb)
-    if not dead or (clip.rotations == clip.rotations[0]).all():
+    # One frame shows of nearly every limb that it turns.
+    turned = (rotations[len(rotations) // 2] != rotations[0]).any(axis=1).tolist()
+    still = [limb for limb in limbs if not any(turned[joint] for joint in limb)]
+    dead = sorted(joint for limb in still if (rotations[:, limb] == rotations[0, limb]).all() for joint in limb)
+    if not dead or (rotations == rotations[0]).all():
         return None
-    names = tuple(skeleton.joint_names[joint] for joint in dead)
+    names = tuple(clip.skeleton.joint_names[joint] for joint in dead)
     return CheckWarning("dead-joints", f"whole limbs of {counted(len(names), 'joint')} never turn", joints=names)
 
 

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from marey_motion.rigs import JointMapping, map_joints
 from marey_motion.skeleton import Skeleton
 
+# Skeletons whose anatomy and measures caches keep.
+KEPT_SKELETONS = 256
+
 
 @dataclass(frozen=True)
 class Landmarks:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from marey_motion.errors import AmbiguousUnits, MotionError
 from marey_motion.importing.anatomy import Anatomy
 from marey_motion.importing.checks import CheckWarning
-from marey_motion.importing.landmarks import Landmarks, path_length
+from marey_motion.importing.landmarks import Landmarks
+from marey_motion.importing.order_statistics import low_quantile, median
 from marey_motion.importing.source import SourceMotion
 from marey_motion.kinematics import forward_kinematics
 from marey_schemas.formats import UNITS_M
@@ -117,7 +118,8 @@ def _measure(source: SourceMotion, anatomy: Anatomy, file: str) -> _Measurements
     rest = skeleton.rest_global_positions
     positions: NDArray[np.floating[Any]] = rest[None]
     if source.rotations is not None and source.root_positions is not None:
-        frames = np.unique(np.linspace(0, len(source.rotations) - 1, _SAMPLED_FRAMES).astype(np.int64))
+        spaced = np.linspace(0, len(source.rotations) - 1, _SAMPLED_FRAMES).astype(np.int64)
+        frames = spaced[np.concatenate(([True], spaced[1:] > spaced[:-1]))]
         rotations = source.rotations[frames].astype(np.float64).reshape(len(frames), -1)
         translations = None if source.translations is None else source.translations[frames]
         positions = forward_kinematics(
@@ -126,10 +128,7 @@ def _measure(source: SourceMotion, anatomy: Anatomy, file: str) -> _Measurements
             translations=translations,
             translated_joints=source.translated_joints,
         )
-    leg = None
-    if landmarks.feet and landmarks.hips is not None:
-        leg = float(np.mean([path_length(skeleton, landmarks.hips, foot) for foot in landmarks.feet]))
-    return _Measurements(file, landmarks, positions.astype(np.float64), rest, leg or None)
+    return _Measurements(file, landmarks, positions.astype(np.float64, copy=False), rest, anatomy.leg)
 
 
 # Up axis
@@ -225,7 +224,7 @@ def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
     assert body.leg is not None
     below = body.positions[:, limbs]
     middle = body.positions.mean(axis=1)
-    signs = np.where(np.median(middle - below.mean(axis=1), axis=0) >= 0, 1.0, -1.0)
+    signs = np.where(median(middle - below.mean(axis=1)) >= 0, 1.0, -1.0)
     lowest = (below * signs).min(axis=1)
     spread = lowest.std(axis=0) / body.leg
     flattest, second = np.argsort(spread)[:2]
@@ -240,7 +239,7 @@ def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
     """Check that a ground through the origin, orthogonal to the axis, is just under the body."""
     assert body.leg is not None
     lowest = _heights(body.positions, axis).min(axis=1)
-    return bool(abs(np.quantile(lowest, 0.05)) <= _FLAT_GROUND * body.leg)
+    return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)
 
 
 def _axis_name(axis: int, sign: float) -> UpAxis:
@@ -324,7 +323,7 @@ def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
     """Compute the median height of the hips above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
-    return float(np.median(hip_heights(body.positions, body.landmarks, up_axis)))
+    return float(median(hip_heights(body.positions, body.landmarks, up_axis)))
 
 
 def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:
@@ -340,7 +339,7 @@ def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: U
     -------
     (F,) float64    in the unit of `positions`
     """
-    ground = np.quantile(_heights(positions[:, list(landmarks.ground_joints)], up_axis).min(axis=1), 0.05)
+    ground = low_quantile(_heights(positions[:, list(landmarks.ground_joints)], up_axis).min(axis=1))
     heights: NDArray[np.float64] = _heights(positions[:, landmarks.hips], up_axis) - ground
     return heights
 
@@ -355,7 +354,7 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
     heights = _heights(body.positions, up_axis)
     hands = heights[:, list(body.landmarks.hands)].min(axis=1)
     feet = heights[:, list(body.landmarks.ground_joints)].min(axis=1)
-    return bool(np.median(hands - feet) < 0.25 * body.leg)
+    return bool(median(hands - feet) < 0.25 * body.leg)
 
 
 def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:

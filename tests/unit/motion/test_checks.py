@@ -62,6 +62,18 @@ class TestRestPose:
         assert dropped == (20, 5)
         np.testing.assert_array_equal(trimmed.poses, walk.poses)
 
+    def test_a_rest_pose_between_other_poses_is_no_finding(self, walk: Clip, standing: Clip) -> None:
+        clip = joined(walk, standing.sliced(0, 20), walk)
+        assert found(clip, "rest-pose-frame") is None
+        assert without_rest_pose(clip) == (clip, (0, 0))
+
+    @pytest.mark.parametrize("frames", [1, 2, 3])
+    def test_a_rest_pose_alone_is_kept_and_reported_once(self, standing: Clip, frames: int) -> None:
+        clip = standing.sliced(0, frames)
+        ranges = [warning.frames for warning in check_clip(clip) if warning.code == "rest-pose-frame"]
+        assert ranges == [(0, frames)]
+        assert without_rest_pose(clip) == (clip, (0, 0))
+
     def test_what_the_options_mended_is_not_complained_about(self, walk: Clip, standing: Clip) -> None:
         poses = joined(standing.sliced(0, 20), walk).poses.copy()
         poses[:, 1] += 0.3
@@ -171,6 +183,18 @@ class TestContinuity:
         assert warning is not None
         assert warning.joints == ("LeftHand",)
         assert warning.values["largest_m"] == pytest.approx(0.02, abs=1e-5)
+
+
+def test_an_arm_that_turns_in_one_frame_only_is_not_dead(walk: Clip) -> None:
+    poses = walk.poses.copy()
+    arm = [walk.skeleton.index_of(name) for name in ("LeftShoulder", "LeftArm", "LeftForeArm", "LeftHand")]
+    columns = np.concatenate([np.arange(3 + 4 * joint, 7 + 4 * joint) for joint in arm])
+    poses[:, columns] = poses[0, columns]
+    dead = found(replace(walk, poses=poses), "dead-joints")
+    assert dead is not None
+    assert set(dead.joints) == {walk.skeleton.joint_names[joint] for joint in arm}
+    poses[1, columns[-4:]] = (0.0, 1.0, 0.0, 0.0)
+    assert found(replace(walk, poses=poses), "dead-joints") is None
 
 
 def test_checks_change_nothing(walk: Clip) -> None:
