@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import cast, get_args
+from typing import Any, cast, get_args
 
 from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
@@ -33,7 +33,7 @@ def work(
     labels: tuple[str, ...] = (),
     name: str | None = None,
     cache: Path | None = None,
-    cache_mb: int = 2048,
+    cache_mb: int | None = None,
     log_form: LogForm | None = None,
     attached: bool = False,
 ) -> None:
@@ -46,10 +46,12 @@ def work(
         raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
     log_to_standard_error(log_form or _form_named(os.environ.get("MAREY_LOG_FORM")), _level_of(os.environ))
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    given = {} if name is None else {"name": name}
+    given: dict[str, Any] = {} if name is None else {"name": name}
+    if cache_mb is not None:
+        given["cache_bytes"] = cache_mb * MIB
     options = WorkerOptions(
         slots=slots, kinds=_known_kinds(kinds), labels=_parsed_labels(labels),
-        cache=cache or default_cache(os.environ), cache_bytes=cache_mb * MIB, **given,  # type: ignore[arg-type]
+        cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
     supervisor = Supervisor(Transport(credential.url, credential.token, retries=BRIEF), options)
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -13,7 +13,7 @@ from marey_client.cli.following import SEEDED_JOB, Into, Wait, follow, input_at,
 from marey_client.cli.invocation import AsJson, JobId, ProjectName, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, tell
 from marey_client.cli.schema_options import Chosen, add_command
-from marey_client.cli.typed_values import assignment, read_parameter, resolved
+from marey_client.cli.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -46,18 +46,28 @@ def list_kinds(
         )
     (kind,) = kinds
     typer.echo(kind.description)
-    takes = [("--input", role, spec.kind, spec.description) for role, spec in kind.inputs.items()]
+    takes = [("--input", role, spec.kind, "", spec.description) for role, spec in kind.inputs.items()]
     given = [
-        ("--param", key, json.dumps(spec.get("default")), spec.get("description", ""))
-        for key, spec in kind.params_schema.get("properties", {}).items()
+        ("--param", key, _value_text(spec), json.dumps(spec.get("default")), spec.get("description", ""))
+        for key, spec in resolved(kind.params_schema).items()
     ]
-    return print_table(("", "name", "kind or default", "meaning"), [*takes, *given])
+    return print_table(("", "name", "value", "default", "meaning"), [*takes, *given])
+
+
+def _value_text(schema: Schema) -> str:
+    """Return the type and the range of a parameter."""
+    return ", ".join(filter(None, (type_text(schema), range_text(schema))))
 
 
 def submit_job(
     context: typer.Context,
     project: ProjectName,
-    kind: Annotated[str, typer.Argument(help="Kind of the job; marey job kinds lists them.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="Kind of the job; marey job kinds lists them, and marey job kinds KIND its inputs and parameters."
+        ),
+    ],
     job: Chosen,
     inputs: Annotated[
         list[str] | None,

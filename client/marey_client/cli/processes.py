@@ -74,7 +74,9 @@ def worker(
         str | None, typer.Option(help="Name of the worker, shown to people; default: host and process id.")
     ] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder for a cache of downloaded inputs.")] = None,
-    cache_mb: Annotated[int, typer.Option(min=16, help="Greatest size of the cache.")] = 2048,
+    cache_mb: Annotated[
+        int | None, typer.Option(min=16, help="Greatest size of the cache, in MiB; default: 2048.")
+    ] = None,
     log_form: Annotated[
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
