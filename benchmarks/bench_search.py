@@ -17,7 +17,6 @@ from marey_motion.gait import GaitStyle, generate_gait
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import search_closely
@@ -29,6 +28,7 @@ from marey_motion.rigs import map_joints
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 
 Floats = NDArray[np.float64]
 
@@ -129,9 +129,9 @@ def _sklearn_tree(samples: NDArray[np.float32]) -> int:
     return sum(_sklearn_tree(group) for group in groups if 0 < len(group) < len(samples))
 
 
-def _wrist_at(target: Floats) -> JointPosition:
+def _wrist_at(target: Floats) -> JointPositionConstraint:
     x, y, z = target.tolist()
-    return JointPosition("left_wrist", FRAME, (x, y, z))
+    return JointPositionConstraint(joint="left_wrist", at=FRAME, target_m=(x, y, z))
 
 
 def _searches() -> list[Row]:

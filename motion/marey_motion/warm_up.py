@@ -249,7 +249,6 @@ def _search(clip: Clip) -> None:
     """Search a model of a single motion for two steps, and refine them."""
     from marey_motion.modelling.mixture import LatentMixture
     from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
-    from marey_motion.modelling.search.constraints import RootPosition
     from marey_motion.modelling.search.step_search import search_steps
     from marey_motion.modelling.search.steps import Step
     from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
@@ -257,6 +256,7 @@ def _search(clip: Clip) -> None:
     from marey_motion.motion import Motion
     from marey_motion.rigs import map_joints
     from marey_schemas.options.modelling import TreeOptions
+    from marey_schemas.search_constraints import RootPositionConstraint
 
     def alone(values: NDArray[np.float64]) -> FunctionalComponents:
         basis = SplineBasis.clamped(len(values), 7)
@@ -270,7 +270,7 @@ def _search(clip: Clip) -> None:
     primitive = MotionPrimitive("walk", clip.skeleton, clip.frame_rate_hz, space, time, 1.0, mixture)
     joints = {name: clip.skeleton.index_of(joint) for name, joint in map_joints(clip.skeleton).joints.items()}
     tree = build_tree(primitive, 0, TreeOptions(samples=64), end_effectors=[joints[name] for name in END_EFFECTORS])
-    step = Step(primitive, (RootPosition("end", (0.0, None)),), joints)
+    step = Step(primitive, (RootPositionConstraint(at="end", target_m=(0.0, None)),), joints)
     search_steps([step, step], [tree, tree])
 
 

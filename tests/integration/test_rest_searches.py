@@ -11,13 +11,13 @@ from tests.support.search_primitives import FRAMES, standard_joints, walking
 
 from marey_motion.documents import skeleton_to_document
 from marey_motion.modelling.primitive_documents import primitive_to_tree
-from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_motion.modelling.search.work import drawing_work, searching_work
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 from marey_server.motions import search_answers, searching
 
 MODELS = "/projects/lab/models"
@@ -121,7 +121,11 @@ def test_a_search_that_takes_too_long_is_refused(
     model = add_model(owner, document)["id"]
     wrist = {"type": "joint_position", "joint": "left_wrist", "at": "end", "target_m": [0.3, 1, 1]}
     asked = {"constraints": [wrist], "candidates": 8, "passes": 1}
-    step = Step(walking()[0], (JointPosition("left_wrist", "end", (0.3, 1.0, 1.0)),), standard_joints())
+    step = Step(
+        walking()[0],
+        (JointPositionConstraint(joint="left_wrist", at="end", target_m=(0.3, 1.0, 1.0)),),
+        standard_joints(),
+    )
     work = searching_work(
         SeveralSteps.of([step]),
         [build_tree(walking()[0], 0, end_effectors=[standard_joints()[name] for name in END_EFFECTORS])],

@@ -15,15 +15,6 @@ The published number is 4; with 8 the result is a sixth nearer, for a millisecon
 PASSES = 2
 """Number of passes of a search, by default: the tree's samples, then samples near the best of them."""
 
-CONSTRAINT_WEIGHT = 1.0
-TOLERANCE_M = 0.01
-TOLERANCE_DEG = 5.0
-TOLERANCE_S = 0.05
-"""Default weight and tolerances of constraints: the errors that count as 1."""
-
-LOOK_AXIS = (0.0, 0.0, 1.0)
-"""Axis of a joint, in its own frame, that points in the direction of a look, by default."""
-
 TRANSITION_TOLERANCE_M = 0.02
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from math import degrees, radians
 from typing import TYPE_CHECKING, Any
 
-from marey_schemas import search as wire
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.formats import MotionFormat
 from marey_schemas.options.searching import RefineOptions, TransitionOptions
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
+from marey_schemas.search_constraints import JointPositionConstraint, RootPositionConstraint, SearchConstraint
 from marey_server.errors import InvalidProblem, TooLargeProblem
 from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile
 from marey_server.motions.searching import FoundSearchable, Searchable
@@ -21,7 +21,6 @@ from marey_server.motions.searching import FoundSearchable, Searchable
 if TYPE_CHECKING:
     from marey_motion.alignment.aligned import Placement
     from marey_motion.clip import Clip
-    from marey_motion.modelling.search.constraints import Constraint
     from marey_motion.modelling.search.finishing import Finished
     from marey_motion.modelling.search.found_motions import FoundMotion
     from marey_motion.modelling.search.step_search import Sequel
@@ -110,21 +109,12 @@ def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
 
 
 def _steps_of(searchables: Sequence[Searchable], request: SearchRequest) -> tuple[Step, ...]:
-    from marey_motion.errors import MotionError
-    from marey_motion.modelling.search.constraints import InvalidConstraint as BadConstraint
     from marey_motion.modelling.search.steps import Step
 
-    steps = []
-    for number, (one, asked) in enumerate(zip(searchables, request.asked_steps, strict=True)):
-        known = []
-        for place, constraint in enumerate(asked.constraints):
-            try:
-                known.append(constraint_of(constraint))
-            except MotionError as error:
-                where = ".".join(part for part in (f"steps[{number}].constraints[{place}]", error.where) if part)
-                raise _invalid(request, BadConstraint(error.message, code=error.code, where=where)) from error
-        steps.append(Step(one.usable.primitive, tuple(known), one.standard_joints))
-    return tuple(steps)
+    return tuple(
+        Step(one.usable.primitive, asked.constraints, one.standard_joints)
+        for one, asked in zip(searchables, request.asked_steps, strict=True)
+    )
 
 
 def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
@@ -137,7 +127,7 @@ def _invalid(request: SearchRequest, error: Any) -> InvalidProblem:
     return InvalidProblem(str(error.message), code=error.code, errors=[problem])
 
 
-# -- telling -----------------------------------------------------------------------------------------------------------
+# -- answers -----------------------------------------------------------------------------------------------------------
 
 
 def answer_of(
@@ -196,9 +186,9 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
     return tuple(told)
 
 
-def _tolerance(constraint: wire.SearchConstraint, unit: str) -> float:
+def _tolerance(constraint: SearchConstraint, unit: str) -> float:
     """Return a constraint's tolerance in the unit of its error."""
-    if isinstance(constraint, wire.JointPositionConstraint | wire.RootPositionConstraint):
+    if isinstance(constraint, JointPositionConstraint | RootPositionConstraint):
         return constraint.tolerance_m / CM
     return float(getattr(constraint, f"tolerance_{unit}"))
 
@@ -227,27 +217,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
     )
 
 
-def constraint_of(one: wire.SearchConstraint) -> Constraint:
-    """Convert centimetres and degrees to metres and radians. Raises `MotionError` for values that are not valid."""
-    from marey_motion.modelling.search import constraints as known
-
-    match one:
-        case wire.JointPositionConstraint():
-            return known.JointPosition(one.joint, one.at, one.target_m, one.tolerance_m, one.weight)
-        case wire.JointOrientationConstraint():
-            return known.JointOrientation(one.joint, one.at, one.rotation, radians(one.tolerance_deg), one.weight)
-        case wire.LookDirectionConstraint():
-            tolerance = radians(one.tolerance_deg)
-            return known.LookDirection(one.joint, one.at, one.direction, one.point_m, one.axis, tolerance, one.weight)
-        case wire.RootPositionConstraint():
-            return known.RootPosition(one.at, one.target_m, one.tolerance_m, one.weight)
-        case wire.RootHeadingConstraint():
-            return known.RootHeading(one.at, radians(one.heading_deg), radians(one.tolerance_deg), one.weight)
-        case wire.KeyframeTimeConstraint():
-            return known.KeyframeTime(one.at, one.seconds, one.tolerance_s, one.weight)
-
-
-def placement_of(start: wire.StartPlacement) -> Placement:
+def placement_of(start: StartPlacement) -> Placement:
     """Return the place of the canonical frame."""
     from marey_motion.alignment.aligned import Placement
 

@@ -1,6 +1,8 @@
 """Options of commands that come from the models of jobs."""
 
 import re
+from contextlib import nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -8,6 +10,7 @@ import typer
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from marey_client.cli import jobs
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import ALIGN, CUT
 from marey_client.cli.evaluations import EVALUATE
@@ -15,8 +18,11 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.files import UPLOAD
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.job_params import AlignParams, EvaluateParams
+from marey_schemas.jobs import JobKind
 from marey_schemas.options.imports import ImportOptions
-from marey_schemas.options.searching import TOLERANCE_DEG, TOLERANCE_M
+from marey_schemas.options.modelling import ModelOptions
+from marey_schemas.search_constraints import JointOrientationConstraint, JointPositionConstraint
+from marey_worker.supervisor import WorkerOptions
 
 COMMANDS: Any = get_command(app)
 
@@ -127,9 +133,33 @@ def test_the_parameters_of_a_job_are_the_options_of_its_command() -> None:
         assert {f"--{name}", f"--{re.sub('s$', '', name)}"} & options, field
 
 
+def test_the_help_of_a_worker_names_the_size_that_its_cache_has_by_default() -> None:
+    command = COMMANDS.commands["worker"]
+    (option,) = (one for one in command.get_params(typer.Context(command)) if one.name == "cache_mb")
+    assert option.help.endswith(f"default: {WorkerOptions.cache_bytes >> 20}.")
+
+
+def test_job_kinds_shows_type_range_and_default_of_each_parameter(monkeypatch: pytest.MonkeyPatch) -> None:
+    kind = JobKind(
+        name="errand", description="Run.", inputs={}, outputs={}, params_schema=ModelOptions.model_json_schema()
+    )
+    marey = SimpleNamespace(jobs=SimpleNamespace(kinds=lambda: [kind]))
+    monkeypatch.setattr(jobs, "connect", lambda _: nullcontext(marey))
+    told = CliRunner().invoke(app, ["job", "kinds", "errand"]).stdout
+    (line,) = (line for line in told.splitlines() if "spatial_components" in line)
+    assert "whole number, 0 to 1000" in line
+    (line,) = (line for line in told.splitlines() if "inner_product" in line)
+    assert "coefficients or l2" in line
+    assert '"coefficients"' in line
+
+
 def test_the_help_of_a_search_names_the_tolerances_that_requests_have_by_default() -> None:
     """The command line does not load the schemas before a command runs, so the two numbers are text there."""
     command = COMMANDS.commands["search"]
     helps = {option.name: option.help for option in command.get_params(typer.Context(command))}
-    assert helps["tolerance_cm"].endswith(f"default: {100 * TOLERANCE_M:g}.")
-    assert helps["tolerance_deg"].endswith(f"default: {TOLERANCE_DEG:g}.")
+    assert helps["tolerance_cm"].endswith(
+        f"default: {100 * JointPositionConstraint.model_fields['tolerance_m'].default:g}."
+    )
+    assert helps["tolerance_deg"].endswith(
+        f"default: {JointOrientationConstraint.model_fields['tolerance_deg'].default:g}."
+    )

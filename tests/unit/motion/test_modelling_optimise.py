@@ -9,12 +9,13 @@ import pytest
 from pydantic import ValidationError
 from tests.support.search_primitives import FRAMES, sliding, standard_joints, walking
 
+from marey_motion.alignment.aligned import Placement
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import JointPosition, KeyframeTime, RootHeading, RootPosition
+from marey_motion.modelling.search.constraints import tolerance_of
 from marey_motion.modelling.search.objective import Objective, build_objective
 from marey_motion.modelling.search.optimise import _Prior, refine
 from marey_motion.modelling.search.samples import search_tree
@@ -22,8 +23,14 @@ from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_schemas.options.modelling import TreeOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import (
+    JointPositionConstraint,
+    KeyframeTimeConstraint,
+    RootHeadingConstraint,
+    RootPositionConstraint,
+)
 
-WRIST = (JointPosition("left_wrist", "middle", (0.35, 1.0, 0.6)),)
+WRIST = (JointPositionConstraint(joint="left_wrist", at="middle", target_m=(0.35, 1.0, 0.6)),)
 
 
 def on_walks(constraints: tuple[Any, ...], mixtures: int = 2) -> SeveralSteps:
@@ -51,13 +58,13 @@ def posterior(
 
 
 def tolerances(constraints: tuple[Any, ...]) -> list[float]:
-    return [next(value for name, value in vars(one).items() if name.startswith("tolerance")) for one in constraints]
+    return [tolerance_of(one) for one in constraints]
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.01, 25.0])
 def test_with_one_gaussian_and_linear_constraints_the_result_is_that_of_ridge_regression(weight: float) -> None:
     primitive = sliding(2)
-    constraints = (RootPosition("middle", (0.25, None), 0.02, 3.0),)
+    constraints = (RootPositionConstraint(at="middle", target_m=(0.25, None), tolerance_m=0.02, weight=3.0),)
     problem = SeveralSteps.of([Step(primitive, constraints, {})])
     found = refine(problem, np.array([2.0, -3.0]), RefineOptions(likelihood_weight=weight))
     # The root's x is 0.1 times the first score.
@@ -83,7 +90,11 @@ def slopes_of(cost: Callable[..., Any], latents: Floats) -> list[float]:
 @pytest.mark.parametrize("weight", [1.0, 0.05])
 def test_where_it_ends_nothing_nearby_is_better(weight: float, mixtures: int) -> None:
     primitive, _ = walking(mixtures=mixtures)
-    constraints = (*WRIST, RootHeading("end", 0.2), KeyframeTime("end", 0.9))
+    constraints = (
+        *WRIST,
+        RootHeadingConstraint(at="end", heading_deg=11.0),
+        KeyframeTimeConstraint(at="end", seconds=0.9),
+    )
     cost = posterior(primitive, constraints, standard_joints(), weight)
     found = refine(
         on_walks(constraints, mixtures=mixtures), primitive.mixture.means[0], RefineOptions(likelihood_weight=weight)
@@ -121,7 +132,7 @@ def test_what_a_motion_does_already_is_met_within_a_millimetre() -> None:
     for example in latents[::8]:
         pose = primitive.poses(example[None], [float(FRAMES // 2)])[:, 0]
         place = forward_kinematics(primitive.skeleton, pose)[0, standard_joints()["left_wrist"]]
-        wanted = (JointPosition("left_wrist", "middle", tuple(place.tolist())),)
+        wanted = (JointPositionConstraint(joint="left_wrist", at="middle", target_m=tuple(place.tolist())),)
         objective = objective_of(primitive, wanted, standard_joints())
         sample = search_tree(objective, tree, candidates=8)
         assert sample.costs[0] < 3.0
@@ -132,7 +143,7 @@ def test_what_a_motion_does_already_is_met_within_a_millimetre() -> None:
 
 def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likelier() -> None:
     primitive, _ = walking(mixtures=1)
-    wanted = (JointPosition("left_wrist", "middle", (1.5, 2.0, 0.0), 0.1),)
+    wanted = (JointPositionConstraint(joint="left_wrist", at="middle", target_m=(1.5, 2.0, 0.0), tolerance_m=0.1),)
     objective = objective_of(primitive, wanted, standard_joints())
     errors, densities = [], []
     for weight in (100.0, 10.0, 1.0, 0.1, 0.01):
@@ -150,14 +161,18 @@ def test_out_of_reach_a_smaller_weight_comes_nearer_and_a_larger_one_stays_likel
 def test_the_component_of_the_mixture_is_picked_anew_on_the_way() -> None:
     primitive = sliding(1)
     two = LatentMixture(np.array([0.5, 0.5]), np.array([[-2.0], [2.0]]), np.full((2, 1, 1), 0.25))
-    problem = SeveralSteps.of([Step(replace(primitive, mixture=two), (RootPosition("middle", (0.2, None)),), {})])
+    problem = SeveralSteps.of(
+        [Step(replace(primitive, mixture=two), (RootPositionConstraint(at="middle", target_m=(0.2, None)),), {})]
+    )
     found = refine(problem, np.array([-2.0]))
     # At 2 both the target and the second component are met.
     np.testing.assert_allclose(found.latents, 2.0, atol=1e-3)
 
 
 def test_a_model_that_never_varies_stays_as_it_is() -> None:
-    found = refine(SeveralSteps.of([Step(sliding(0), (RootPosition(0, (1.0, 0.0)),), {})]), np.zeros(0))
+    found = refine(
+        SeveralSteps.of([Step(sliding(0), (RootPositionConstraint(at=0, target_m=(1.0, 0.0)),), {})]), np.zeros(0)
+    )
     assert found.latents.shape == (0,)
     assert found.cost == found.start_cost
 
@@ -170,7 +185,9 @@ def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_rounding_allows(weight: float) -> None:
-    constraints = (JointPosition("head", "end", (1e6, 1e6, 1e6), 1e-8, 1e6),)
+    constraints = (
+        JointPositionConstraint(joint="head", at="end", target_m=(1e6, 1e6, 1e6), tolerance_m=1e-5, weight=1e6),
+    )
     start = walking()[0].mixture.means[0]
     found = refine(on_walks(constraints), start, RefineOptions(likelihood_weight=weight))
     assert np.isfinite(found.latents).all()
@@ -191,7 +208,10 @@ def test_slopes_without_any_curvature_are_damped_instead_of_failing() -> None:
     np.testing.assert_array_equal(found.latents, 0.0)
 
 
-def test_errors_that_cannot_be_computed_with_are_told_of() -> None:
-    constraints = (JointPosition("head", "end", (1e200, 0.0, 0.0), 1e-8),)
+def test_errors_too_large_to_compute_with_are_refused() -> None:
+    step = Step(
+        walking()[0], (JointPositionConstraint(joint="head", at="end", target_m=(0.0, 0.0, 0.0)),), standard_joints()
+    )
+    problem = SeveralSteps.of([step], Placement(0.0, 1e200, 0.0))
     with pytest.raises(MotionError, match="too large"):
-        refine(on_walks(constraints), walking()[0].mixture.means[0])
+        refine(problem, walking()[0].mixture.means[0])

@@ -9,8 +9,9 @@ from tests.support.search_primitives import standard_joints, walking
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import InvalidConstraint, KeyframeTime
+from marey_motion.modelling.search.constraints import InvalidConstraint
 from marey_motion.modelling.search.objective import build_objective
+from marey_schemas.search_constraints import KeyframeTimeConstraint
 
 FAR = 1e3
 
@@ -48,4 +49,8 @@ def _moved(primitive: MotionPrimitive, amount: float) -> Floats:
 def test_a_time_that_no_motion_of_the_model_reaches_is_refused() -> None:
     primitive, _ = bounded()
     with pytest.raises(InvalidConstraint, match="last"):
-        build_objective(primitive, [KeyframeTime("end", 3.0 * primitive.duration_range_s[1])], standard_joints())
+        build_objective(
+            primitive,
+            [KeyframeTimeConstraint(at="end", seconds=3.0 * primitive.duration_range_s[1])],
+            standard_joints(),
+        )

@@ -16,7 +16,6 @@ from tests.support.tiers import examples
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_kinematics
-from marey_motion.modelling.search.constraints import Constraint, JointPosition, RootPosition
 from marey_motion.modelling.search.objective import Objective, build_objective
 from marey_motion.modelling.search.optimise import refine
 from marey_motion.modelling.search.samples import FoundSamples, search_closely, search_tree
@@ -25,6 +24,7 @@ from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import JointPositionConstraint, RootPositionConstraint, SearchConstraint
 
 EVERYTHING = 10**6
 
@@ -42,7 +42,9 @@ def grown(leaf_size: int = 1, samples: int = 2000) -> SampleTree:
 
 
 def wrist_at(x: float, y: float, z: float) -> Objective:
-    return build_objective(walking()[0], [JointPosition("left_wrist", "middle", (x, y, z))], standard_joints())
+    return build_objective(
+        walking()[0], [JointPositionConstraint(joint="left_wrist", at="middle", target_m=(x, y, z))], standard_joints()
+    )
 
 
 TARGETS = st.tuples(st.floats(-0.5, 0.8), st.floats(0.5, 1.5), st.floats(0.0, 1.5))
@@ -124,7 +126,9 @@ def test_a_root_that_is_a_leaf_is_searched() -> None:
 def test_the_target_that_is_a_samples_own_is_found() -> None:
     tree, primitive = grown(), walking()[0]
     wanted = primitive.poses(tree.samples[777:778].astype(np.float64), [0.0])[0, 0, :3]
-    objective = build_objective(primitive, [JointPosition("pelvis", 0, tuple(wanted))], {"pelvis": 0})
+    objective = build_objective(
+        primitive, [JointPositionConstraint(joint="pelvis", at=0, target_m=tuple(wanted))], {"pelvis": 0}
+    )
     assert search_all(objective, tree).costs[0] < 1e-6
 
 
@@ -142,7 +146,7 @@ def test_threads_find_the_same() -> None:
 
 def test_a_tree_of_another_model_is_refused() -> None:
     with pytest.raises(MotionError, match="the model needs") as caught:
-        search_tree(build_objective(sliding(), [RootPosition(0, (0.0, 0.0))], {}), grown())
+        search_tree(build_objective(sliding(), [RootPositionConstraint(at=0, target_m=(0.0, 0.0))], {}), grown())
     assert caught.value.code == "tree-of-another"
 
 
@@ -154,7 +158,7 @@ def test_a_beam_is_at_least_one_wide() -> None:
 def test_a_model_that_never_varies_has_one_motion_to_find() -> None:
     primitive = sliding(0)
     tree = SampleTree(np.zeros((1, 0), np.float32), np.array([1], np.int32), np.array([0], np.int32))
-    found = search_tree(build_objective(primitive, [RootPosition(0, (0.5, None))], {}), tree)
+    found = search_tree(build_objective(primitive, [RootPositionConstraint(at=0, target_m=(0.5, None))], {}), tree)
     np.testing.assert_allclose(found.costs, 50.0)
 
 
@@ -163,7 +167,10 @@ def test_looking_closer_comes_nearer_and_stays_as_likely() -> None:
     once, twice = [], []
     for target in primitive.sample(25, 31):
         place = primitive.poses(target[None], [0.0])[0, 0, :3]
-        wanted: list[Constraint] = [JointPosition("pelvis", 0, tuple(place)), RootPosition("end", (0.05, 1.1))]
+        wanted: list[SearchConstraint] = [
+            JointPositionConstraint(joint="pelvis", at=0, target_m=tuple(place)),
+            RootPositionConstraint(at="end", target_m=(0.05, 1.1)),
+        ]
         objective = build_objective(primitive, wanted, standard_joints())
         once.append(search_tree(objective, tree, candidates=4))
         twice.append(search_closely(objective, tree, candidates=4, passes=2))
@@ -182,7 +189,7 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
     assert search_closely(objective, tree, passes=1).samples[0] >= 0
 
 
-def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPosition]], Floats]:
+def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPositionConstraint]], Floats]:
     """A model of walks is asked to put the left wrist where each of its examples has it at the keyframe.
 
     Objectives by example, the model's tree, constraints by example, and the latent vectors (m, L) of the examples.
@@ -192,7 +199,9 @@ def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tup
     tree = build_tree(primitive, 0, TreeOptions(samples=10_000), end_effectors=[joints[name] for name in END_EFFECTORS])
     poses = aligned.poses[:, aligned.keyframes["contact"]]
     wrists = forward_kinematics(aligned.skeleton, poses)[:, joints["left_wrist"]]
-    wanted = [(JointPosition("left_wrist", "contact", tuple(place)),) for place in wrists.tolist()]
+    wanted = [
+        (JointPositionConstraint(joint="left_wrist", at="contact", target_m=tuple(place)),) for place in wrists.tolist()
+    ]
     objectives = [build_objective(primitive, one, joints) for one in wanted]
     return objectives, tree, wanted, primitive.latents_of(aligned.poses, aligned.time_functions)
 

@@ -13,7 +13,6 @@ from marey_motion.clip import Clip
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import forward_kinematics
 from marey_motion.matching.body import MatchingBody
-from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
@@ -26,6 +25,7 @@ from marey_motion.rigs.mapping import JointMapping
 from marey_motion.skeleton import Skeleton, same_hierarchy
 from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 
 TARGETS = 200
 HELD_OUT_EVERY = 4
@@ -83,7 +83,7 @@ def _search_all(
         frame = float(random.integers(primitive.frame_count))
         pose = primitive.poses(latents[[random.integers(len(latents))]], [frame])[:, 0]
         x, y, z = forward_kinematics(primitive.skeleton, pose)[0, joints["right_wrist"]].tolist()
-        step = Step(primitive, (JointPosition("right_wrist", frame, (x, y, z)),), joints)
+        step = Step(primitive, (JointPositionConstraint(joint="right_wrist", at=frame, target_m=(x, y, z)),), joints)
         sequel = search_steps([step], [tree], refining=RefineOptions(likelihood_weight=0.01))
         searched.append(100.0 * sequel.sampled.errors[0][0])
         refined.append(100.0 * sequel.measured.errors[0][0])

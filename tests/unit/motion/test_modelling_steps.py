@@ -11,14 +11,7 @@ from marey_motion.alignment.aligned import Placement
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.kinematics import forward_directions, headings
-from marey_motion.modelling.search.constraints import (
-    InvalidConstraint,
-    JointOrientation,
-    JointPosition,
-    LookDirection,
-    RootHeading,
-    RootPosition,
-)
+from marey_motion.modelling.search.constraints import InvalidConstraint
 from marey_motion.modelling.search.finishing import finish_motion
 from marey_motion.modelling.search.found_motions import FoundMotion, found_motion
 from marey_motion.modelling.search.step_search import Sequel, search_steps
@@ -28,6 +21,13 @@ from marey_motion.quaternions import from_axis_angle
 from marey_motion.rigs import map_joints
 from marey_schemas.options.modelling import TreeOptions
 from marey_schemas.options.searching import RefineOptions, TransitionOptions
+from marey_schemas.search_constraints import (
+    JointOrientationConstraint,
+    JointPositionConstraint,
+    LookDirectionConstraint,
+    RootHeadingConstraint,
+    RootPositionConstraint,
+)
 
 START = Placement(0.5, 1.0, -2.0)
 
@@ -38,7 +38,10 @@ def tree() -> SampleTree:
 
 def walk_to(*places: Any) -> list[Step]:
     """Steps of a second that end near places on the ground."""
-    return [Step(walking()[0], (RootPosition("end", place, 0.05),), standard_joints()) for place in places]
+    return [
+        Step(walking()[0], (RootPositionConstraint(at="end", target_m=place, tolerance_m=0.05),), standard_joints())
+        for place in places
+    ]
 
 
 THREE = walk_to((1.6, -0.9), (2.3, 0.2), (3.1, 1.2))
@@ -53,6 +56,13 @@ def heading_at(positions: Floats) -> Floats:
     joints = standard_joints()
     lefts, rights = ([joints[f"{side}_{part}"] for part in ("hip", "shoulder")] for side in ("left", "right"))
     return headings(forward_directions(positions, lefts, rights))
+
+
+def test_a_step_may_begin_beyond_the_range_that_positions_in_requests_are_limited_to() -> None:
+    steps = walk_to((None, 1e6), (None, 1e6))
+    sequel = search_steps(steps, [tree()] * 2, start=Placement(0.0, 0.0, 1e6), refining=None)
+    assert sequel.measured.placements[1].z > 1e6
+    assert sequel.measured.jumps_m[0].max() < 1.0
 
 
 @pytest.mark.parametrize("refining", [None, RefineOptions()])
@@ -100,7 +110,7 @@ def test_steps_end_where_they_were_asked_to() -> None:
     positions = found.motion.positions(found.skeleton)[:, standard_joints()["pelvis"]]
     for number, step in enumerate(THREE):
         root = step.constraints[0]
-        assert isinstance(root, RootPosition)
+        assert isinstance(root, RootPositionConstraint)
         place = positions[found.frame_of(number, step.primitive, "end"), [0, 2]]
         reached = np.linalg.norm(place - root.target_m)
         np.testing.assert_allclose(reached, sequel.measured.errors[number][0], atol=5e-3)
@@ -133,7 +143,7 @@ def test_a_tolerance_that_is_larger_lets_joints_jump_more() -> None:
 
 def test_one_step_needs_no_hips_and_shoulders() -> None:
     primitive = sliding(2)
-    step = Step(primitive, (RootPosition("end", (0.3, None)),), {})
+    step = Step(primitive, (RootPositionConstraint(at="end", target_m=(0.3, None)),), {})
     one = build_tree(primitive, 0, TreeOptions(samples=500, features="latent"))
     sequel = search_steps([step], [one], start=Placement(0.0, 0.1, 0.0), refining=RefineOptions(likelihood_weight=1e-4))
     assert sequel.measured.errors[0][0] < 1e-3
@@ -142,7 +152,14 @@ def test_one_step_needs_no_hips_and_shoulders() -> None:
 
 
 def test_a_constraint_that_is_wrong_is_told_by_step_and_place() -> None:
-    steps = [THREE[0], Step(walking()[0], (RootHeading("end", 0.0), RootHeading("never", 0.0)), standard_joints())]
+    steps = [
+        THREE[0],
+        Step(
+            walking()[0],
+            (RootHeadingConstraint(at="end", heading_deg=0.0), RootHeadingConstraint(at="never", heading_deg=0.0)),
+            standard_joints(),
+        ),
+    ]
     with pytest.raises(InvalidConstraint, match="no keyframe 'never'") as caught:
         search_steps(steps, [tree()] * 2)
     assert caught.value.where == "steps[1].constraints[1].at"
@@ -171,10 +188,10 @@ def joined(first: Sequel, second: Sequel) -> Sequel:
 
 def test_inverse_kinematics_removes_what_is_left() -> None:
     wanted = (
-        JointPosition("left_wrist", "middle", (1.6, 1.1, -1.3)),
-        JointOrientation("head", "end", (1.0, 0.0, 0.3, 0.0)),
-        LookDirection("head", 4.0, direction=(0.3, 0.0, 1.0)),
-        RootHeading("end", 0.5),
+        JointPositionConstraint(joint="left_wrist", at="middle", target_m=(1.6, 1.1, -1.3)),
+        JointOrientationConstraint(joint="head", at="end", rotation=(1.0, 0.0, 0.3, 0.0)),
+        LookDirectionConstraint(joint="head", at=4.0, direction=(0.3, 0.0, 1.0)),
+        RootHeadingConstraint(at="end", heading_deg=30.0),
     )
     step = Step(walking()[0], wanted, standard_joints())
     sequel = search_steps([step], [tree()], start=START)
@@ -201,7 +218,10 @@ def test_straight_legs_are_finished_with_knees_that_bend_forwards(side: str) -> 
     frame = found.frame_of(0, step.primitive, "middle")
     before = found.motion.positions(found.skeleton)[frame]
     up = 0.03 * (before[hip] - before[ankle])
-    raised = replace(step, constraints=(JointPosition(f"{side}_ankle", "middle", tuple(before[ankle] + up)),))
+    raised = replace(
+        step,
+        constraints=(JointPositionConstraint(joint=f"{side}_ankle", at="middle", target_m=tuple(before[ankle] + up)),),
+    )
     finished = finish_motion([raised], found, map_joints(found.skeleton)).found.motion
     after = finished.positions(found.skeleton)[frame]
     facing = forward_directions(

@@ -16,7 +16,6 @@ from marey_motion.arrays import AnyFloats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.objective import build_objective
 from marey_motion.modelling.search.samples import search_tree
 from marey_motion.modelling.search.tree import END_EFFECTORS, SampleTree, build_tree
@@ -24,6 +23,7 @@ from marey_motion.modelling.search.tree_documents import sample_tree_from_tree, 
 from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree, encode_tree
 from marey_schemas.options.modelling import TreeOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 
 LATENT = TreeOptions(samples=600, features="latent")
 
@@ -199,7 +199,7 @@ def test_no_search_evaluates_more_motions_than_its_tree_tells_before(
     options = TreeOptions(samples=300, branching=branching, leaf_size=leaf_size, depth=depth, features="latent")
     tree = build_tree(primitive, 1, options)
     for height in (0.8, 1.2):
-        constraints = (JointPosition("left_wrist", "middle", (0.3, height, 0.5)),)
+        constraints = (JointPositionConstraint(joint="left_wrist", at="middle", target_m=(0.3, height, 0.5)),)
         objective = build_objective(primitive, constraints, standard_joints())
         evaluated = search_tree(objective, tree, candidates=candidates).evaluations
         assert evaluated <= tree.most_evaluations(candidates)

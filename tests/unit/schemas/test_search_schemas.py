@@ -6,6 +6,7 @@ import pytest
 from pydantic import ValidationError
 
 from marey_schemas.search import SearchRequest
+from marey_schemas.search_constraints import RootPositionConstraint
 
 AHEAD = {"type": "root_position", "at": "end", "target_m": [0.0, 1.0]}
 
@@ -33,3 +34,34 @@ def test_a_tolerance_out_of_range_is_refused_in_either_unit(tolerance: dict[str,
 def test_both_units_at_once_are_refused() -> None:
     with pytest.raises(ValidationError, match="give only tolerance_m"):
         SearchRequest.model_validate({"constraints": [{**AHEAD, "tolerance_cm": 3, "tolerance_m": 0.03}]})
+
+
+HEAD = {"joint": "head", "at": "end"}
+LOOK = {**HEAD, "type": "look_direction"}
+
+
+@pytest.mark.parametrize(
+    ("constraint", "place"),
+    [
+        ({**AHEAD, "target_m": [None, None]}, ("target_m",)),
+        ({**HEAD, "type": "joint_position", "target_m": [None, None, None]}, ("target_m",)),
+        ({**HEAD, "type": "joint_orientation", "rotation": [0, 0, 0, 0]}, ("rotation",)),
+        ({**LOOK, "direction": [0, 0, 1], "axis": [0, 0, 0]}, ("axis",)),
+        (LOOK, ()),
+        ({**LOOK, "direction": [0, 0, 1], "point_m": [0, 0, 1]}, ()),
+    ],
+)
+def test_a_constraint_without_a_meaning_is_refused_at_its_place(
+    constraint: dict[str, object], place: tuple[str, ...]
+) -> None:
+    with pytest.raises(ValidationError) as caught:
+        SearchRequest.model_validate({"constraints": [constraint]})
+    (error,) = caught.value.errors()
+    assert (error["loc"], error["type"]) == (("constraints", 0, constraint["type"], *place), "constraint_invalid")
+
+
+def test_a_constraint_in_a_request_has_a_type_which_python_adds() -> None:
+    with pytest.raises(ValidationError, match="type"):
+        SearchRequest.model_validate({"constraints": [{"at": "end", "target_m": [0.0, 1.0]}]})
+    made = RootPositionConstraint(at="end", target_m=(0.0, 1.0))
+    assert made.model_dump(mode="json", exclude_unset=True) == AHEAD

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.arrays import CM_PER_M, Floats
 from marey_motion.modelling.sample_quality import toe_positions
-from marey_motion.modelling.search.constraints import JointPosition
 from marey_motion.modelling.search.step_search import search_steps
 from marey_motion.modelling.search.steps import Step
 from marey_motion.modelling.search.tree import build_tree
 from marey_motion.modelling.training import train_primitive
 from marey_schemas.options.modelling import ModelOptions, TreeOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
 """Standard joints."""
@@ -79,7 +79,11 @@ def check_search(
     names, searched, refined = tuple(joints), [], []
     for example, place in wanted:
         x, y, z = places[example, frames[place], place].tolist()
-        step = Step(primitive, (JointPosition(names[place], float(frames[place]), (x, y, z)),), standard_joints)
+        step = Step(
+            primitive,
+            (JointPositionConstraint(joint=names[place], at=float(frames[place]), target_m=(x, y, z)),),
+            standard_joints,
+        )
         found = search_steps([step], [tree], refining=REFINING)
         searched.append(float(found.sampled.errors[0][0]))
         refined.append(float(found.measured.errors[0][0]))

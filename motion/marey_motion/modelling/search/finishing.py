@@ -12,16 +12,16 @@ from marey_motion.editing.finish import finish
 from marey_motion.editing.inverse_kinematics.solving import limb_ending_at
 from marey_motion.editing.inverse_kinematics.targets import LookAtTarget, OrientationTarget, PositionTarget, Target
 from marey_motion.errors import MappingError
-from marey_motion.modelling.search.constraints import (
-    Constraint,
-    JointOrientation,
-    JointPosition,
-    LookDirection,
-    joint_index,
-)
+from marey_motion.modelling.search.constraints import joint_index
 from marey_motion.modelling.search.found_motions import FoundMotion
 from marey_motion.modelling.search.steps import Step
 from marey_motion.rigs import JointAxes, JointMapping, guess_axes
+from marey_schemas.search_constraints import (
+    JointOrientationConstraint,
+    JointPositionConstraint,
+    LookDirectionConstraint,
+    SearchConstraint,
+)
 
 FAR_AWAY_M = 1000.0
 """Looking at a point so far away is looking in its direction."""
@@ -82,13 +82,13 @@ def _axes_if_known(found: FoundMotion, mapping: JointMapping) -> dict[str, Joint
 def _constrained(
     step: Step,
     number: int,
-    constraint: Constraint,
+    constraint: SearchConstraint,
     found: FoundMotion,
     mapping: JointMapping,
     axes: Mapping[str, JointAxes] | None,
 ) -> Constrained | None:
     """Convert a constraint for inverse kinematics; None for a kind that it cannot meet."""
-    if not isinstance(constraint, JointPosition | JointOrientation | LookDirection):
+    if not isinstance(constraint, JointPositionConstraint | JointOrientationConstraint | LookDirectionConstraint):
         return None
     joint = joint_index(step.primitive, constraint.joint, step.standard_joints)
     chain = _chain(found, joint, step.standard_joints.get("pelvis", 0))
@@ -106,17 +106,20 @@ def _chain(found: FoundMotion, joint: int, pelvis: int) -> tuple[int, ...]:
 
 
 def _target(
-    constraint: JointPosition | JointOrientation | LookDirection, joint: int, frame: int, found: FoundMotion
+    constraint: JointPositionConstraint | JointOrientationConstraint | LookDirectionConstraint,
+    joint: int,
+    frame: int,
+    found: FoundMotion,
 ) -> Target:
     match constraint:
-        case JointPosition(target_m=target):
+        case JointPositionConstraint(target_m=target):
             axes = "".join(axis for axis, value in zip("xyz", target, strict=True) if value is not None)
             return PositionTarget(joint, tuple(value or 0.0 for value in target), axes=axes)  # type: ignore[arg-type]
-        case JointOrientation(rotation=rotation):
+        case JointOrientationConstraint(rotation=rotation):
             return OrientationTarget(joint, rotation)
-        case LookDirection(point_m=None, direction=direction):
+        case LookDirectionConstraint(point_m=None, direction=direction):
             here = found.motion.at_frames(np.array([frame])).positions(found.skeleton)[0, joint]
             along = np.asarray(direction) / np.linalg.norm(np.asarray(direction))
             return LookAtTarget(joint, here + FAR_AWAY_M * along, axis=constraint.axis)
-        case LookDirection(point_m=point):
+        case LookDirectionConstraint(point_m=point):
             return LookAtTarget(joint, point, axis=constraint.axis)  # type: ignore[arg-type]

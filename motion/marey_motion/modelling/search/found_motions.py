@@ -11,11 +11,12 @@ from marey_motion import quaternions
 from marey_motion.alignment.aligned import Placement
 from marey_motion.arrays import Floats
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import InvalidConstraint, Moment, frame_at
+from marey_motion.modelling.search.constraints import InvalidConstraint, frame_at
 from marey_motion.modelling.search.step_search import Sequel
 from marey_motion.modelling.search.steps import Step
 from marey_motion.motion import Motion
 from marey_motion.skeleton import SAME_OFFSET_M, Skeleton, same_hierarchy
+from marey_schemas.search_constraints import Moment
 
 
 @dataclass(frozen=True, eq=False)

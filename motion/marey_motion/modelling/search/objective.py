@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -15,19 +16,7 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import objective_kernels as kernels
 from marey_motion.modelling.search import slope_kernels
-from marey_motion.modelling.search.constraints import (
-    Constraint,
-    InvalidConstraint,
-    JointOrientation,
-    JointPosition,
-    KeyframeTime,
-    LookDirection,
-    RootHeading,
-    RootPosition,
-    frame_at,
-    joint_index,
-    tolerance_of,
-)
+from marey_motion.modelling.search.constraints import InvalidConstraint, frame_at, joint_index, tolerance_of
 from marey_motion.modelling.search.tracking import (
     Chains,
     Clocks,
@@ -36,6 +25,15 @@ from marey_motion.modelling.search.tracking import (
     facing,
     track_points,
     track_times,
+)
+from marey_schemas.search_constraints import (
+    JointOrientationConstraint,
+    JointPositionConstraint,
+    KeyframeTimeConstraint,
+    LookDirectionConstraint,
+    RootHeadingConstraint,
+    RootPositionConstraint,
+    SearchConstraint,
 )
 
 MOST_SOUGHT = 256
@@ -86,7 +84,7 @@ class Objective:
     """
 
     primitive: MotionPrimitive
-    constraints: tuple[Constraint, ...]
+    constraints: tuple[SearchConstraint, ...]
     placement: Placement
     chains: Chains
     clocks: Clocks
@@ -161,7 +159,7 @@ class Objective:
 
 def build_objective(
     primitive: MotionPrimitive,
-    constraints: Sequence[Constraint],
+    constraints: Sequence[SearchConstraint],
     standard_joints: Mapping[str, int],
     *,
     placement: Placement = AT_ORIGIN,
@@ -229,7 +227,7 @@ class _ResidualRow(NamedTuple):
 
 def _row(
     primitive: MotionPrimitive,
-    constraint: Constraint,
+    constraint: SearchConstraint,
     standard_joints: Mapping[str, int],
     tracked: dict[Tracked, int],
     moments: dict[float, int],
@@ -241,30 +239,32 @@ def _row(
         return tracked.setdefault(one, len(tracked))
 
     match constraint:
-        case KeyframeTime():
+        case KeyframeTimeConstraint():
             _require_possible(primitive, constraint, frame)
             return _ResidualRow(kernels.TIME, moments.setdefault(frame, len(moments)), (constraint.seconds,))
-        case RootHeading():
-            return _ResidualRow(kernels.HEADING, place(facing(frame, standard_joints)), (constraint.heading_rad,))
-        case RootPosition():
+        case RootHeadingConstraint():
+            return _ResidualRow(
+                kernels.HEADING, place(facing(frame, standard_joints)), (radians(constraint.heading_deg),)
+            )
+        case RootPositionConstraint():
             x, z = constraint.target_m
             return _position_row(place(body_place(frame, standard_joints)), (x, None, z))
         case _:
             joint = place(Tracked(frame, (joint_index(primitive, constraint.joint, standard_joints),)))
     match constraint:
-        case JointPosition():
+        case JointPositionConstraint():
             return _position_row(joint, constraint.target_m)
-        case JointOrientation():
+        case JointOrientationConstraint():
             return _ResidualRow(kernels.ORIENTATION, joint, _unit(constraint.rotation))
-        case LookDirection(point_m=None, direction=direction):
+        case LookDirectionConstraint(point_m=None, direction=direction):
             assert direction is not None  # one of the two is there
             return _ResidualRow(kernels.DIRECTION, joint, _unit(direction), _unit(constraint.axis))
-        case LookDirection(point_m=point):
+        case LookDirectionConstraint(point_m=point):
             assert point is not None
             return _ResidualRow(kernels.POINT, joint, point, _unit(constraint.axis))
 
 
-def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTime, frame: float) -> None:
+def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTimeConstraint, frame: float) -> None:
     """Raise `InvalidConstraint` for a time that no motion of the primitive reaches, at a canonical frame."""
     if primitive.duration_range_s is None:
         return

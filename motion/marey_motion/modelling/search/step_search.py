@@ -10,7 +10,7 @@ import numpy as np
 from marey_motion.alignment.aligned import Placement
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
-from marey_motion.modelling.search.constraints import START, JointPosition
+from marey_motion.modelling.search.constraints import START
 from marey_motion.modelling.search.objective import AT_ORIGIN, build_objective
 from marey_motion.modelling.search.optimise import DEFAULT_REFINING, Refined, refine
 from marey_motion.modelling.search.samples import FoundSamples, search_closely
@@ -23,6 +23,7 @@ from marey_motion.modelling.search.steps import (
 )
 from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.options.searching import CANDIDATES, PASSES, RefineOptions, TransitionOptions
+from marey_schemas.search_constraints import JointPositionConstraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +105,12 @@ def _search_step(
     step: Step, tree: SampleTree, begun: CarriedOn, candidates: int, passes: int, transitions: TransitionOptions
 ) -> FoundSamples:
     """Find the best motion of a tree for a step that continues another."""
+    _require_finite(*begun.joints.values())
+    # The end of a motion may lie outside of the range that requests are limited to, so these are not validated.
     going_on = tuple(
-        JointPosition(name, START, (x, y, z), transitions.tolerance_m, transitions.weight)
+        JointPositionConstraint.model_construct(
+            joint=name, at=START, target_m=(x, y, z), tolerance_m=transitions.tolerance_m, weight=transitions.weight
+        )
         for name, (x, y, z) in ((name, point.tolist()) for name, point in begun.joints.items())
     )
     constraints = (*step.constraints, *going_on)

@@ -20,10 +20,11 @@ from marey_motion.errors import MotionError
 from marey_motion.modelling.mixture import LatentMixture
 from marey_motion.modelling.primitive import MotionPrimitive
 from marey_motion.modelling.search import slope_kernels
-from marey_motion.modelling.search.constraints import Constraint, InvalidConstraint
+from marey_motion.modelling.search.constraints import InvalidConstraint
 from marey_motion.modelling.search.objective import AT_ORIGIN, Linearised, Objective, as_row, build_objective
 from marey_motion.modelling.search.tracking import Chains, Tracked, body_place, facing, track_points
 from marey_schemas.options.searching import TransitionOptions
+from marey_schemas.search_constraints import SearchConstraint
 
 MOST_SEARCH_STEPS = 32
 
@@ -39,7 +40,7 @@ class Step:
     """
 
     primitive: MotionPrimitive
-    constraints: tuple[Constraint, ...]
+    constraints: tuple[SearchConstraint, ...]
     standard_joints: Mapping[str, int]
 
 

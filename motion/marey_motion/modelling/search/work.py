@@ -10,13 +10,17 @@ from collections.abc import Sequence
 from math import log
 
 from marey_motion.modelling.primitive import MotionPrimitive
-from marey_motion.modelling.search.constraints import JointOrientation, JointPosition, LookDirection
 from marey_motion.modelling.search.found_motions import FoundMotion
 from marey_motion.modelling.search.objective import Objective
 from marey_motion.modelling.search.steps import SeveralSteps, Step
 from marey_motion.modelling.search.tree import DEFAULT_TREE, SampleTree, feature_frames
 from marey_schemas.options.modelling import TreeOptions
 from marey_schemas.options.searching import RefineOptions
+from marey_schemas.search_constraints import (
+    JointOrientationConstraint,
+    JointPositionConstraint,
+    LookDirectionConstraint,
+)
 
 # Nanoseconds, measured on one thread of a server of 2020 and rounded up.
 _PER_NODE, _PER_ROW, _PER_STEP_OF_TIME = 50, 50, 20
@@ -97,7 +101,7 @@ def finishing_work(steps: Sequence[Step], found: FoundMotion) -> float:
     -------
     float    nanoseconds of one thread
     """
-    kinds = JointPosition | JointOrientation | LookDirection
+    kinds = JointPositionConstraint | JointOrientationConstraint | LookDirectionConstraint
     spans = sum(isinstance(constraint, kinds) for step in steps for constraint in step.constraints)
     rounds = _ROUNDS_OF_SPANS if spans > 1 else 1
     return float(rounds * spans * (_PER_SPAN + _PER_NUMBER_OF_SPAN * found.motion.rotations.size))

@@ -1,0 +1,32 @@
+"""Fields of release 0.1 that give a length in centimetres."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+
+
+def in_centimetres(name: str) -> Any:
+    """Declare the field of release 0.1 that gives in centimetres the value that `name` gives in metres."""
+    return Field(
+        None,
+        exclude=True,
+        json_schema_extra={"deprecated": True},
+        description=f"Deprecated: `{name}` in centimetres, as release 0.1 spelt it.",
+    )
+
+
+def read_old_unit(model: Request, name: str, old: str) -> None:
+    """Convert a value in centimetres to the field in metres. Raises `ValueError` if both are given."""
+    centimetres = getattr(model, old)
+    if centimetres is None:
+        return
+    if name in model.model_fields_set:
+        raise ValueError(f"{old}: give only {name}")
+    object.__setattr__(model, name, centimetres * 0.01)
+    object.__setattr__(model, old, None)
+    model.model_fields_set.discard(old)
+    model.model_fields_set.add(name)
