@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 from marey_client.access import Members
 from marey_client.handles.coverage_streams import CoverageStreams
@@ -31,11 +31,9 @@ from marey_client.requests import (
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange
 from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EvaluateParams, ModelParams, RetargetParams
-from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.jobs import CacheMode, Job, JobCreate
 from marey_schemas.model_pipelines import model_pipeline
 from marey_schemas.pipelines import PipelineCreate
-
-Cache: TypeAlias = Literal["use", "refresh", "off"]
 
 
 class ProjectHandle(ProjectItems):
@@ -96,7 +94,7 @@ class ProjectHandle(ProjectItems):
         name: str,
         seed: int = 0,
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **choices: Any,
     ) -> PipelineRun:
         """Submit the jobs from takes to a model: import, retarget, annotate, cut, align, model, tree.
@@ -117,7 +115,7 @@ class ProjectHandle(ProjectItems):
         into: str,
         params: RetargetParams | None = None,
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
     ) -> Job:
         """Submit a job that retargets clips, or folders given by path, to the skeleton with this id.
 
@@ -133,7 +131,7 @@ class ProjectHandle(ProjectItems):
         proposal: str | Mapping[str, Any] = "steps",
         into: str = "",
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **options: Any,
     ) -> Job:
         """Submit a job that annotates clips by a method and its options; the results go below the folder `into`.
@@ -146,7 +144,7 @@ class ProjectHandle(ProjectItems):
         return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
 
     def cut(
-        self, annotations: Annotations, *, into: str, priority: int = 0, cache: Cache = "use", **options: Any
+        self, annotations: Annotations, *, into: str, priority: int = 0, cache: CacheMode = "use", **options: Any
     ) -> Job:
         """Submit a job that cuts clips along the segments of annotations, into folders below `into`.
 
@@ -162,7 +160,7 @@ class ProjectHandle(ProjectItems):
         into: str,
         annotations: Annotations | None = None,
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **options: Any,
     ) -> Job:
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
@@ -180,7 +178,7 @@ class ProjectHandle(ProjectItems):
         *,
         into: str = "",
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **options: Any,
     ) -> Job:
         """Submit a job that edits clips, or folders given by path, by commands or a stored edit.
@@ -198,7 +196,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         normaliser: EvaluationHandle | str | None = None,
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **options: Any,
     ) -> Job:
         """Submit a job that evaluates clips of one skeleton, or folders of them given by path.
@@ -220,7 +218,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         seed: int = 0,
         priority: int = 0,
-        cache: Cache = "use",
+        cache: CacheMode = "use",
         **options: Any,
     ) -> Job:
         """Submit a job that trains a model on clips that were aligned with each other, given as one or several folders.

@@ -18,7 +18,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.formats import format_named
+from marey_schemas.formats import DEFAULT_UNIT, format_named
 from marey_schemas.item_files import ItemToExport
 
 
@@ -39,7 +39,7 @@ class ExportedFile:
 
 
 def write_clip_file(
-    clip: Clip, file_format: str, *, unit: str | float = "cm", info: Mapping[str, Any] | None = None
+    clip: Clip, file_format: str, *, unit: str | float = DEFAULT_UNIT, info: Mapping[str, Any] | None = None
 ) -> ExportedFile:
     """Write a clip in one of `marey_schemas.formats.MOTION_FORMATS`.
 
@@ -72,7 +72,7 @@ def write_motion_file(
     source: ItemToExport,
     file_format: str,
     *,
-    unit: str | float = "cm",
+    unit: str | float = DEFAULT_UNIT,
     time: Literal["canonical", "source"] = "canonical",
     skeleton: Skeleton | None = None,
 ) -> ExportedFile:

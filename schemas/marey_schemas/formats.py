@@ -18,6 +18,13 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 
+AnnotationForm = Literal["labels", "list", "frames"]
+"""Forms of annotations in the predecessor's format: sections by label, a list of sections, or frames by label."""
+DEFAULT_FORM: AnnotationForm = "labels"
+EndIndex = Literal["inclusive", "exclusive"]
+"""Whether a section of the predecessor's format includes its last index."""
+DEFAULT_END_INDEX: EndIndex = "inclusive"
+
 UNITS_M = {
     "mm": 0.001,
     "cm": 0.01,
@@ -155,6 +162,10 @@ EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
 """Choices of an export."""
 WRITTEN_UNITS = tuple(dict.fromkeys(unit for one in FORMATS if len(one.units) > 1 for unit in one.units))
 """Units that the caller can choose from where a format leaves its unit open."""
+DEFAULT_FORMAT = "bvh"
+"""Format of motion files that are written where the caller chooses none."""
+DEFAULT_UNIT = "cm"
+"""Unit of length of files that are written where the caller chooses none."""
 MOTION_MEDIA_TYPES = tuple(dict.fromkeys(format_named(name).media_type for name in MOTION_FORMATS))
 EXPORT_MEDIA_TYPES = tuple(dict.fromkeys((OCTETS, *(one.media_type for one in FORMATS if one.writes))))
 

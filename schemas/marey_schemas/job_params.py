@@ -9,7 +9,7 @@ from pydantic import Field, field_validator, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
-from marey_schemas.formats import ExportFormat, WrittenUnit
+from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, ExportFormat, WrittenUnit
 from marey_schemas.imports import ImportFile
 from marey_schemas.names import (
     MAX_NAME_LENGTH,
@@ -270,5 +270,7 @@ class RetargetParams(SuffixedResults):
 class ExportParams(Request):
     """Parameters of `export`: one archive of files."""
 
-    format: ExportFormat = Field("bvh", description="Format of the files.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of the files, for formats without a fixed unit.")
+    format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
+    unit: WrittenUnit = Field(
+        DEFAULT_UNIT, description="Unit of length of the files, for formats without a fixed unit."
+    )

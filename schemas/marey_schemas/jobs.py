@@ -102,6 +102,10 @@ class Resources(Request):
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
 
 
+CacheMode = Literal["use", "refresh", "off"]
+"""Use of the results of identical jobs."""
+
+
 class JobCreate(Request):
     """Request to submit a job."""
 
@@ -117,7 +121,7 @@ class JobCreate(Request):
     concurrency_key: str | None = Field(
         None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
     )
-    cache: Literal["use", "refresh", "off"] = Field(
+    cache: CacheMode = Field(
         "use",
         description="use: reuse the result of an identical job; refresh: compute it again and store it for "
         "later jobs; off: compute it again for this job only.",

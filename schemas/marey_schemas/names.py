@@ -1,5 +1,6 @@
 """Types of constrained strings for documents."""
 
+import re
 from typing import Annotated
 
 from pydantic import StringConstraints
@@ -24,7 +25,8 @@ CollectionPath = Annotated[
 
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
 
-Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
+DIGEST_PATTERN = r"^sha256:[0-9a-f]{64}$"
+Digest = Annotated[str, StringConstraints(pattern=DIGEST_PATTERN)]
 """Digest of bytes: `sha256:` and 64 hexadecimal digits."""
 
 Message = Annotated[str, StringConstraints(max_length=2000)]
@@ -40,3 +42,10 @@ LayerName = Annotated[str, StringConstraints(min_length=1, max_length=64, patter
 ItemId = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 TrialName = Annotated[str, StringConstraints(min_length=1, max_length=100)]
+
+_DIGEST = re.compile(DIGEST_PATTERN)
+
+
+def is_digest(text: str) -> bool:
+    """Return whether a text is the digest of bytes."""
+    return _DIGEST.fullmatch(text) is not None

@@ -2,12 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.jobs import Job, JobCreate, JobInput, JobOutputsInput, Resources
+from marey_schemas.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 from marey_schemas.names import CollectionPath, Message
 
 MOST_STEPS = 32
@@ -38,7 +38,7 @@ class PipelineStep(Request):
 
     into: CollectionPath | None = None
     priority: int | None = Field(None, ge=-100, le=100)
-    cache: Literal["use", "refresh", "off"] | None = None
+    cache: CacheMode | None = None
     seed: int | None = Field(None, ge=0, lt=2**63)
     max_attempts: int | None = Field(None, ge=1, le=20)
     labels: dict[str, str] | None = None
@@ -52,7 +52,7 @@ class PipelineCreate(Request):
     steps: dict[StepName, PipelineStep] = Field(min_length=1, max_length=MOST_STEPS)
     into: CollectionPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100)
-    cache: Literal["use", "refresh", "off"] = "use"
+    cache: CacheMode = "use"
     seed: int = Field(0, ge=0, lt=2**63)
     max_attempts: int = Field(3, ge=1, le=20)
     labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the steps.")

@@ -16,6 +16,7 @@ from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_pairs, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.typed_values import assignment, is_frame, json_or_text, read_json
+from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -39,21 +40,6 @@ class Neighbour(StrEnum):
     NEXT = "next"
     PREVIOUS = "previous"
     NEAREST = "nearest"
-
-
-class EndIndex(StrEnum):
-    """Meaning of the last index of a section in the predecessor's files."""
-
-    INCLUSIVE = "inclusive"
-    EXCLUSIVE = "exclusive"
-
-
-class Form(StrEnum):
-    """Forms of the predecessor's annotations."""
-
-    LABELS = "labels"
-    LIST = "list"
-    FRAMES = "frames"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -245,7 +231,7 @@ def import_annotation(
     ] = None,
     end_index: Annotated[
         EndIndex, typer.Option(help="Whether a section includes its frame end_idx, as in the predecessor's editor.")
-    ] = EndIndex.INCLUSIVE,
+    ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -255,7 +241,7 @@ def import_annotation(
     document = read_json(file)
     if not isinstance(document, dict):
         raise WrongUsage(f"{file} does not contain a JSON object")
-    options = {"layer": layer, "name": name, "end_index": end_index.value, "labels": tuple(label) if label else None}
+    options = {"layer": layer, "name": name, "end_index": end_index, "labels": tuple(label) if label else None}
     with connect(context) as marey:
         found = require_item(marey, Address.parse(clip), [Kind.CLIP])
         made = found.import_annotation(document, **{key: value for key, value in options.items() if value is not None})
@@ -268,16 +254,17 @@ def export_annotation(
     place: Place,
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     form: Annotated[
-        Form, typer.Option(help="Form of the file: sections by label, a list of sections, or frames by label.")
-    ] = Form.LABELS,
+        AnnotationForm,
+        typer.Option(help="Form of the file: sections by label, a list of sections, or frames by label."),
+    ] = DEFAULT_FORM,
     end_index: Annotated[
         EndIndex, typer.Option(help="Whether a section includes its frame end_idx.")
-    ] = EndIndex.INCLUSIVE,
+    ] = DEFAULT_END_INDEX,
 ) -> None:
     """Write an annotation to a file of the predecessor."""
     with connect(context) as marey:
         found = annotation_at(marey, place)
-        typer.echo(found.export(output, format="predecessor", form=form.value, end_index=end_index.value))
+        typer.echo(found.export(output, format="predecessor", form=form, end_index=end_index))
 
 
 def annotation_at(marey: Marey, place: str) -> AnnotationHandle:

@@ -13,7 +13,7 @@ from marey_client.cli.following import SEEDED_JOB, Wait, follow, input_at
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_table, tell
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_schemas.formats import SAMPLE_FORMATS
+from marey_schemas.formats import DEFAULT_FORMAT, SAMPLE_FORMATS
 from marey_schemas.wording import one_of
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def sample(
     seed: Annotated[
         int, typer.Option(min=0, help="Seed of the random numbers; the same seed gives the same motions.")
     ] = 0,
-    format: Annotated[str, typer.Option(help=f"{one_of(SAMPLE_FORMATS)}.")] = "bvh",  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"{one_of(SAMPLE_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="Folder of the files; default: the current folder.")
     ] = None,

@@ -15,7 +15,7 @@ from marey_client.cli.models import model_at
 from marey_client.cli.output import print_json, print_table, tell
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.typed_values import read_json
-from marey_schemas.formats import MOTION_FORMATS
+from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def search(
     out: Annotated[
         Path | None, typer.Option("--out", "--output", "-o", help="File or folder to write the motion to.")
     ] = None,
-    format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = "bvh",  # noqa: A002
+    format: Annotated[str, typer.Option(help=f"{one_of(MOTION_FORMATS)}.")] = DEFAULT_FORMAT,  # noqa: A002
     as_json: AsJson = False,
 ) -> None:
     """Find the motion of a model that meets constraints. WHEN is a keyframe, start, end, or a canonical frame."""

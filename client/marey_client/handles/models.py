@@ -18,6 +18,7 @@ from marey_client.handles.searches import SearchableHandle
 from marey_client.items import Items
 from marey_schemas.documents.clips import ClipInfo, ClipSource
 from marey_schemas.encoding.codecs import JSON, encode_tree
+from marey_schemas.formats import DEFAULT_FORMAT
 from marey_schemas.kinds import Kind
 
 
@@ -66,7 +67,7 @@ class ModelHandle(SearchableHandle):
     def save_samples(
         self,
         folder: str | Path,
-        format: str = "bvh",  # noqa: A002
+        format: str = DEFAULT_FORMAT,  # noqa: A002
         *,
         n: int = 1,
         seed: int = 0,

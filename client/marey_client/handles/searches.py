@@ -13,6 +13,7 @@ from marey_client.handles.reports import ReportedHandle
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, as_json, read_tree
+from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT
 from marey_schemas.job_params import TreeParams
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.search import SearchAnswer, SearchRequest
@@ -42,8 +43,8 @@ class SearchableHandle(ReportedHandle):
         path: str | Path,
         constraints: Constraints = (),
         *,
-        format: str = "bvh",  # noqa: A002
-        unit: str = "cm",
+        format: str = DEFAULT_FORMAT,  # noqa: A002
+        unit: str = DEFAULT_UNIT,
         **options: Any,
     ) -> Path:
         """Write the result of a search to a motion file: bvh, npz or predecessor."""

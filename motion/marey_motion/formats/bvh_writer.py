@@ -16,6 +16,7 @@ from marey_motion.importing.source import SourceInfo
 from marey_motion.importing.units import unit_in_metres
 from marey_motion.kernels import compiled
 from marey_motion.skeleton import Skeleton
+from marey_schemas.formats import DEFAULT_UNIT
 
 DEFAULT_ORDER = "zxy"
 _DECIMALS = 6
@@ -23,7 +24,11 @@ _LARGEST = 1e12
 
 
 def write_bvh(
-    clip: Clip, *, unit: str | float = "cm", rotation_order: str = DEFAULT_ORDER, source: SourceInfo | None = None
+    clip: Clip,
+    *,
+    unit: str | float = DEFAULT_UNIT,
+    rotation_order: str = DEFAULT_ORDER,
+    source: SourceInfo | None = None,
 ) -> bytes:
     """Write a clip as BVH, Y up.
 

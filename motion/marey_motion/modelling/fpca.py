@@ -11,7 +11,7 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_motion.modelling.primitive import FunctionalComponents
 from marey_motion.modelling.splines import SplineBasis
-from marey_schemas.options.modelling import InnerProduct
+from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
 """Singular values below this share of the largest one are rounding: the Gram matrix holds their squares."""
@@ -60,7 +60,7 @@ def find_components(
     coefficients: Floats,
     weights: Floats,
     keep: Keep = Keep(),
-    inner_product: InnerProduct = "coefficients",
+    inner_product: InnerProduct = DEFAULT_INNER_PRODUCT,
 ) -> PrincipalExamples:
     """Compute the principal functions of m examples.
 

@@ -14,7 +14,7 @@ from marey_motion.modelling.fpca import Keep, dual_coefficients, find_components
 from marey_motion.modelling.reconstruction import comparison_frames
 from marey_motion.modelling.splines import SplineBasis
 from marey_motion.skeleton import Skeleton
-from marey_schemas.options.modelling import InnerProduct
+from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_WEIGHT = 1e-2
 LARGEST_WEIGHT = 1e3
@@ -32,7 +32,7 @@ def optimised_weights(
     coefficients: Floats,
     starts: Sequence[Floats],
     keep: Keep,
-    inner_product: InnerProduct = "coefficients",
+    inner_product: InnerProduct = DEFAULT_INNER_PRODUCT,
 ) -> tuple[Floats, Keep]:
     """Optimise weights, one for each root axis and each joint, that minimise the squared distance of joints.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from marey_motion.evaluation.judgement import GRADES, LARGEST_SPEED_SHARE, LARGEST_TURN_DEG_S, LONGEST_LAG_S
 from marey_reports.drawing.markup import Html, element, joined
 from marey_reports.drawing.tables import table
 
@@ -100,10 +101,11 @@ def definitions() -> Html:
         for name, metric in METRICS.items()
     ]
     rules = (
-        "on average no farther from the wished place than it goes in half a second",
-        "on average no more than 15 % faster or slower than wished",
-        "on average turning no more than 10 degrees a second too much or too little",
+        f"on average no farther from the wished place than it goes in {LONGEST_LAG_S:g} s",
+        f"on average no more than {100 * LARGEST_SPEED_SHARE:g} % faster or slower than wished",
+        f"on average turning no more than {LARGEST_TURN_DEG_S:g} degrees a second too much or too little",
     )
+    grades = ", ".join(f"from {100 * share:g} % {name}" for share, name in GRADES[:-1])
     return joined(
         (
             element("h3", "When a trajectory counts as followed"),
@@ -111,8 +113,7 @@ def definitions() -> Html:
             element("ul", [element("li", rule) for rule in rules]),
             element(
                 "p",
-                "The share of trajectories that are followed gives the grade: from 90 % very good, from 70 % good, "
-                "from 40 % usable in part, below that poor.",
+                f"The share of trajectories that are followed gives the grade: {grades}, below that {GRADES[-1][1]}.",
             ),
             element("h3", "Coverage"),
             element(

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
+from marey_schemas.formats import DEFAULT_END_INDEX, EndIndex
 from marey_schemas.names import ItemName, Label, LayerName, Message
 
 MAX_FRAME = 2**31 - 1
@@ -127,8 +128,8 @@ class AnnotationImport(Request):
     name: ItemName | None = Field(
         None, description="Name of the annotation; default: the names of the clip and the layer."
     )
-    end_index: Literal["inclusive", "exclusive"] = Field(
-        "inclusive",
+    end_index: EndIndex = Field(
+        DEFAULT_END_INDEX,
         description="Whether a section includes its frame `end_idx`, as in the predecessor's editor, or ends "
         "before it, as in its time warping.",
     )

@@ -10,6 +10,7 @@ from marey_schemas.base import Options
 
 Scaling = Literal["jacobian", "root_max", "sfpca", "none"]
 InnerProduct = Literal["coefficients", "l2"]
+DEFAULT_INNER_PRODUCT: InnerProduct = "coefficients"
 Criterion = Literal["bic", "aic"]
 FeatureKind = Literal["end_effectors", "latent"]
 
@@ -56,7 +57,7 @@ class ModelOptions(MixtureOptions):
         "weights.",
     )
     inner_product: InnerProduct = Field(
-        "coefficients",
+        DEFAULT_INNER_PRODUCT,
         description="Inner product of spatial functions. coefficients: of their spline coefficients; l2: of "
         "the functions themselves, which does not depend on the knots.",
     )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
-
 from marey_schemas.items import BlobsMissing, BlobsQuery
+from marey_schemas.names import is_digest
 from marey_server.errors import NotFoundProblem
 from marey_server.http.calls import only_identify
 from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
@@ -16,12 +15,11 @@ from marey_server.store import blobs
 
 MAX_BLOB_BYTES = 1024 * MIB
 """Greatest size of a blob in one request; larger blobs need a resumable upload."""
-_DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 def require_digest(text: str) -> str:
     """Return the text if it is a digest. Raises `NotFoundProblem`."""
-    if not _DIGEST.fullmatch(text):
+    if not is_digest(text):
         raise NotFoundProblem("A blob is identified by sha256: and 64 hexadecimal digits.", code="no-blob")
     return text
 

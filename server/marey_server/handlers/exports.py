@@ -7,7 +7,16 @@ from typing import Literal
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.formats import EXPORT_MEDIA_TYPES, ExportFormat, WrittenUnit
+from marey_schemas.formats import (
+    DEFAULT_END_INDEX,
+    DEFAULT_FORM,
+    DEFAULT_UNIT,
+    EXPORT_MEDIA_TYPES,
+    AnnotationForm,
+    EndIndex,
+    ExportFormat,
+    WrittenUnit,
+)
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, reads
 from marey_server.http.queries import MAX_INTEGER
@@ -23,13 +32,13 @@ class ExportQuery(Request):
     """Format and options of the exported file."""
 
     format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")
-    end_index: Literal["inclusive", "exclusive"] = Field(
-        "inclusive",
+    unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")
+    end_index: EndIndex = Field(
+        DEFAULT_END_INDEX,
         description="For annotations in the predecessor's format: whether a section includes its frame `end_idx`.",
     )
-    form: Literal["labels", "list", "frames"] = Field(
-        "labels",
+    form: AnnotationForm = Field(
+        DEFAULT_FORM,
         description="For annotations in the predecessor's format: sections by label, a list of sections, or "
         "frames by label.",
     )

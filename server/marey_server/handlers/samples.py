@@ -6,7 +6,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.documents.models import MOST_SAMPLES, MOST_SEED
-from marey_schemas.formats import MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
+from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.queries import MAX_INTEGER
@@ -35,8 +35,10 @@ class SampleQuery(Request):
 class SampleFileQuery(SampleQuery):
     """Query of samples as files: the samples to draw, and the format."""
 
-    format: MotionFormat = Field("bvh", description="File format; several files are returned in one ZIP archive.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of BVH files.")
+    format: MotionFormat = Field(
+        DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."
+    )
+    unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of BVH files.")
 
 
 class ModelUser(Resource):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.formats import MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
+from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYPES, MotionFormat, WrittenUnit
 from marey_schemas.search import SearchRequest
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
@@ -19,8 +19,8 @@ from marey_server.motions.searching import FoundSearchable, Searchable, Searchab
 class FoundFileQuery(Request):
     """Query of a search with a file as result: its format and unit."""
 
-    format: MotionFormat = Field("bvh", description="File format of the motion.")
-    unit: WrittenUnit = Field("cm", description="Unit of length of a BVH file.")
+    format: MotionFormat = Field(DEFAULT_FORMAT, description="File format of the motion.")
+    unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")
 
 
 class Searcher(Resource):

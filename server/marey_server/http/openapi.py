@@ -13,6 +13,7 @@ from pydantic.json_schema import JsonSchemaMode, models_json_schema
 from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding.codecs import MEDIA_TYPES
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.names import DIGEST_PATTERN
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
 from marey_schemas.problems import Problem
 from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody
@@ -35,7 +36,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "revision": ("Number of the revision.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
     "token": ("Id of the token.", _NAME),
     "upload": ("Id of the upload.", _NAME),
-    "digest": ("Name of the bytes.", {"type": "string", "pattern": "^sha256:[0-9a-f]{64}$"}),
+    "digest": ("Name of the bytes.", {"type": "string", "pattern": DIGEST_PATTERN}),
     "job": ("Id of the job.", _NAME),
     "job_kind": ("Name of the kind of job.", _NAME),
     "stream": ("Id of the coverage stream.", _NAME),

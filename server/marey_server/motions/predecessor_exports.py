@@ -15,6 +15,7 @@ from marey_schemas.documents.originals import StoredOriginal, content_digest
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.sample_trees import SampleTreeDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
+from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
 
@@ -33,8 +34,8 @@ class PredecessorOptions:
     other than its motion.
     """
 
-    end_index: Literal["inclusive", "exclusive"] = "inclusive"
-    form: Literal["labels", "list", "frames"] = "labels"
+    end_index: EndIndex = DEFAULT_END_INDEX
+    form: AnnotationForm = DEFAULT_FORM
     part: Literal["model", "tree", "alignment"] | None = None
     layout: Literal["2", "3"] | None = None
 

@@ -19,6 +19,7 @@ from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.names import is_digest
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
@@ -29,7 +30,6 @@ from marey_server.store.transaction import Transaction
 
 OPEN_SCHEMA = "marey/document@1"
 
-_DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 _NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
 _REFERENCE_KEYS = {"dtype", "shape", "content"}
 _FILE_POINTERS = {"marey/clip-info@1": ("/source/file", "/source/companion")}
@@ -152,7 +152,7 @@ def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, s
     for pointer, value in _members(body):
         if _is_reference(value):
             leaves[pointer] = value
-        elif isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and _DIGEST.fullmatch(value):
+        elif isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and is_digest(value):
             files[pointer] = value
     return leaves, files
 

@@ -23,6 +23,7 @@ from marey_motion.rigs import map_joints
 from marey_reports.drawing.drawn import DrawnFigure
 from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
+from marey_reports.evaluation import definitions
 from marey_reports.evaluation.definitions import METRICS
 from marey_reports.evaluation.figures import FIGURES, draw_figures
 from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
@@ -299,6 +300,17 @@ def test_the_verdict_is_one_sentence_with_the_worst_trial_and_its_reason(result:
     assert "(22 deg/s too little)" in verdict(little)
     assert "not measured" in verdict(replace(result, trials=(outcome(offset=None),)))
     assert verdict(replace(result, trials=())) == "Not judged: the evaluation has no trials."
+
+
+def test_the_definitions_name_the_limits_and_shares_of_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no more than 15 % faster or slower" in definitions.definitions()
+    monkeypatch.setattr(definitions, "LARGEST_SPEED_SHARE", 0.2)
+    monkeypatch.setattr(definitions, "LARGEST_TURN_DEG_S", 12.0)
+    monkeypatch.setattr(definitions, "LONGEST_LAG_S", 0.7)
+    monkeypatch.setattr(definitions, "GRADES", ((0.8, "fine"), (0.0, "bad")))
+    told = definitions.definitions()
+    for part in ("20 % faster", "no more than 12 degrees", "in 0.7 s", "from 80 % fine, below that bad"):
+        assert part in told
 
 
 # Comparisons

@@ -10,12 +10,8 @@ from hypothesis import strategies as st
 
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import FormatError
-from marey_motion.formats.predecessor.annotation import (
-    AnnotationForm,
-    EndIndex,
-    read_predecessor_annotation,
-    write_predecessor_annotation,
-)
+from marey_motion.formats.predecessor.annotation import read_predecessor_annotation, write_predecessor_annotation
+from marey_schemas.formats import AnnotationForm, EndIndex
 
 FRAMES = 40
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import AnnotationError, FormatError
 from marey_motion.formats.document_fields import field_of, number_array
 from marey_motion.formats.predecessor.encoding import decode_document, encode_document
-
-EndIndex = Literal["inclusive", "exclusive"]
-AnnotationForm = Literal["labels", "list", "frames"]
+from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 
 SECTIONS, SEMANTIC, KEYFRAMES = "sections", "semantic_annotation", "keyframes"
 
@@ -31,7 +29,7 @@ def read_predecessor_annotation(
     file: str,
     frame_count: int,
     *,
-    end_index: EndIndex = "inclusive",
+    end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
     """Read an annotation of a clip, in any of its forms.
@@ -62,7 +60,7 @@ def layer_of_document(
     file: str,
     frame_count: int,
     *,
-    end_index: EndIndex = "inclusive",
+    end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
     """Read an annotation from a decoded document, as `read_predecessor_annotation`.
@@ -101,7 +99,7 @@ def layer_of_document(
 
 
 def write_predecessor_annotation(
-    layer: Layer, *, form: AnnotationForm = "labels", end_index: EndIndex = "inclusive"
+    layer: Layer, *, form: AnnotationForm = DEFAULT_FORM, end_index: EndIndex = DEFAULT_END_INDEX
 ) -> bytes:
     """Write an annotation as JSON.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ from sqlalchemy import and_, bindparam, delete, func, insert, select, tuple_, up
 
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.names import is_digest
 from marey_schemas.problems import FieldError
 from marey_schemas.worker_protocol import StagedOutput
 from marey_server import faults
@@ -27,7 +27,6 @@ from marey_server.store.tables import document, job, staged_output
 from marey_server.store.transaction import IN_LIST, Transaction
 
 MOST_STAGED = 20_000
-_DIGEST = re.compile(r"sha256:[0-9a-f]{64}")
 
 StagedDraft = dict[str, Any]
 """Stored draft: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
@@ -231,7 +230,7 @@ def named_blobs(tree: Any) -> Iterator[str]:
     """Return the digests under members named `blob`, anywhere in parameters or in a result."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
-            if name == "blob" and isinstance(value, str) and _DIGEST.fullmatch(value):
+            if name == "blob" and isinstance(value, str) and is_digest(value):
                 yield value
             else:
                 yield from named_blobs(value)
