@@ -93,5 +93,5 @@ def test_ends_that_hold_a_sample_twice_are_refused() -> None:
     document = models.tree()
     first, second = document["root"]["children"][0]["children"][:2]
     first |= copy.deepcopy(second)
-    with pytest.raises(FormatError, match="do not hold each sample once"):
+    with pytest.raises(FormatError, match="do not contain each sample exactly once"):
         read(document)
