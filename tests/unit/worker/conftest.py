@@ -51,8 +51,7 @@ class FakeServer:
         self.tokens_seen: set[str] = set()
         self._claims = 0
         self._lock = threading.Lock()
-        self.http = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self))
-        self.http.daemon_threads = True
+        self.http = _Connections(("127.0.0.1", 0), _handler(self))
         threading.Thread(target=self.http.serve_forever, daemon=True).start()
 
     @property
@@ -122,6 +121,16 @@ class FakeServer:
     def ended(self, job: str, timeout_s: int = 60) -> dict[str, Any]:
         self.until(lambda: job in self.completed or job in self.failed, timeout_s)
         return self.completed.get(job) or self.failed[job]
+
+
+class _Connections(ThreadingHTTPServer):
+    """Connections of workers, which end at any moment: tests stop and kill workers that wait for an answer."""
+
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
 
 def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
@@ -216,12 +225,17 @@ class Worker:
     """A worker process, as `marey serve` starts one."""
 
     def __init__(self, server: FakeServer, folder: Path, *options: str, env: dict[str, str] | None = None) -> None:
+        self.log = folder / "worker.log"
         paths = [str(THIRD_PARTY), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **(env or {})}
         command = [sys.executable, "-m", "marey_worker", "--attached", "--server", server.url]
-        self.process = subprocess.Popen(
-            [*command, "--cache", str(folder / "cache"), *options], stdin=subprocess.PIPE, env=environment
-        )
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [*command, "--cache", str(folder / "cache"), *options],
+                stdin=subprocess.PIPE,
+                stderr=log,
+                env=environment,
+            )
         self.process.stdin.write(b"marey_worker_token\n")
         self.process.stdin.flush()
 
@@ -244,3 +258,5 @@ def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[Callable[..., W
             worker.process.kill()
             worker.process.wait()
         worker.process.stdin.close()
+    for log in {worker.log for worker in workers}:
+        sys.stderr.write(log.read_text())  # pytest shows it beside the failure of a test

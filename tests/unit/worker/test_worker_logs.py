@@ -16,12 +16,12 @@ def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise() -> None:
 
 @pytest.mark.parametrize("form", ["json", "text"])
 def test_a_worker_logs_in_the_form_that_its_environment_names(
-    server: Any, start_worker: Callable[..., Any], capfd: pytest.CaptureFixture[str], form: str
+    server: Any, start_worker: Callable[..., Any], form: str
 ) -> None:
     worker = start_worker(env={"MAREY_LOG_FORM": form})
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     assert worker.stop() == 0
-    lines = capfd.readouterr().err.splitlines()
+    lines = worker.log.read_text().splitlines()
     assert any("works for" in line for line in lines)
     assert {line.startswith("{") for line in lines} == {form == "json"}
 
