@@ -3,10 +3,10 @@
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
 from marey_client.blobs import Blobs, digest_of
@@ -26,7 +26,7 @@ class Torn(httpx.SyncByteStream):
         raise httpx.ReadError("connection reset")
 
 
-def test_a_file_is_streamed_with_its_length(script: Any, tmp_path: Path) -> None:
+def test_a_file_is_streamed_with_its_length(script: ScriptedServer, tmp_path: Path) -> None:
     path = tmp_path / "walk.bvh"
     path.write_bytes(DATA)
     script.answers = [httpx.ReadError("lost"), httpx.Response(204)]
@@ -39,7 +39,7 @@ def test_a_file_is_streamed_with_its_length(script: Any, tmp_path: Path) -> None
 
 @pytest.mark.parametrize(("became", "told"), [(DATA[:1000], "shorter"), (DATA * 3, "longer")])
 def test_a_file_whose_length_changes_while_it_is_sent_is_told(
-    script: Any, tmp_path: Path, became: bytes, told: str
+    script: ScriptedServer, tmp_path: Path, became: bytes, told: str
 ) -> None:
     path = tmp_path / "walk.bvh"
     path.write_bytes(DATA)
@@ -53,7 +53,7 @@ def test_a_file_whose_length_changes_while_it_is_sent_is_told(
         script.marey().blobs.put_file(path)
 
 
-def test_a_download_goes_on_where_the_connection_broke(script: Any, tmp_path: Path) -> None:
+def test_a_download_goes_on_where_the_connection_broke(script: ScriptedServer, tmp_path: Path) -> None:
     def rest(request: httpx.Request) -> httpx.Response:
         start = int(request.headers["Range"].removeprefix("bytes=").rstrip("-"))
         return httpx.Response(206, content=DATA[start:])
@@ -64,12 +64,12 @@ def test_a_download_goes_on_where_the_connection_broke(script: Any, tmp_path: Pa
     assert script.requests[1].headers["Range"] == "bytes=1000-"
 
 
-def test_a_download_starts_again_where_ranges_are_not_known(script: Any, tmp_path: Path) -> None:
+def test_a_download_starts_again_where_ranges_are_not_known(script: ScriptedServer, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, stream=Torn(DATA[:1000])), httpx.Response(200, content=DATA)]
     assert script.marey().blobs.fetch_to(digest_of(DATA), tmp_path / "walk").read_bytes() == DATA
 
 
-def test_other_bytes_than_those_asked_for_are_never_kept(script: Any, tmp_path: Path) -> None:
+def test_other_bytes_than_those_asked_for_are_never_kept(script: ScriptedServer, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, content=b"other"), httpx.Response(200, content=b"other")]
     blobs = script.marey().blobs
     with pytest.raises(errors.DigestMismatch):
@@ -79,7 +79,7 @@ def test_other_bytes_than_those_asked_for_are_never_kept(script: Any, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_thousands_of_digests_are_asked_for_in_few_questions(script: Any) -> None:
+def test_thousands_of_digests_are_asked_for_in_few_questions(script: ScriptedServer) -> None:
     digests = [f"sha256:{number:064x}" for number in range(12_000)]
 
     def answer(request: httpx.Request) -> httpx.Response:

@@ -5,7 +5,6 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -14,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 import typer
+from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.cli import accounts, files, with_global_options_first
 from marey_client.cli.addresses import Address
@@ -228,7 +228,7 @@ def test_a_format_that_cannot_be_written_is_refused_before_anything_is_asked(now
     assert "the formats are original, bvh, npz" in done.stderr
 
 
-def test_a_folder_is_shown_without_reading_those_below_it(script: Any) -> None:
+def test_a_folder_is_shown_without_reading_those_below_it(script: ScriptedServer) -> None:
     def empty(request: httpx.Request) -> httpx.Response:
         return httpx.Response(200, content=b'{"items": [], "next_cursor": null}')
 
@@ -240,9 +240,9 @@ def test_a_folder_is_shown_without_reading_those_below_it(script: Any) -> None:
 
 @pytest.mark.parametrize(("token", "hinted"), [(None, True), ("marey_secret", False)])
 def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(
-    script: Any, make_problem: Callable[..., Any], token: str | None, hinted: bool
+    script: ScriptedServer, token: str | None, hinted: bool
 ) -> None:
-    script.answers = [make_problem(404, "no-project")]
+    script.answers = [problem(404, "no-project")]
     with (
         Marey("http://server.test", token, http=httpx.MockTransport(script)) as anyone,
         pytest.raises(NotFound) as raised,
@@ -257,45 +257,45 @@ def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_p
     assert sentence(failed.value) == f"{tmp_path}/nowhere/walk.bvh: No such file or directory"
 
 
-def test_what_is_wrong_with_a_field_is_told_once(script: Any, make_problem: Callable[..., Any]) -> None:
+def test_what_is_wrong_with_a_field_is_told_once(script: ScriptedServer) -> None:
     errors = [{"pointer": "/a", "code": "bad", "detail": "no"}, {"pointer": "/b", "code": "bad", "detail": "neither"}]
-    script.answers = [make_problem(422, "invalid", detail="/a: no", errors=errors)]
+    script.answers = [problem(422, "invalid", detail="/a: no", errors=errors)]
     with pytest.raises(Invalid) as raised:
         script.marey().project("lab").read()
     assert sentence(raised.value) == "/a: no; /b: neither (invalid, request req-1)"
 
 
 def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(
-    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers = [make_problem(401, "bad-token", detail="The token is unknown, expired or revoked.")] * 2
+    refusal = problem(401, "bad-token", detail="The token is unknown, expired or revoked.")
     monkeypatch.setattr("marey_client.marey.Marey", lambda url, token: answering(script, token))
     monkeypatch.setenv("MAREY_TOKEN", "marey_old")
     for anonymous, told in ((False, "the token comes from the variable MAREY_TOKEN; marey login"), (True, "unknown")):
-        script.answers = answers[:1]
+        script.answers = [refusal]
         with pytest.raises(Unauthenticated) as refused, connect(NO_OPTIONS, anonymous=anonymous) as marey:
             marey.me()
         assert told in sentence(refused.value)
         assert ("MAREY_TOKEN" in sentence(refused.value)) is not anonymous
 
 
-def answering(script: Any, token: str | None) -> Marey:
+def answering(script: ScriptedServer, token: str | None) -> Marey:
     return Marey("http://server.test", token, http=httpx.MockTransport(script))
 
 
 def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(
-    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     monkeypatch.setattr(files, "connect", lambda context: script.marey())
-    script.answers = [make_problem(404, "no-project")]
+    script.answers = [problem(404, "no-project")]
     with pytest.raises(NotFound):
         files.upload(NO_OPTIONS, [tmp_path], "nowhere", {})
     assert [request.method for request in script.requests] == ["GET"]
 
 
 def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(
-    script: Any, capsys: pytest.CaptureFixture[str]
+    script: ScriptedServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupt(_request: httpx.Request) -> None:
         raise KeyboardInterrupt
@@ -309,7 +309,7 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(
     assert "marey job cancel job_1" in told
 
 
-def test_a_job_that_is_not_waited_for_is_named(script: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_job_that_is_not_waited_for_is_named(script: ScriptedServer, capsys: pytest.CaptureFixture[str]) -> None:
     submitted = a_job(id="job_1", kind="retarget", state=JobState.QUEUED, progress=None)
     assert follow(script.marey(), submitted, wait=False) is None
     assert capsys.readouterr().out == "job_1\n"
@@ -339,7 +339,7 @@ def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(
 
 
 def test_who_interrupts_an_upload_is_told_how_to_go_on(
-    script: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "walk.bvh").write_text("x")
 
@@ -354,7 +354,7 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(
 
 
 def test_a_token_whose_file_cannot_be_written_is_never_made(
-    script: Any, make_problem: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "there").write_text("precious")
     monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
@@ -362,7 +362,7 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
         accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "there")
     assert script.requests == []
     assert (tmp_path / "there").read_text() == "precious"
-    script.answers = [make_problem(403, "insufficient-scope")]
+    script.answers = [problem(403, "insufficient-scope")]
     with pytest.raises(Forbidden):
         accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
     assert not (tmp_path / "new").exists()

@@ -1,12 +1,12 @@
 """Performances as the SDK sends them: where the last answer left them, each frame once."""
 
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.errors import Conflict, RequestFailed
 from marey_client.handles.coverage_streams import CoverageStreamHandle, CoverageStreams
@@ -37,18 +37,18 @@ def counted(request: httpx.Request) -> httpx.Response:
 
 
 @pytest.fixture
-def streams(script: Any) -> CoverageStreams:
+def streams(script: ScriptedServer) -> CoverageStreams:
     return script.marey().project("lab").coverage_streams
 
 
 @pytest.fixture
-def stream(script: Any, streams: CoverageStreams) -> CoverageStreamHandle:
+def stream(script: ScriptedServer, streams: CoverageStreams) -> CoverageStreamHandle:
     script.answers = [httpx.Response(201, json=STREAM)]
     return streams.begin(60.0, skeleton="skeleton_1", turn_rates_deg_s=(-90, 0, 90))
 
 
 def test_what_is_asked_for_is_sent_and_checked_before(
-    script: Any, streams: CoverageStreams, stream: CoverageStreamHandle
+    script: ScriptedServer, streams: CoverageStreams, stream: CoverageStreamHandle
 ) -> None:
     (request,) = script.requests
     assert (request.method, request.url.path) == ("POST", URL)
@@ -60,7 +60,7 @@ def test_what_is_asked_for_is_sent_and_checked_before(
     assert len(script.requests) == 1
 
 
-def test_frames_go_on_where_the_last_answer_left_them(script: Any, stream: CoverageStreamHandle) -> None:
+def test_frames_go_on_where_the_last_answer_left_them(script: ScriptedServer, stream: CoverageStreamHandle) -> None:
     script.answers = [counted] * 4
     poses = np.zeros((10, 107), np.float32)
     stream.send(poses)
@@ -76,7 +76,9 @@ def test_frames_go_on_where_the_last_answer_left_them(script: Any, stream: Cover
     assert stream.offset == 20
 
 
-def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(script: Any, stream: CoverageStreamHandle) -> None:
+def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(
+    script: ScriptedServer, stream: CoverageStreamHandle
+) -> None:
     script.answers = [httpx.ReadError("connection reset"), counted]
     stream.send(np.zeros((10, 3)))
     first, again = script.requests[1:]
@@ -85,9 +87,9 @@ def test_frames_whose_answer_was_lost_are_sent_again_as_they_were(script: Any, s
 
 
 def test_frames_that_are_refused_leave_the_offset_where_it_was(
-    script: Any, stream: CoverageStreamHandle, make_problem: Callable[..., Any]
+    script: ScriptedServer, stream: CoverageStreamHandle
 ) -> None:
-    script.answers = [make_problem(409, "coverage-offset", context={"offset": 30}), make_problem(422, "invalid")]
+    script.answers = [problem(409, "coverage-offset", context={"offset": 30}), problem(422, "invalid")]
     with pytest.raises(Conflict) as refused:
         stream.send(np.zeros((10, 3)))
     assert refused.value.problem.context == {"offset": 30}
@@ -96,7 +98,7 @@ def test_frames_that_are_refused_leave_the_offset_where_it_was(
     assert stream.offset == 0
 
 
-def test_another_process_goes_on_with_a_stream(script: Any, streams: CoverageStreams) -> None:
+def test_another_process_goes_on_with_a_stream(script: ScriptedServer, streams: CoverageStreams) -> None:
     script.answers = [httpx.Response(200, json={**STREAM, "offset": 700}), counted]
     stream = streams.get("coverage_1")
     stream.send(np.zeros((10, 3)))
@@ -104,7 +106,7 @@ def test_another_process_goes_on_with_a_stream(script: Any, streams: CoverageStr
 
 
 def test_streams_are_listed_read_and_dropped(
-    script: Any, streams: CoverageStreams, stream: CoverageStreamHandle
+    script: ScriptedServer, streams: CoverageStreams, stream: CoverageStreamHandle
 ) -> None:
     state = {
         **STREAM, "index": 0.0, "missing_s": 1.0, "targets": [], "performer": None, "seconds": [[0.0]],

@@ -6,6 +6,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client.downloads import TakenPaths, download, safe_file_name
 from marey_server.http.streaming import attachment
@@ -15,19 +16,21 @@ def answer(file_name: str, content: bytes = b"motion") -> httpx.Response:
     return httpx.Response(200, content=content, headers={"Content-Disposition": attachment(file_name)})
 
 
-def fetch(script: Any, folder: Path, **options: Any) -> Path:
+def fetch(script: ScriptedServer, folder: Path, **options: Any) -> Path:
     return download(script.marey().transport, "/clips/clip_1/export", folder, name="walk.bvh", **options)
 
 
 @pytest.mark.parametrize(
     "name", ["walk.bvh", "Спокойная ходьба.bvh", "50% größer.bvh", "marcheuse 🚶‍♀️.bvh", 'a "b".bvh']
 )
-def test_a_file_has_the_name_that_the_server_gives_it_in_any_language(script: Any, tmp_path: Path, name: str) -> None:
+def test_a_file_has_the_name_that_the_server_gives_it_in_any_language(
+    script: ScriptedServer, tmp_path: Path, name: str
+) -> None:
     script.answers = [answer(name)]
     assert fetch(script, tmp_path) == tmp_path / name.replace('"', "_")
 
 
-def test_a_server_that_gives_no_name_or_a_plain_one_is_understood(script: Any, tmp_path: Path) -> None:
+def test_a_server_that_gives_no_name_or_a_plain_one_is_understood(script: ScriptedServer, tmp_path: Path) -> None:
     script.answers = [
         httpx.Response(200, content=b""),
         httpx.Response(200, content=b"", headers={"Content-Disposition": 'attachment; filename="run.bvh"'}),
@@ -46,7 +49,9 @@ def test_a_name_that_no_file_system_takes_is_shortened_and_keeps_its_ending(tmp_
 
 
 @pytest.mark.parametrize("names", [("walk.bvh", "walk.bvh"), ("Walk.bvh", "walk.bvh"), ("a:b.bvh", "a?b.bvh")])
-def test_files_of_one_download_do_not_replace_each_other(script: Any, tmp_path: Path, names: tuple[str, str]) -> None:
+def test_files_of_one_download_do_not_replace_each_other(
+    script: ScriptedServer, tmp_path: Path, names: tuple[str, str]
+) -> None:
     script.answers = [answer(name, name.encode()) for name in names]
     beside = TakenPaths()
     first, second = (fetch(script, tmp_path, beside=beside) for _ in names)
@@ -54,7 +59,9 @@ def test_files_of_one_download_do_not_replace_each_other(script: Any, tmp_path: 
     assert [path.read_bytes() for path in (first, second)] == [name.encode() for name in names]
 
 
-def test_a_download_that_is_tried_again_keeps_its_name_and_replaces_an_older_file(script: Any, tmp_path: Path) -> None:
+def test_a_download_that_is_tried_again_keeps_its_name_and_replaces_an_older_file(
+    script: ScriptedServer, tmp_path: Path
+) -> None:
     (tmp_path / "walk.bvh").write_bytes(b"older")
 
     def breaks_off() -> Iterator[bytes]:

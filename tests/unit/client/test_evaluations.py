@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.following import show_progress
@@ -51,11 +52,11 @@ def answer(request: httpx.Request) -> httpx.Response:
     return httpx.Response(200, json={"items": found})
 
 
-def submitted(script: Any) -> dict[str, Any]:
+def submitted(script: ScriptedServer) -> dict[str, Any]:
     return json.loads(script.requests[-1].content)
 
 
-def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(script: Any) -> None:
+def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(script: ScriptedServer) -> None:
     script.answers = [answer] * 9
     script.marey().project("lab").evaluate("walks", into="results", name="walks-eval", duration_s=10)
     sent = submitted(script)
@@ -67,7 +68,7 @@ def test_a_folder_is_evaluated_with_its_tagged_loops_and_the_edited_mapping(scri
     assert sent["params"] == {"name": "walks-eval", "duration_s": 10.0, "loops": ["clip_b"]}
 
 
-def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: Any) -> None:
+def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: ScriptedServer) -> None:
     script.answers = [answer] * 9
     places = [CollectionInput(collection="walks")]
     script.marey().project("lab").evaluate(places, normaliser="evaluation_7", loops=["clip_a"], cache="refresh")
@@ -77,7 +78,7 @@ def test_loops_that_are_named_and_a_normaliser_are_handed_in(script: Any) -> Non
     assert sent["cache"] == "refresh"
 
 
-def test_a_misspelt_option_is_refused_before_anything_is_sent(script: Any) -> None:
+def test_a_misspelt_option_is_refused_before_anything_is_sent(script: ScriptedServer) -> None:
     with pytest.raises(ValueError, match="durations_s"):
         script.marey().project("lab").evaluate("walks", durations_s=10)
     assert script.requests == []

@@ -1,10 +1,10 @@
 """Findings of jobs on evaluations in the SDK and on the command line."""
 
 import json
-from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client.blobs import digest_of
 from marey_client.cli.failures import WrongUsage
@@ -16,7 +16,7 @@ NOW = "2026-01-01T00:00:00Z"
 DOCUMENT = json.dumps({"schema": "marey/suggestions@1"}).encode()
 
 
-def evaluation(script: Any, name: str) -> EvaluationHandle:
+def evaluation(script: ScriptedServer, name: str) -> EvaluationHandle:
     item = Item(
         id=f"evaluation_{name}",
         kind="evaluation",
@@ -42,7 +42,9 @@ def answer(request: httpx.Request) -> httpx.Response:
     return httpx.Response(200, json=job)
 
 
-def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(script: Any) -> None:
+def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_was_given(
+    script: ScriptedServer,
+) -> None:
     script.answers = [answer] * 3
     found = evaluation(script, "first").suggest("others", removals=3)
     assert json.loads(script.requests[0].content) == {

@@ -9,6 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
 from marey_client.imports import FILES_PER_IMPORT, LocalFile, batches, find_files, refusal_text
@@ -81,7 +82,9 @@ def test_large_files_make_small_portions() -> None:
     assert [len(portion) for portion in portions] == [1] * 6
 
 
-def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(script: Any, tmp_path: Path) -> None:
+def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(
+    script: ScriptedServer, tmp_path: Path
+) -> None:
     for name in ("a.bvh", "b.bvh", "copy-of-b.bvh", "c.bvh"):
         (tmp_path / name).write_text(name.removeprefix("copy-of-"))
     sent, imported = [], []
@@ -124,7 +127,7 @@ def test_only_bytes_the_server_lacks_are_sent_and_each_file_gets_its_entry(scrip
 
 @pytest.mark.parametrize(("name", "shown"), [(b"caf\xe9.bvh", r"caf\udce9.bvh"), (b"new\nline.bvh", r"new\nline.bvh")])
 def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(
-    script: Any, tmp_path: Path, name: bytes, shown: str
+    script: ScriptedServer, tmp_path: Path, name: bytes, shown: str
 ) -> None:
     (tmp_path / "walk.bvh").write_text("x")
     (tmp_path / os.fsdecode(name)).write_text("y")

@@ -5,6 +5,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
 from marey_client.explanations import explain
@@ -26,7 +27,7 @@ def answer(**members: Any) -> httpx.Response:
     return httpx.Response(200, content=job(**members).model_dump_json())
 
 
-def test_waiting_ends_with_the_job_and_tells_its_progress(script: Any) -> None:
+def test_waiting_ends_with_the_job_and_tells_its_progress(script: ScriptedServer) -> None:
     script.answers = [answer(), answer(state="running", progress={"done": 1, "total": 2}), answer(state="succeeded")]
     seen = []
     ended = script.marey().jobs.wait("job_1", on_progress=lambda now: seen.append(now.state))
@@ -34,7 +35,7 @@ def test_waiting_ends_with_the_job_and_tells_its_progress(script: Any) -> None:
     assert seen == ["queued", "running", "succeeded"]
 
 
-def test_a_job_that_failed_raises_with_its_reason(script: Any) -> None:
+def test_a_job_that_failed_raises_with_its_reason(script: ScriptedServer) -> None:
     failure = {"reason": "error", "code": "no-mapping", "detail": "nothing maps"}
     script.answers = [answer(state="failed", failure=failure)] * 2
     jobs = script.marey().jobs
@@ -44,7 +45,7 @@ def test_a_job_that_failed_raises_with_its_reason(script: Any) -> None:
     assert jobs.wait("job_1", require_success=False).state == "failed"
 
 
-def test_waiting_gives_up_when_told_to(script: Any) -> None:
+def test_waiting_gives_up_when_told_to(script: ScriptedServer) -> None:
     script.answers = [answer(state="running")] * 100
     with pytest.raises(errors.WaitedTooLong, match="still running"):
         script.marey().jobs.wait("job_1", timeout_s=0.01)
@@ -67,6 +68,6 @@ def test_every_state_has_its_reason(members: dict[str, Any], running: list[Job],
     assert expected in explain(job(**members), [], running, NOW)[0]
 
 
-def test_earlier_attempts_are_told(script: Any) -> None:
+def test_earlier_attempts_are_told(script: ScriptedServer) -> None:
     lost = Attempt(job="job_1", fence=1, worker="w1", started_at=NOW, ended_at=NOW, outcome="lost", detail=None)
     assert "attempt 1 on w1 was lost" in explain(job(), [lost], [], NOW)

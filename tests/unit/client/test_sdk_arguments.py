@@ -4,11 +4,11 @@ import errno
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from tests.support.scripted_server import ScriptedServer
 
 from marey_client.downloads import saved_atomically
 from marey_client.handles.clips import MotionArrays
@@ -31,7 +31,7 @@ JOB = {
 }  # fmt: skip
 
 
-def test_folders_and_files_may_be_named_by_texts(script: Any, tmp_path: Path) -> None:
+def test_folders_and_files_may_be_named_by_texts(script: ScriptedServer, tmp_path: Path) -> None:
     script.answers = [httpx.Response(200, json=CLIP), httpx.Response(200, content=b"motion")]
     clip = script.marey().project("lab").clips.get("clip_1")
     written = clip.export(f"{tmp_path}/out", format="bvh")
@@ -39,7 +39,7 @@ def test_folders_and_files_may_be_named_by_texts(script: Any, tmp_path: Path) ->
     assert written.read_bytes() == b"motion"
 
 
-def test_poses_that_were_read_are_put_back_as_the_next_revision(script: Any) -> None:
+def test_poses_that_were_read_are_put_back_as_the_next_revision(script: ScriptedServer) -> None:
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
         "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
@@ -62,7 +62,7 @@ def test_poses_that_were_read_are_put_back_as_the_next_revision(script: Any) -> 
     assert script.requests[-1].headers["If-Match"] == '"4.json"'
 
 
-def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script: Any) -> None:
+def test_a_folder_is_retargeted_by_its_path_as_it_is_edited_and_evaluated(script: ScriptedServer) -> None:
     page = {"items": [CLIP], "next_cursor": None}
     answers = [httpx.Response(200, json=answer) for answer in (page, SKELETON)]
     script.answers = [*answers, httpx.Response(202, json=JOB)]
@@ -105,7 +105,7 @@ def query_of(request: httpx.Request) -> dict[str, str]:
     return dict(request.url.params)
 
 
-def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script: Any) -> None:
+def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_letter(script: ScriptedServer) -> None:
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
         "joints": ["Hips"], "poses": np.tile(np.array([0, 1, 0, 1, 0, 0, 0], np.float32), (3, 1)),
@@ -125,7 +125,9 @@ def test_one_joint_or_tag_or_command_needs_no_list_and_is_not_read_letter_by_let
         assert list(sent["tags"]) == ["walk"]
 
 
-def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(script: Any, tmp_path: Path) -> None:
+def test_one_digest_one_folder_one_command_and_one_constraint_need_no_list(
+    script: ScriptedServer, tmp_path: Path
+) -> None:
     digest = "sha256:" + "0" * 64
     script.answers = [httpx.Response(200, json={"missing": [digest]})]
     assert script.marey().blobs.missing(digest) == {digest}

@@ -3,13 +3,13 @@
 import logging
 import pickle
 import ssl
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client import errors
 from marey_client.marey import Marey
@@ -59,21 +59,21 @@ def ok(document: dict[str, Any], status: int = 200) -> httpx.Response:
     return httpx.Response(status, json=document)
 
 
-def test_a_read_is_sent_again_when_the_connection_is_lost(script: Any) -> None:
+def test_a_read_is_sent_again_when_the_connection_is_lost(script: ScriptedServer) -> None:
     script.answers = [LOST, NEVER_CONNECTED, ok(PROJECT)]
     assert script.marey().project("lab").read().name == "lab"
     assert len(script.waited) == 2
 
 
 @pytest.mark.parametrize("name", ["a\n", "a?b=c", "a#b", "a%00", "é", "a b"])
-def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script: Any, name: str) -> None:
+def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script: ScriptedServer, name: str) -> None:
     script.answers = [ok(PROJECT)]
     script.marey().project(name).read()
     assert script.requests[0].url.path == f"/api/v1/projects/{name}"
     assert not script.requests[0].url.query
 
 
-def test_a_post_is_sent_again_under_the_same_idempotency_key(script: Any) -> None:
+def test_a_post_is_sent_again_under_the_same_idempotency_key(script: ScriptedServer) -> None:
     script.answers = [LOST, ok(PROJECT, 201), ok(PROJECT)]
     script.marey().create_project(ProjectCreate(name="lab"))
     keys = {request.headers["Idempotency-Key"] for request in script.requests}
@@ -81,7 +81,7 @@ def test_a_post_is_sent_again_under_the_same_idempotency_key(script: Any) -> Non
     assert len(keys) == 1
 
 
-def test_two_posts_have_two_keys(script: Any) -> None:
+def test_two_posts_have_two_keys(script: ScriptedServer) -> None:
     script.answers = [ok(PROJECT, 201), ok(PROJECT, 201)]
     marey = script.marey()
     for _ in range(2):
@@ -89,7 +89,7 @@ def test_two_posts_have_two_keys(script: Any) -> None:
     assert len({request.headers["Idempotency-Key"] for request in script.requests}) == 2
 
 
-def test_a_change_whose_answer_was_lost_is_not_sent_twice(script: Any) -> None:
+def test_a_change_whose_answer_was_lost_is_not_sent_twice(script: ScriptedServer) -> None:
     script.answers = [ok(ITEM), LOST]
     clip = script.marey().project("lab").clips.get("clip_1")
     with pytest.raises(errors.Unreachable):
@@ -97,23 +97,23 @@ def test_a_change_whose_answer_was_lost_is_not_sent_twice(script: Any) -> None:
     assert len(script.requests) == 2
 
 
-def test_a_change_that_never_arrived_is_sent_again(script: Any) -> None:
+def test_a_change_that_never_arrived_is_sent_again(script: ScriptedServer) -> None:
     script.answers = [ok(ITEM), NEVER_CONNECTED, ok({**ITEM, "name": "run", "rev": 5})]
     clip = script.marey().project("lab").clips.get("clip_1")
     assert clip.change(ItemChange(name="run")).name == "run"
     assert script.requests[-1].headers["If-Match"] == '"4.json"'
 
 
-def test_a_token_is_not_made_twice(script: Any) -> None:
+def test_a_token_is_not_made_twice(script: ScriptedServer) -> None:
     script.answers = [LOST]
     with pytest.raises(errors.Unreachable):
         script.marey().tokens.create(TokenCreate(name="ci"))
 
 
-def test_a_busy_server_is_waited_for_as_long_as_it_asks(script: Any, make_problem: Callable[..., Any]) -> None:
+def test_a_busy_server_is_waited_for_as_long_as_it_asks(script: ScriptedServer) -> None:
     script.answers = [
-        make_problem(503, "unavailable", retry_after=7),
-        make_problem(429, "too-many-requests"),
+        problem(503, "unavailable", retry_after=7),
+        problem(429, "too-many-requests"),
         ok(PROJECT),
     ]
     script.marey().project("lab").read()
@@ -121,7 +121,7 @@ def test_a_busy_server_is_waited_for_as_long_as_it_asks(script: Any, make_proble
     assert script.waited[1] < 7
 
 
-def test_trying_again_ends(script: Any) -> None:
+def test_trying_again_ends(script: ScriptedServer) -> None:
     script.answers = [ok(PROJECT), *[LOST] * 10]
     project = script.marey(retries=Retries(tries=5, sleep=script.waited.append)).project("lab")
     project.read()
@@ -130,7 +130,7 @@ def test_trying_again_ends(script: Any) -> None:
     assert len(script.requests) == 1 + 5
 
 
-def test_a_server_that_was_never_there_is_given_up_sooner(script: Any) -> None:
+def test_a_server_that_was_never_there_is_given_up_sooner(script: ScriptedServer) -> None:
     script.answers = [NEVER_CONNECTED] * 10
     with pytest.raises(errors.Unreachable):
         script.marey().project("lab").read()
@@ -153,10 +153,10 @@ def test_a_server_that_was_never_there_is_given_up_sooner(script: Any) -> None:
     ],
 )
 def test_problems_become_errors_by_code_and_status(
-    script: Any, make_problem: Callable[..., Any], status: int, code: str, expected: type[errors.RequestFailed]
+    script: ScriptedServer, status: int, code: str, expected: type[errors.RequestFailed]
 ) -> None:
     field = {"pointer": "/name", "code": "taken", "detail": "is taken"}
-    script.answers = [make_problem(status, code, errors=[field], context={"revision": 3})]
+    script.answers = [problem(status, code, errors=[field], context={"revision": 3})]
     with pytest.raises(expected) as caught:
         script.marey().project("lab").read()
     assert type(caught.value) is expected
@@ -165,22 +165,24 @@ def test_problems_become_errors_by_code_and_status(
     assert caught.value.context == {"revision": 3}
 
 
-def test_an_error_of_something_in_between_is_told_too(script: Any) -> None:
+def test_an_error_of_something_in_between_is_told_too(script: ScriptedServer) -> None:
     script.answers = [httpx.Response(413, text="<html>too large</html>")]
     with pytest.raises(errors.TooLarge, match="413"):
         script.marey().project("lab").read()
 
 
 @pytest.mark.parametrize("media_type", ["text/html", "application/problem+json"])
-def test_an_error_of_another_server_names_the_address_and_asks_about_it(script: Any, media_type: str) -> None:
+def test_an_error_of_another_server_names_the_address_and_asks_about_it(
+    script: ScriptedServer, media_type: str
+) -> None:
     script.answers = [httpx.Response(404, content=b'{"title": "?"}', headers={"Content-Type": media_type})]
     with pytest.raises(errors.NotFound, match=r"http://server\.test/ answered 404 .*is it the right address"):
         script.marey().project("lab").read()
 
 
-def test_errors_survive_the_way_from_one_process_to_another(script: Any, make_problem: Callable[..., Any]) -> None:
+def test_errors_survive_the_way_from_one_process_to_another(script: ScriptedServer) -> None:
     wrong = [{"pointer": "/name", "code": "bad", "detail": "too long"}]
-    script.answers = [make_problem(422, "invalid", detail="No.", errors=wrong)]
+    script.answers = [problem(422, "invalid", detail="No.", errors=wrong)]
     with pytest.raises(errors.Invalid) as refused:
         script.marey().project("lab").read()
     again = pickle.loads(pickle.dumps(refused.value))
@@ -189,18 +191,18 @@ def test_errors_survive_the_way_from_one_process_to_another(script: Any, make_pr
     assert (str(ended), ended.job) == ("it failed", {"id": "job_1"})
 
 
-def test_an_answer_of_something_else_is_no_traceback(script: Any) -> None:
+def test_an_answer_of_something_else_is_no_traceback(script: ScriptedServer) -> None:
     script.answers = [httpx.Response(200, text="<html>hello</html>")]
     with pytest.raises(errors.UnexpectedAnswer, match="not a Project"):
         script.marey().project("lab").read()
 
 
-def test_fields_that_a_newer_server_adds_are_ignored(script: Any) -> None:
+def test_fields_that_a_newer_server_adds_are_ignored(script: ScriptedServer) -> None:
     script.answers = [ok({**PROJECT, "colour": "green"})]
     assert script.marey().project("lab").read().name == "lab"
 
 
-def test_lists_are_read_page_by_page(script: Any) -> None:
+def test_lists_are_read_page_by_page(script: ScriptedServer) -> None:
     script.answers = [ok({"items": [ITEM], "next_cursor": "c1"}), ok({"items": [{**ITEM, "id": "clip_2"}]})]
     clips = script.marey().project("lab").clips.list(collection="raw", filters={"frames.gte": 10, "tag.in": None})
     assert [clip.id for clip in clips] == ["clip_1", "clip_2"]
@@ -209,7 +211,7 @@ def test_lists_are_read_page_by_page(script: Any) -> None:
     assert "tag.in" not in script.requests[1].url.params
 
 
-def test_poses_come_as_arrays_in_blocks(script: Any) -> None:
+def test_poses_come_as_arrays_in_blocks(script: ScriptedServer) -> None:
     poses = np.arange(22, dtype="<f4").reshape(2, 11)
     motion = {
         "schema": "marey/motion@1", "skeleton": {"item": "skeleton_1", "revision": 1}, "frame_rate_hz": 30.0,
@@ -226,13 +228,13 @@ def test_poses_come_as_arrays_in_blocks(script: Any) -> None:
 
 
 @pytest.mark.parametrize("frames", [slice(0, 10, 2), slice(-5, None)])
-def test_frames_that_a_query_cannot_say_are_refused(script: Any, frames: slice) -> None:
+def test_frames_that_a_query_cannot_say_are_refused(script: ScriptedServer, frames: slice) -> None:
     script.answers = [ok(ITEM)]
     with pytest.raises(ValueError, match=r"frames|negative"):
         script.marey().project("lab").clips.get("clip_1").motion(frames=frames)
 
 
-def test_the_token_is_sent_and_shown_nowhere(script: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_token_is_sent_and_shown_nowhere(script: ScriptedServer, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     script.answers = [NEVER_CONNECTED, ok(PROJECT)]
     marey = script.marey()
@@ -245,14 +247,14 @@ def test_the_token_is_sent_and_shown_nowhere(script: Any, caplog: pytest.LogCapt
 
 
 @pytest.mark.parametrize("token", ["marey_secret\n", " marey_secret\r\n"])
-def test_a_token_is_sent_without_the_end_of_its_line(script: Any, token: str) -> None:
+def test_a_token_is_sent_without_the_end_of_its_line(script: ScriptedServer, token: str) -> None:
     script.answers = [ok({"items": [], "next_cursor": None})]
     list(Marey("http://server.test", token, http=httpx.MockTransport(script)).projects())
     assert script.requests[0].headers["Authorization"] == "Bearer marey_secret"
 
 
 @pytest.mark.parametrize("token", ["marey_secret and more", "marey_secret\nmore", "m\u00e4rey_secret", "\x1b", "  "])
-def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script: Any, token: str) -> None:
+def test_what_is_no_token_is_refused_before_it_is_sent_and_shown_nowhere(script: ScriptedServer, token: str) -> None:
     with pytest.raises(errors.BadToken) as refused:
         Marey("http://server.test", token, http=httpx.MockTransport(script))
     assert "secret" not in str(refused.value)
@@ -282,7 +284,7 @@ def test_authorities_of_the_house_are_trusted_beside_the_public_ones(
     assert trusted.check_hostname
 
 
-def test_a_password_is_sent_though_it_hides_itself(script: Any) -> None:
+def test_a_password_is_sent_though_it_hides_itself(script: ScriptedServer) -> None:
     token = {"id": "token_1", "name": "x", "prefix": "p", "scopes": ["read"], "created_at": "2026-01-01T00:00:00Z"}
     script.answers = [ok({**token, "expires_at": None, "secret": "s"})]
     login = Login(name="ada", password="correct horse")

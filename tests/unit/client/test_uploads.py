@@ -8,6 +8,7 @@ from typing import Any
 
 import httpx
 import pytest
+from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client import blobs, errors
 
@@ -17,13 +18,12 @@ DATA = bytes(range(251)) * 100
 class UploadServer:
     """Keeps the bytes of one upload; `faults` are raised instead of answers, after keeping so many bytes of a piece."""
 
-    def __init__(self, make_problem: Callable[..., httpx.Response]) -> None:
+    def __init__(self) -> None:
         self.kept = bytearray()
         self.faults: list[int] = []
         self.sent = 0
         self.announced: dict[str, Any] | None = None
         self.finished = False
-        self.make_problem = make_problem
 
     def __call__(self, request: httpx.Request) -> httpx.Response:
         request.read()
@@ -31,7 +31,7 @@ class UploadServer:
             self.announced = json.loads(request.content)
         if request.method == "PATCH":
             if int(request.headers["Upload-Offset"]) != len(self.kept):
-                return self.make_problem(409, "wrong-offset", context={"offset": len(self.kept)})
+                return problem(409, "wrong-offset", context={"offset": len(self.kept)})
             self.sent += len(request.content)
             keep = self.faults.pop(0) if self.faults else None
             self.kept += request.content[:keep]
@@ -44,14 +44,14 @@ class UploadServer:
 
 
 @pytest.fixture
-def upload_server(make_problem: Callable[..., httpx.Response], monkeypatch: pytest.MonkeyPatch) -> UploadServer:
+def upload_server(monkeypatch: pytest.MonkeyPatch) -> UploadServer:
     monkeypatch.setattr(blobs, "PIECE_BYTES", 4096)
     monkeypatch.setattr(blobs, "RESUMABLE_FROM_BYTES", 1000)
-    return UploadServer(make_problem)
+    return UploadServer()
 
 
 @pytest.fixture
-def send(script: Any, upload_server: UploadServer, tmp_path: Path) -> Callable[[], str]:
+def send(script: ScriptedServer, upload_server: UploadServer, tmp_path: Path) -> Callable[[], str]:
     path = tmp_path / "large.bvh"
     path.write_bytes(DATA)
     script.answers = [upload_server] * 100
@@ -91,7 +91,7 @@ def test_a_connection_that_never_lets_a_piece_through_is_given_up(
     assert upload_server.sent == blobs.TRIES_PER_PIECE * 4096
 
 
-def test_a_file_that_shrinks_is_noticed(script: Any, upload_server: UploadServer, tmp_path: Path) -> None:
+def test_a_file_that_shrinks_is_noticed(script: ScriptedServer, upload_server: UploadServer, tmp_path: Path) -> None:
     path = tmp_path / "large.bvh"
     path.write_bytes(DATA)
 

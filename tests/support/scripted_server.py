@@ -1,0 +1,51 @@
+"""A server inside the process of a client's test: it gives prepared answers and keeps every request."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+
+from marey_client.marey import Marey
+from marey_client.retries import Retries
+
+Answer = httpx.Response | Exception | Callable[[httpx.Request], httpx.Response]
+"""A response, an error to raise, or a function that answers the request."""
+
+
+def problem(
+    status: int, code: str, *, retry_after: int | None = None, detail: str = "the reason", **members: Any
+) -> httpx.Response:
+    """Return a refusal in the form of the server's problem documents, with further members."""
+    document = {
+        "type": "about:blank", "title": "t", "status": status, "detail": detail, "instance": "req-1", "code": code,
+    }  # fmt: skip
+    headers = {"Content-Type": "application/problem+json"}
+    if retry_after is not None:
+        headers["Retry-After"] = str(retry_after)
+    return httpx.Response(status, content=json.dumps({**document, **members}), headers=headers)
+
+
+class ScriptedServer:
+    """Prepared answers, given one after another; the requests, and the waits between them, in order."""
+
+    def __init__(self) -> None:
+        self.answers: list[Answer] = []
+        self.requests: list[httpx.Request] = []
+        self.waited: list[float] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        """Answer a request with the next prepared answer."""
+        request.read()
+        self.requests.append(request)
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer if isinstance(answer, httpx.Response) else answer(request)
+
+    def marey(self, **options: Any) -> Marey:
+        """Return a client of this server that waits without taking time."""
+        retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
+        return Marey(
+            "http://server.test/", "marey_secret", http=httpx.MockTransport(self), **{"retries": retries, **options}
+        )
