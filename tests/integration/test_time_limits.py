@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.support.attached_worker import python_path
 from tests.support.server_process import ServerProcess
 
 from marey_client import Marey
@@ -14,14 +14,11 @@ from marey_client.errors import JobUnsuccessful
 from marey_schemas.access import ProjectCreate
 from marey_schemas.jobs import FailureReason, JobCreate, JobState, Resources
 
-THIRD_PARTY = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
-
 
 @pytest.fixture
 def marey(tmp_path: Path) -> Iterator[Marey]:
     """A server and a worker that know a kind of job that can sleep."""
-    paths = os.pathsep.join(filter(None, [str(THIRD_PARTY), os.environ.get("PYTHONPATH")]))
-    process = ServerProcess(tmp_path, PYTHONPATH=paths)
+    process = ServerProcess(tmp_path, PYTHONPATH=python_path())
     process.start(workers=1)
     with process.client() as client:
         yield client

@@ -3,50 +3,48 @@
 import os
 import signal
 import time
-import uuid
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import psutil
 import pytest
-from psutil import Process
+from tests.support.attached_worker import StartWorker
+from tests.support.fake_server import FakeServer
 
 
 def alive(pid: int) -> bool:
-    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
-def test_a_kind_of_another_distribution_runs_and_its_result_log_and_progress_arrive(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
-    job = server.submit("add", {"a": 2, "b": 3})
-    end = server.ended(job)
+def test_a_kind_of_another_distribution_runs_and_its_result_log_and_progress_arrive(shared_server: FakeServer) -> None:
+    job = shared_server.submit("add", {"a": 2, "b": 3})
+    end = shared_server.ended(job)
     assert end["result"]["sum"] == 5
     assert end["code_version"] == "add@1"
     assert "numpy" in end["environment"]
-    assert b"adding 2 and 3" in server.logs[job]
+    assert b"adding 2 and 3" in shared_server.logs[job]
 
 
-def test_a_child_stays_warm_between_jobs(server: Any, start_worker: Callable[..., Any]) -> None:
-    start_worker()
-    ends = [server.ended(server.submit("add", {"a": 1, "b": n})) for n in range(3)]
+def test_a_child_stays_warm_between_jobs(shared_server: FakeServer) -> None:
+    ends = [shared_server.ended(shared_server.submit("add", {"a": 1, "b": n})) for n in range(3)]
     assert len({end["result"]["pid"] for end in ends}) == 1
 
 
 def test_the_next_job_begins_while_the_end_of_the_last_one_is_reported(
-    server: Any, start_worker: Callable[..., Any]
+    server: FakeServer, start_worker: StartWorker
 ) -> None:
     server.may_complete.clear()
     start_worker("--slots", "1")
     first, second = (server.submit("add", {"a": 1, "b": n}) for n in range(2))
-    server.until(lambda: server.started == [first, second])
+    server.until(lambda: list(server.leased) == [first, second])
     assert not server.completed
     server.may_complete.set()
     assert [server.ended(job)["result"]["sum"] for job in (first, second)] == [1, 2]
 
 
-def test_a_worker_that_stops_reports_what_is_done(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_a_worker_that_stops_reports_what_is_done(server: FakeServer, start_worker: StartWorker) -> None:
     server.may_complete.clear()
     worker = start_worker("--slots", "1")
     job = server.submit("add", {"a": 1, "b": 1})
@@ -58,32 +56,28 @@ def test_a_worker_that_stops_reports_what_is_done(server: Any, start_worker: Cal
 
 
 def test_a_task_knows_its_place_and_the_job_that_gathers_gets_what_the_tasks_returned(
-    server: Any, start_worker: Callable[..., Any]
+    shared_server: FakeServer,
 ) -> None:
-    start_worker("--slots", "1")
-    task = server.submit("tally", {"tasks": 3}, position=2, size=3)
-    result = server.ended(task)["result"]
+    task = shared_server.submit("tally", {"tasks": 3}, position=2, size=3)
+    result = shared_server.ended(task)["result"]
     assert (result["task"], result["threads"]) == ([2, 3], os.cpu_count())
-    server.results["whole"] = [{"task": [n, 3]} for n in range(3)]
-    server.submit("tally", {"tasks": 3}, job="whole", size=3)
-    assert server.ended("whole")["result"] == {"seen": [[0, 3], [1, 3], [2, 3]]}
+    shared_server.results["whole"] = [{"task": [n, 3]} for n in range(3)]
+    shared_server.submit("tally", {"tasks": 3}, job="whole", size=3)
+    assert shared_server.ended("whole")["result"] == {"seen": [[0, 3], [1, 3], [2, 3]]}
 
 
-def test_a_job_that_was_not_spread_over_tasks_is_done_and_gathered_at_once(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
-    assert server.ended(server.submit("tally", {"tasks": 1}))["result"] == {"seen": [[0, 1]]}
+def test_a_job_that_was_not_spread_over_tasks_is_done_and_gathered_at_once(shared_server: FakeServer) -> None:
+    assert shared_server.ended(shared_server.submit("tally", {"tasks": 1}))["result"] == {"seen": [[0, 1]]}
 
 
-def test_the_attempts_own_token_is_used_for_the_attempt(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_the_attempts_own_token_is_used_for_the_attempt(server: FakeServer, start_worker: StartWorker) -> None:
     start_worker()
     job = server.submit("add", {"a": 1, "b": 1})
     server.ended(job)
     assert server.tokens_seen == {"Bearer marey_worker_token", f"Bearer mareyjob_secret_of_{job}"}
 
 
-def test_no_secret_stands_in_arguments_or_environment(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_no_secret_stands_in_arguments_or_environment(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     process = psutil.Process(worker.process.pid)
@@ -104,21 +98,17 @@ def test_no_secret_stands_in_arguments_or_environment(server: Any, start_worker:
     ],
 )
 def test_each_way_to_fail_is_told_apart_and_the_worker_goes_on(
-    server: Any, start_worker: Callable[..., Any], how: str, code: str, retryable: bool, detail: str
+    shared_server: FakeServer, how: str, code: str, retryable: bool, detail: str
 ) -> None:
-    start_worker()
-    failed = server.ended(server.submit("misbehave", {"how": how}, memory_limit_mb=512))
+    failed = shared_server.ended(shared_server.submit("misbehave", {"how": how}, memory_limit_mb=512))
     assert (failed["code"], failed["retryable"], failed["interrupted"]) == (code, retryable, False)
     assert detail in failed["detail"]
-    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+    assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
 
 
-def test_the_same_crash_has_the_same_signature_and_another_has_another(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
+def test_the_same_crash_has_the_same_signature_and_another_has_another(shared_server: FakeServer) -> None:
     signatures = [
-        server.ended(server.submit("misbehave", {"how": how}))["signature"]
+        shared_server.ended(shared_server.submit("misbehave", {"how": how}))["signature"]
         for how in ("raise", "raise", "segfault", "segfault", "exit")
     ]
     assert signatures[0] == signatures[1]
@@ -126,170 +116,144 @@ def test_the_same_crash_has_the_same_signature_and_another_has_another(
     assert len(set(signatures)) == 3
 
 
-def test_a_crash_leaves_its_traceback_in_the_log(server: Any, start_worker: Callable[..., Any]) -> None:
-    start_worker()
-    job = server.submit("misbehave", {"how": "segfault"})
-    server.ended(job)
-    assert b"Segmentation fault" in server.logs[job]
-    assert b"_segfault" in server.logs[job]
+def test_a_crash_leaves_its_traceback_in_the_log(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "segfault"})
+    shared_server.ended(job)
+    assert b"Segmentation fault" in shared_server.logs[job]
+    assert b"_segfault" in shared_server.logs[job]
 
 
-def test_an_exception_is_named_in_the_answer_and_traced_in_the_log(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
-    job = server.submit("misbehave", {"how": "raise"})
-    assert "Traceback" not in server.ended(job)["detail"]
-    assert b"Traceback" in server.logs[job]
+def test_an_exception_is_named_in_the_answer_and_traced_in_the_log(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "raise"})
+    assert "Traceback" not in shared_server.ended(job)["detail"]
+    assert b"Traceback" in shared_server.logs[job]
 
 
 def test_memory_hoarded_by_a_grandchild_is_noticed_and_all_are_killed(
-    server: Any, start_worker: Callable[..., Any]
+    shared_server: FakeServer, tmp_path: Path
 ) -> None:
-    mark = {"MAREY_TEST_HOARDER": str(uuid.uuid4())}
-    start_worker(env=mark)
-    job = server.submit("misbehave", {"how": "hoard"}, memory_limit_mb=1024)
-    server.until(lambda: _hoarders(mark, 500 << 20))
-    failed = server.ended(job)
+    job = shared_server.submit("misbehave", {"how": "hoard", "folder": str(tmp_path)}, memory_limit_mb=1024)
+    failed = shared_server.ended(job)
     assert failed["code"] == "memory-limit"
     assert failed["signature"] == "memory-limit"
-    server.until(lambda: not _hoarders(mark, 500 << 20))
+    hoarder = int((tmp_path / "hoarder").read_text())
+    shared_server.until(lambda: not alive(hoarder))
 
 
-def test_a_copy_that_a_job_made_of_its_process_does_not_answer_for_it(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
-    assert server.ended(server.submit("misbehave", {"how": "fork-and-raise"}))["result"] == {"survived": True}
+def test_a_copy_that_a_job_made_of_its_process_does_not_answer_for_it(shared_server: FakeServer) -> None:
+    assert shared_server.ended(shared_server.submit("misbehave", {"how": "fork-and-raise"}))["result"] == {
+        "survived": True
+    }
 
 
-def _hoarders(mark: dict[str, str], size: int) -> list[Process]:
-    """Processes of this test alone that hold more memory: others on the machine may have children of workers, too."""
-    return [process for process in psutil.process_iter() if _holds_more_than(process, size, mark)]
-
-
-def _holds_more_than(process: Process, size: int, mark: dict[str, str]) -> bool:
-    try:
-        return process.memory_info().rss > size and mark.items() <= process.environ().items()
-    except psutil.Error:
-        return False
-
-
-def test_answers_that_come_too_late_do_not_reach_the_next_job(server: Any, start_worker: Callable[..., Any]) -> None:
-    server.documents["clip_1", 1, "motion"] = {"some": "document"}
-    start_worker()
+def test_answers_that_come_too_late_do_not_reach_the_next_job(shared_server: FakeServer) -> None:
+    shared_server.documents["clip_1", 1, "motion"] = {"some": "document"}
     for _ in range(3):
-        assert server.ended(server.submit("misbehave", {"how": "give-up-early"}))["code"] == "exception"
-        assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+        assert shared_server.ended(shared_server.submit("misbehave", {"how": "give-up-early"}))["code"] == "exception"
+        assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
 
 
-def test_a_job_that_needs_what_was_deleted_fails_for_good_and_says_what_is_missing(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    start_worker()
-    failed = server.ended(server.submit("misbehave", {"how": "miss"}))
+def test_a_job_that_needs_what_was_deleted_fails_for_good_and_says_what_is_missing(shared_server: FakeServer) -> None:
+    failed = shared_server.ended(shared_server.submit("misbehave", {"how": "miss"}))
     assert (failed["code"], failed["retryable"]) == ("no-skeleton", False)
     assert "Traceback" not in failed["detail"]
 
 
-def test_a_job_is_stopped_at_its_time_limit(server: Any, start_worker: Callable[..., Any]) -> None:
-    start_worker()
-    failed = server.ended(server.submit("misbehave", {"how": "sleep", "seconds": 60}, time_limit_s=1))
+def test_a_job_is_stopped_at_its_time_limit(shared_server: FakeServer) -> None:
+    failed = shared_server.ended(shared_server.submit("misbehave", {"how": "sleep", "seconds": 60}, time_limit_s=1))
     assert failed["code"] == "time-limit"
 
 
-def test_a_cancelled_job_is_stopped(server: Any, start_worker: Callable[..., Any]) -> None:
-    server.heartbeat_s = 0.3
-    start_worker()
-    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
-    server.until(lambda: server.heartbeats[job])
-    server.cancelled.add(job)
-    assert server.ended(job)["code"] == "cancelled"
-    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+def test_a_cancelled_job_is_stopped(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "sleep", "seconds": 60}, heartbeat_s=0.3)
+    shared_server.until(lambda: shared_server.heartbeats[job])
+    shared_server.cancelled.add(job)
+    assert shared_server.ended(job)["code"] == "cancelled"
+    assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
 
 
-def test_a_job_whose_lease_was_lost_is_given_up_without_another_word(
-    server: Any, start_worker: Callable[..., Any]
-) -> None:
-    server.heartbeat_s = 0.3
-    start_worker()
-    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
-    server.until(lambda: server.heartbeats[job])
-    server.lost.add(job)
-    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
-    assert job not in server.completed
-    assert job not in server.failed
+def test_a_job_whose_lease_was_lost_is_given_up_without_another_word(shared_server: FakeServer) -> None:
+    job = shared_server.submit("misbehave", {"how": "sleep", "seconds": 60}, heartbeat_s=0.3)
+    shared_server.until(lambda: shared_server.heartbeats[job])
+    shared_server.lost.add(job)
+    assert shared_server.ended(shared_server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+    assert job not in shared_server.completed
+    assert job not in shared_server.failed
 
 
 def test_a_job_goes_on_while_the_server_is_away_and_is_published_when_it_is_back(
-    server: Any, start_worker: Callable[..., Any]
+    shared_server: FakeServer, tmp_path: Path
 ) -> None:
-    server.heartbeat_s, server.ttl_s = 0.2, 0.6
-    start_worker()
-    job = server.submit("misbehave", {"how": "sleep", "seconds": 2})
-    server.until(lambda: server.heartbeats[job])
-    server.silent.add(job)
-    time.sleep(2.5)
-    assert job not in server.completed
-    heard = len(server.heartbeats[job])
-    server.silent.clear()
-    assert server.ended(job)["result"] == {"slept": True}
-    assert len(server.heartbeats[job]) > heard
+    wait = {"how": "wait", "folder": str(tmp_path)}
+    job = shared_server.submit("misbehave", wait, heartbeat_s=0.2, ttl_s=0.6)
+    shared_server.until(lambda: shared_server.heartbeats[job] and (tmp_path / "started").exists())
+    shared_server.silent.add(job)
+    time.sleep(0.6)  # at least as long as the lease, which has to be confirmed afterwards
+    (tmp_path / "go").touch()
+    refused = shared_server.refused[job]
+    shared_server.until(lambda: shared_server.refused[job] > refused)
+    assert job not in shared_server.completed
+    heard = len(shared_server.heartbeats[job])
+    shared_server.silent.clear()
+    assert shared_server.ended(job)["result"] == {"waited": True}
+    assert len(shared_server.heartbeats[job]) > heard
 
 
 def test_on_sigterm_a_running_job_is_given_back_and_the_exit_status_says_so(
-    server: Any, start_worker: Callable[..., Any]
+    server: FakeServer, start_worker: StartWorker, tmp_path: Path
 ) -> None:
     worker = start_worker()
-    job = server.submit("misbehave", {"how": "sleep", "seconds": 60})
-    server.until(lambda: not server.jobs)
-    time.sleep(0.5)
+    job = server.submit("misbehave", {"how": "wait", "folder": str(tmp_path)})
+    server.until((tmp_path / "started").exists)
     assert worker.stop() != 0
     assert server.failed[job]["interrupted"] is True
 
 
-def test_on_sigterm_an_idle_worker_exits_with_success(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_on_sigterm_an_idle_worker_exits_with_success(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     assert worker.stop() == 0
 
 
-def test_a_worker_stops_when_whoever_started_it_has_gone(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_a_worker_stops_when_whoever_started_it_has_gone(server: FakeServer, start_worker: StartWorker) -> None:
     worker = start_worker()
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     worker.process.stdin.close()
     assert worker.process.wait(30) == 0
 
 
-def test_children_do_not_outlive_a_worker_that_was_killed(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_children_do_not_outlive_a_worker_that_was_killed(
+    server: FakeServer, start_worker: StartWorker, tmp_path: Path
+) -> None:
     worker = start_worker()
-    server.submit("misbehave", {"how": "sleep", "seconds": 60})
-    server.until(lambda: not server.jobs)
-    time.sleep(0.5)
+    server.submit("misbehave", {"how": "wait", "folder": str(tmp_path)})
+    server.until((tmp_path / "started").exists)
     children = [child.pid for child in psutil.Process(worker.process.pid).children(recursive=True)]
     assert children
-    os.kill(worker.process.pid, signal.SIGKILL)
+    worker.process.kill()
     worker.process.wait()
-    server.until(lambda: not any(alive(pid) for pid in children), 10)
+    server.until(lambda: not any(alive(pid) for pid in children))
 
 
-def test_slots_run_jobs_at_the_same_time(server: Any, start_worker: Callable[..., Any]) -> None:
+def test_slots_run_jobs_at_the_same_time(server: FakeServer, start_worker: StartWorker, tmp_path: Path) -> None:
     start_worker("--slots", "2")
-    server.ended(server.submit("add", {"a": 1, "b": 1}))
-    jobs = [server.submit("misbehave", {"how": "sleep", "seconds": 1.5}, job=f"both{n}") for n in range(2)]
-    server.until(lambda: not server.jobs, 5)
-    assert not server.completed.keys() & set(jobs)
-    assert all(server.ended(job)["result"] == {"slept": True} for job in jobs)
+    jobs = []
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        jobs.append(server.submit("misbehave", {"how": "wait", "folder": str(tmp_path / name)}))
+    server.until(lambda: all((tmp_path / name / "started").exists() for name in ("one", "other")))
+    for name in ("one", "other"):
+        (tmp_path / name / "go").touch()
+    assert all(server.ended(job)["result"] == {"waited": True} for job in jobs)
 
 
-def test_a_file_that_a_job_made_is_sent_and_named_by_its_digest(server: Any, start_worker: Callable[..., Any]) -> None:
-    start_worker()
-    end = server.ended(server.submit("misbehave", {"how": "put"}))
-    assert server.blobs[end["result"]["digest"]] == b"bytes that a job made"
+def test_a_file_that_a_job_made_is_sent_and_named_by_its_digest(shared_server: FakeServer) -> None:
+    end = shared_server.ended(shared_server.submit("misbehave", {"how": "put"}))
+    assert shared_server.blobs[end["result"]["digest"]] == b"bytes that a job made"
 
 
 @pytest.mark.parametrize("point", ["worker.after_claim", "worker.before_complete", "worker.after_complete"])
-def test_fault_points_kill_the_worker_where_they_say(server: Any, start_worker: Callable[..., Any], point: str) -> None:
+def test_fault_points_kill_the_worker_where_they_say(server: FakeServer, start_worker: StartWorker, point: str) -> None:
     worker = start_worker(env={"MAREY_FAULT": f"{point}:kill"})
     job = server.submit("add", {"a": 1, "b": 1})
     assert worker.process.wait(60) == -signal.SIGKILL

@@ -1,9 +1,8 @@
 """Format of a worker's log."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
+from tests.support.attached_worker import StartWorker
+from tests.support.fake_server import FakeServer
 
 from marey_client.errors import MareyError
 from marey_worker.commands import _form_named, _level_of
@@ -16,7 +15,7 @@ def test_a_worker_without_a_terminal_logs_json_unless_told_otherwise() -> None:
 
 @pytest.mark.parametrize("form", ["json", "text"])
 def test_a_worker_logs_in_the_form_that_its_environment_names(
-    server: Any, start_worker: Callable[..., Any], form: str
+    server: FakeServer, start_worker: StartWorker, form: str
 ) -> None:
     worker = start_worker(env={"MAREY_LOG_FORM": form})
     server.ended(server.submit("add", {"a": 1, "b": 1}))

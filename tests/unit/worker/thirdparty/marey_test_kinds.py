@@ -3,15 +3,16 @@
 import ctypes
 import os
 import resource
-import sys
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.kinds import Kind
 from marey_schemas.worker_protocol import PinnedInput
-from marey_worker.context import JobRefused
+from marey_worker.context import Context, JobRefused
 
 
 class AddParams(Request):
@@ -22,19 +23,21 @@ class AddParams(Request):
 class MisbehaveParams(Request):
     how: str
     seconds: float = 0.0
+    folder: str = ""
 
 
-def add(context: Any, params: Any) -> Any:
+def add(context: Context, params: AddParams) -> dict[str, int]:
     context.log(f"adding {params.a} and {params.b}")
     context.progress(1, 2, "half way")
     return {"sum": params.a + params.b, "pid": os.getpid()}
 
 
-def misbehave(context: Any, params: Any) -> Any:
+def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
     return {
-        "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat, "hoard": _hoard,
+        "raise": _raise, "refuse": _refuse, "segfault": _segfault, "exit": _exit, "eat": _eat,
+        "hoard": lambda: _hoard(Path(params.folder)), "wait": lambda: _wait(Path(params.folder)),
         "fork-and-raise": _fork_and_raise,
-        "sleep": lambda: _sleep(params.seconds), "shout": _shout, "ignore-term": lambda: _ignore_term(params.seconds),
+        "sleep": lambda: _sleep(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
     }[params.how]()  # fmt: skip
@@ -56,13 +59,14 @@ def _exit() -> None:
     os._exit(7)
 
 
-def _eat() -> Any:
+def _eat() -> dict[str, int]:
     return {"bytes": len(bytearray(8 << 30))}
 
 
-def _hoard() -> None:
-    """Memory in small helpings, which no single allocation gives away; in a process of its own that lifts its limit."""
+def _hoard(folder: Path) -> None:
+    """Take memory in small pieces, in a process of its own that lifts its limit; name that process in a file."""
     if os.fork() == 0:
+        (folder / "hoarder").write_text(str(os.getpid()))
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         hoard = []
         while True:
@@ -71,33 +75,28 @@ def _hoard() -> None:
     time.sleep(60)
 
 
-def _fork_and_raise() -> Any:
-    """The copy of this process gets as far as its end, and must not be taken for the job."""
+def _wait(folder: Path) -> dict[str, bool]:
+    """Make the file `started`, and wait until somebody makes the file `go`."""
+    (folder / "started").touch()
+    while not (folder / "go").exists():
+        time.sleep(0.01)
+    return {"waited": True}
+
+
+def _fork_and_raise() -> dict[str, bool]:
+    """Let a copy of this process fail, which must not be taken for the job."""
     if os.fork() == 0:
         raise ArithmeticError("raised in a copy")
     time.sleep(1)
     return {"survived": True}
 
 
-def _sleep(seconds: Any) -> Any:
+def _sleep(seconds: float) -> dict[str, bool]:
     time.sleep(seconds)
     return {"slept": True}
 
 
-def _ignore_term(seconds: Any) -> Any:
-    import signal
-
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    return _sleep(seconds)
-
-
-def _shout() -> Any:
-    print("said on standard output")
-    print("said on standard error", file=sys.stderr)
-    return {}
-
-
-def _give_up_early(context: Any) -> None:
+def _give_up_early(context: Context) -> None:
     """Fail while answers are still on their way."""
     pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
     reading = context.documents([pin] * 20, "motion")
@@ -105,7 +104,7 @@ def _give_up_early(context: Any) -> None:
     raise ArithmeticError("enough")
 
 
-def _put(context: Any) -> Any:
+def _put(context: Context) -> dict[str, str]:
     path = context.scratch / "result.bin"
     path.write_bytes(b"bytes that a job made")
     return {"digest": context.put_file(path)}
@@ -115,11 +114,11 @@ class TallyParams(Request):
     tasks: int
 
 
-def tally(context: Any, params: Any) -> Any:
+def tally(context: Context, params: TallyParams) -> dict[str, Any]:
     return {"task": list(context.task), "threads": context.threads}
 
 
-def gather_tally(context: Any, params: Any, results: Any) -> Any:
+def gather_tally(context: Context, params: TallyParams, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"seen": [result["task"] for result in results]}
 
 
