@@ -36,6 +36,7 @@ from marey_server.http.routes import RouteTable
 from marey_server.launchers.local import local_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.process.computing import compute_on_one_thread_each, keep_freed_memory
+from marey_server.process.data_folder import prepare_data_folder
 from marey_server.process.housekeeping import keeping_house
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
@@ -164,8 +165,8 @@ def open_database(settings: Settings) -> Database:
 
     Raises `DatabaseUnusable`.
     """
-    settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     with opening(settings.resolved_database_url):
+        prepare_data_folder(settings)
         upgrade_schema(settings.resolved_database_url)
         database = connect_database(settings)
         database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)

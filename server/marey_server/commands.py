@@ -69,11 +69,12 @@ def read_settings(**given: Any) -> Settings:
 
 def upgrade(**settings: Any) -> None:
     """Upgrade the tables to the schema of this version."""
+    from marey_server.process.data_folder import prepare_data_folder
     from marey_server.store.database.schema import upgrade_schema
 
     chosen = read_settings(**settings)
-    chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     with _database_of(chosen) as url:
+        prepare_data_folder(chosen)
         upgrade_schema(url)
     _say("the database's schema is up to date")
 
@@ -165,12 +166,11 @@ def _database_of(settings: Settings) -> Iterator[str]:
 
 
 def _sqlite_file(settings: Settings, *, must_exist: bool) -> Path:
-    from sqlalchemy import make_url
+    from marey_server.store.database.opening import sqlite_file
 
-    url = make_url(settings.resolved_database_url)
-    if url.get_backend_name() != "sqlite" or not url.database:
+    file = sqlite_file(settings.resolved_database_url)
+    if file is None:
         raise CommandFailed("this works on SQLite files; use pg_dump and pg_restore for Postgres")
-    file = Path(url.database)
     if must_exist and not file.is_file():
         raise CommandFailed(f"there is no database {file}; say where with --data")
     return file

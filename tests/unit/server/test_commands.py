@@ -19,6 +19,10 @@ from marey_server.store.database.opening import DatabaseUnusable
 from marey_server.store.transaction import Transaction
 
 
+def upgrade_in(folder: Path) -> None:
+    commands.upgrade(data=folder)
+
+
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """A data folder with a database that its server left."""
@@ -169,3 +173,22 @@ def test_the_server_runs_on_asyncio_where_uvloop_is_not_installed(monkeypatch: p
 
     assert isinstance(loop, asyncio.SelectorEventLoop)
     loop.close()
+
+
+@pytest.mark.parametrize("start", [lambda folder: open_database(Settings(data=folder)).close(), upgrade_in])
+def test_other_users_may_not_look_into_a_data_folder_whatever_its_rights_were(
+    start: Callable[[Path], None], tmp_path: Path
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir(mode=0o755)
+    folder.chmod(0o755)
+    (folder / "marey.toml").write_text("")
+    (folder / "marey.toml").chmod(0o644)
+    start(folder)
+    with closing(sqlite3.connect(folder / "marey.db")) as server:
+        server.execute("PRAGMA journal_mode=WAL")
+        server.execute("UPDATE user SET name = name")
+        modes = {path.name: path.stat().st_mode & 0o777 for path in folder.iterdir()}
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert {"marey.db", "marey.db-wal", "marey.db-shm", "marey.toml"} <= modes.keys()
+    assert set(modes.values()) == {0o600}

@@ -1,9 +1,10 @@
-"""Errors of a database that cannot be opened, described for the person who starts the server."""
+"""Place of a database, and errors of one that cannot be opened, described for the person who starts the server."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from alembic.util import CommandError
 from sqlalchemy import exc, make_url
@@ -35,6 +36,12 @@ def opening(url: str) -> Iterator[None]:
         raise DatabaseUnusable(
             f"the tables of the database {_shown(url)} belong to another, perhaps newer, version of Marey: {error}"
         ) from error
+
+
+def sqlite_file(url: str) -> Path | None:
+    """Return the file of an SQLite database, or None for other databases."""
+    parsed = make_url(url)
+    return Path(parsed.database) if parsed.get_backend_name() == "sqlite" and parsed.database else None
 
 
 def _shown(url: str) -> str:

@@ -1,0 +1,100 @@
+"""Bodies of callers who may not send them: refused before any of their bytes is decoded."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import msgpack
+import numpy as np
+import pytest
+from tests.support.rest_server import Server
+
+from marey_schemas.access import Role
+from marey_schemas.encoding import blocks
+from marey_schemas.encoding.codecs import FREE_ARRAY_BYTES
+from marey_server.http.validation import decode_body
+
+INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
+CLIPS = "/projects/lab/clips"
+MSGPACK = {"Content-Type": "application/msgpack"}
+
+
+def packed(array: np.ndarray[Any, Any]) -> bytes:
+    """Return a document whose one array is sent in blocks."""
+    leaf = {"dtype": array.dtype.str, "shape": list(array.shape), "encoding": "blocks", "data": blocks.encode(array)}
+    return msgpack.packb({"name": "walk", "parts": {"motion": {"poses": leaf}}})
+
+
+def in_chunks(body: bytes) -> Iterator[bytes]:
+    """Yield a body without its length, as a chunked request sends it."""
+    yield body
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the bodies that the server decodes."""
+    sizes: list[int] = []
+
+    def note(data: bytes, media_type: str, *, max_array_bytes: int) -> Any:
+        sizes.append(len(data))
+        return decode_body(data, media_type, max_array_bytes=max_array_bytes)
+
+    monkeypatch.setattr("marey_server.http.resource.decode_body", note)
+    return sizes
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+@pytest.mark.parametrize(
+    ("body", "media_type"),
+    [
+        (packed(np.zeros((10_000, 700), np.float32)), "application/msgpack"),
+        (b"[" + b"[]," * 300_000 + b"[]]", "application/json"),
+        (b"not a document", "application/bson"),
+    ],
+    ids=["blocks", "json", "bson"],
+)
+def test_nothing_is_decoded_for_an_invented_token(
+    server: Server, decoded: list[int], body: bytes, media_type: str, *, chunked: bool
+) -> None:
+    server.make_project()
+    content = in_chunks(body) if chunked else body
+    answer = server.client(INVENTED).post(CLIPS, content=content, headers={"Content-Type": media_type})
+    assert (answer.status_code, answer.json()["code"], decoded) == (401, "bad-token", [])
+
+
+@pytest.mark.parametrize(("role", "status"), [(None, 404), (Role.READER, 403)])
+def test_nothing_is_decoded_for_users_who_may_not_write_in_the_project(
+    server: Server, decoded: list[int], role: Role | None, status: int
+) -> None:
+    server.make_project()
+    token = server.make_user("rita")
+    if role is not None:
+        server.make_project("lab2", owner="otto", rita=role)
+    place = CLIPS if role is None else "/projects/lab2/clips"
+    answer = server.client(token).post(place, content=b"{", headers={"Content-Type": "application/json"})
+    assert (answer.status_code, decoded) == (status, [])
+
+
+def test_nothing_is_decoded_for_guests_who_ask_a_long_question(server: Server, decoded: list[int]) -> None:
+    server.make_project()
+    answer = server.client().post("/projects/lab/parts", content=b"{")
+    assert (answer.status_code, decoded) == (404, [])
+
+
+def test_a_sign_in_is_short(server: Server, decoded: list[int]) -> None:
+    answer = server.client().post("/login", json={"name": "olga", "password": "x" * 5000})
+    assert (answer.status_code, decoded) == (413, [])
+
+
+def test_a_small_body_unpacks_to_sixteen_megabytes_at_most(owner: httpx.Client) -> None:
+    fits, exceeds = (np.zeros((FREE_ARRAY_BYTES // 4 + more, 1), np.float32) for more in (0, 1))
+    codes = [owner.post(CLIPS, content=packed(array), headers=MSGPACK).json()["code"] for array in (fits, exceeds)]
+    assert codes == ["invalid", "too-large"]
+
+
+def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_a_while(server: Server) -> None:
+    client = server.client(server.make_project())
+    assert client.post("/projects/lab/collections", json={"path": "before"}).status_code == 201
+    assert client.post("/logout").status_code == 204
+    answer = client.post("/projects/lab/collections", json={"path": "after"})
+    assert (answer.status_code, answer.json()["code"]) == (401, "bad-token")
