@@ -25,6 +25,18 @@ JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", 
 MAX_BYTES = 1 << 28
 MAX_DEPTH = 64
 MAX_LIST = 1 << 20
+MAX_VALUES = 1 << 20
+"""Greatest number of values in a document that is decoded; the elements of arrays do not count."""
+FREE_LISTS = 1 << 17
+"""Number of objects and lists that a document of any size may contain; larger documents may contain more."""
+BYTES_PER_LIST = 12
+"""Least size in bytes of an object or a list, on average: one takes 70 bytes of memory, and three in JSON."""
+FREE_ARRAY_BYTES = 1 << 24
+"""Bytes of arrays that a document of any size may unpack to."""
+UNPACKING = 2048
+"""Greatest ratio of the unpacked arrays of a larger document to its own bytes."""
+BSON_COPIES = 8
+"""Greatest ratio of the bytes that reading BSON copies, once for each level, to those of the document."""
 
 ArrayForm = Literal["plain", "blocks"]
 
@@ -75,15 +87,33 @@ def _write_bson(plain: Any) -> bytes:
         raise CodecError("too-large", "", f"a BSON document is smaller than 2 GiB: {error}") from error
 
 
-def decode_tree(data: bytes, media_type: str, *, max_bytes: int = MAX_BYTES, max_depth: int = MAX_DEPTH) -> Any:
+def unpacked_limit(size_bytes: int) -> int:
+    """Return the number of bytes to which the arrays of a document from an untrusted sender may unpack."""
+    return max(FREE_ARRAY_BYTES, UNPACKING * size_bytes)
+
+
+def decode_tree(
+    data: bytes,
+    media_type: str,
+    *,
+    max_bytes: int = MAX_BYTES,
+    max_depth: int = MAX_DEPTH,
+    max_array_bytes: int | None = None,
+) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
-    `max_bytes` limits the bytes of the input and, separately, the bytes of all arrays together. Raises `CodecError`.
+    `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without it, they
+    have the same limit as the input. The number of values is limited, too. Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
         raise CodecError("too-large", "", f"{len(data)} bytes; at most {max_bytes} are read")
-    walk = _Walk(max_depth, array_bytes=max_bytes)
+    walk = _Walk(
+        max_depth,
+        array_bytes=max_bytes if max_array_bytes is None else min(max_bytes, max_array_bytes),
+        max_values=MAX_VALUES,
+        max_copied=BSON_COPIES * max(len(data), MAX_LIST),
+    )
     try:
         return walk.visit(_PARSERS[media_type](data))
     except CodecError:
@@ -117,12 +147,40 @@ def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
 
 
 def _parse_json(data: bytes) -> Any:
+    if data.count(b"[") + data.count(b"{") > _most_lists(data):
+        raise _too_many_lists(data)
     return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
 
 
 def _parse_msgpack(data: bytes) -> Any:
+    left = _most_lists(data)
+
+    def count() -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise _too_many_lists(data)
+
+    def on_list(items: list[Any]) -> list[Any]:
+        count()
+        return items
+
+    def on_object(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+        count()
+        return _unique(pairs)
+
     # The parser allocates what a header claims before it reads on, so claims are limited.
-    return msgpack.unpackb(data, object_pairs_hook=_unique, max_array_len=MAX_LIST, max_map_len=MAX_LIST)
+    return msgpack.unpackb(
+        data, object_pairs_hook=on_object, list_hook=on_list, max_array_len=MAX_LIST, max_map_len=MAX_LIST
+    )
+
+
+def _most_lists(data: bytes) -> int:
+    return max(FREE_LISTS, len(data) // BYTES_PER_LIST)
+
+
+def _too_many_lists(data: bytes) -> CodecError:
+    return CodecError("too-large", "", f"{len(data)} bytes may contain at most {_most_lists(data)} objects and lists")
 
 
 def _parse_bson(data: bytes) -> Any:
@@ -163,10 +221,14 @@ class _Walk:
         *,
         on_array: Callable[[Any], dict[str, Any]] | None = None,
         array_bytes: int = 0,
+        max_values: int | None = None,
+        max_copied: int = 0,
     ) -> None:
         self._max_depth = max_depth
         self._on_array = on_array
         self._array_bytes = array_bytes
+        self._values_left = math.inf if max_values is None else max_values
+        self._copies_left = max_copied
         self._path: list[str | int] = []
 
     @property
@@ -197,7 +259,13 @@ class _Walk:
         raise self._error("bad-type", f"a value of type {type(value).__name__} cannot be encoded")
 
     def _object(self, value: Mapping[Any, Any]) -> Any:
-        self._enter()
+        if isinstance(value, RawBSONDocument):
+            self._copies_left -= len(value.raw)
+            if self._copies_left < 0:
+                raise self._error(
+                    "too-deep", "the nested objects of a BSON document take too many bytes; use MessagePack"
+                )
+        self._enter(len(value))
         keys = [self._key(key) for key in value]
         if LEAF_KEYS.issubset(keys):
             if self._on_array is not None:
@@ -211,9 +279,9 @@ class _Walk:
         return members
 
     def _list(self, value: list[Any] | tuple[Any, ...]) -> list[Any]:
-        self._enter()
         if len(value) > MAX_LIST:
             raise self._error("too-large", f"a list of {len(value)}; above {MAX_LIST} numbers must be sent as an array")
+        self._enter(len(value))
         items = []
         for index, item in enumerate(value):
             self._path.append(index)
@@ -256,9 +324,12 @@ class _Walk:
             raise self._error("not-finite", f"{number} cannot be encoded; only finite numbers can")
         return float(number)
 
-    def _enter(self) -> None:
+    def _enter(self, values: int) -> None:
         if len(self._path) >= self._max_depth:
             raise self._error("too-deep", f"nested deeper than {self._max_depth} levels")
+        self._values_left -= values
+        if self._values_left < 0:
+            raise self._error("too-large", f"more than {MAX_VALUES} values; numbers can be sent as arrays")
 
     def _error(self, code: str, detail: str) -> CodecError:
         return CodecError(code, self.pointer, detail)

@@ -8,12 +8,15 @@ from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, 
 from marey_server.access import passwords
 from marey_server.access.principal import Principal
 from marey_server.errors import ForbiddenProblem
-from marey_server.http.declarations import Access, reads, writes
+from marey_server.http.declarations import KIB, Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import tokens, users
 from marey_server.store.transaction import Transaction
+
+MAX_LOGIN_BYTES = 4 * KIB
+"""Greatest size of the body of a sign-in, the only one that a caller without a token may send."""
 
 
 def read_me(tx: Transaction) -> Me:
@@ -55,7 +58,13 @@ class LoginResource(Resource):
     path = "/login"
     tag = "Access"
 
-    @writes(access=Access.ANYONE, scope=None, body=Login, answer=NewToken, also=((429, None),))
+    @writes(
+        access=Access.ANYONE,
+        scope=None,
+        body=RequestBody(Login, max_bytes=MAX_LOGIN_BYTES),
+        answer=NewToken,
+        also=((429, None),),
+    )
     async def post(self, body: Login) -> Reply:
         """Sign in with name and password; the answer contains a new token, shown only once."""
         self.services.limit_sign_in(body.name, self.request.remote_ip or "")

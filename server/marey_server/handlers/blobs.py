@@ -5,7 +5,6 @@ from __future__ import annotations
 from marey_schemas.items import BlobsMissing, BlobsQuery
 from marey_schemas.names import is_digest
 from marey_server.errors import NotFoundProblem
-from marey_server.http.calls import only_identify
 from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
 from marey_server.http.receiving import Receiver
 from marey_server.http.reply import Rendered, Reply
@@ -31,9 +30,8 @@ class Blob(BlobSender):
     tag = "Blobs"
 
     async def begin(self, digest: str) -> None:
-        """Check the credential before the bytes are received."""
+        """Check the digest before the bytes are received."""
         require_digest(digest)
-        await self.look_up(only_identify)
         self.receiver = Receiver(self.services)
 
     async def receive(self, chunk: bytes) -> None:

@@ -46,9 +46,8 @@ class ProjectImports(Resource):
     path = "/projects/{project}/imports"
     tag = "ProjectImports"
 
-    async def begin(self, project: str) -> None:
-        """Check that the caller may import before the files are received."""
-        await self.look_up(importing.require_importer, project)
+    async def begin(self, **_path: str) -> None:
+        """Look at the type of the body before the files are received."""
         content_type = self.request.headers.get("Content-Type", "")
         self.fields: dict[str, bytearray] = {}
         self.files: list[SourceFile] = []
@@ -130,7 +129,7 @@ class ProjectImports(Resource):
         return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
 
     async def _read_request(self) -> ImportRequest:
-        tree = decode_body(bytes(self.body), body_type(self.request.headers.get("Content-Type")))
+        tree = decode_body(bytes(self.body), body_type(self.request.headers.get("Content-Type")), max_array_bytes=0)
         return validate_body(ImportRequest, tree)
 
     async def _submit(self, project: str, options: ImportOptions) -> Reply:

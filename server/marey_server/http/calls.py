@@ -11,6 +11,7 @@ from typing import Any
 
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
+from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, AnswerForm, Rendered, Reply, render
@@ -37,6 +38,16 @@ class Caller:
         require_access(self.operation, self.principal)
         tx.principal = self.principal
         tx.required_role = self.operation.required_role
+
+
+Admission = tuple[str, Access, str | None, bool, str | None]
+"""Hash of a token, the access that an operation declares, its scope, whether guests are accepted, and a project."""
+
+
+def admission_of(caller: Caller, project: str | None) -> Admission:
+    """Return what the admission of a caller's body depends on: `project` is the one whose role is required, if any."""
+    operation = caller.operation
+    return hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, project
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
@@ -97,8 +108,10 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
     return rendered
 
 
-def only_identify(tx: Transaction) -> None:
-    """Do nothing; run by `run_plain` to resolve the credential only."""
+def admit(tx: Transaction, project: str | None) -> None:
+    """Refuse a caller without the declared role in `project`; `run_plain` has checked the credential before."""
+    if project is not None:
+        projects.require(tx, project)
 
 
 def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import re
+import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
@@ -29,11 +30,12 @@ from urllib.parse import urlencode
 from pydantic import BaseModel
 from tornado.web import stream_request_body
 
+from marey_schemas.encoding.codecs import JSON, unpacked_limit
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.errors import ApiProblem, BadRequestProblem, TooLargeProblem
 from marey_server.http import negotiation
-from marey_server.http.calls import Call, Caller, only_identify, require_access, run_call, run_plain
-from marey_server.http.declarations import Bytes, Declared, Document, Operation
+from marey_server.http.calls import Call, Caller, admission_of, admit, require_access, run_call, run_plain
+from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
@@ -43,10 +45,10 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 
-INLINE_BYTES = 32 * 1024
-"""Greatest size of bodies and answers that are converted on the event loop; larger ones are converted in a thread."""
-EARLY_CHECK_BYTES = 1024 * 1024
-"""Greatest size of a body that is received before the credential is checked."""
+INLINE_BYTES = 4 * 1024
+"""Greatest size of JSON bodies that are decoded on the event loop; larger ones, and other forms, in a thread."""
+ADMISSION_S = 5.0
+"""Time in seconds for which a caller who was admitted may send further bodies without another look at the database."""
 _METHODS = ("get", "post", "put", "patch", "delete")
 _KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
@@ -181,13 +183,27 @@ class Resource(Exchange):
         try:
             self._check_head()
             body = self.operation.body
+            if body is not None and (body.streamed or self.expects_body()):
+                await self._admit()
             if body is not None and body.streamed:
                 self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 await self.begin(**self.path_variables)
-            elif self.declared_length() > EARLY_CHECK_BYTES:
-                await self.look_up(only_identify)
         except ApiProblem as error:
             await self.refuse(error)
+
+    async def _admit(self) -> None:
+        """Refuse callers who may not send the body, so that nothing of it is received or decoded for them.
+
+        The transaction of the request decides again; here, a decision may be `ADMISSION_S` old.
+        """
+        project = self.path_kwargs.get("project") if self.operation.access.role is not None else None
+        if self.caller.token is None and project is None:
+            return  # the head showed that anyone may do this
+        admission, now = admission_of(self.caller, project), time.monotonic()
+        admitted = self.services.admitted.get(admission)
+        if admitted is None or now - admitted > ADMISSION_S:
+            await self.look_up(admit, project)
+            self.services.admitted.put(admission, now)
 
     def _check_head(self) -> None:
         method = "GET" if self.request.method == "HEAD" else self.request.method
@@ -285,8 +301,12 @@ class Resource(Exchange):
             if body.required:
                 raise BadRequestProblem("A body is needed.", code="body-missing")
             return None
-        read = partial(_decode, data, self.body_type, body.content)
-        return read() if len(data) <= INLINE_BYTES else await self.compute(read)
+        # Workers compute: their results may be still motion of any length, which takes next to no bytes.
+        is_result = self.operation.access is Access.ATTEMPT
+        max_array_bytes = body.max_bytes if is_result else min(body.max_bytes, unpacked_limit(len(data)))
+        read = partial(_decode, data, self.body_type, body.content, max_array_bytes)
+        inline = len(data) <= INLINE_BYTES and self.body_type == JSON  # a few bytes of blocks unpack to megabytes
+        return read() if inline else await self.compute(read)
 
     # -- idempotency --------------------------------------------------------------------------------------------------
 
@@ -307,6 +327,6 @@ class Resource(Exchange):
         return f"sha256:{digest.hexdigest()}"
 
 
-def _decode(data: bytes, media_type: str, content: Any) -> Any:
-    tree = decode_body(data, media_type)
+def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int) -> Any:
+    tree = decode_body(data, media_type, max_array_bytes=max_array_bytes)
     return tree if content is Document else validate_body(content, tree)

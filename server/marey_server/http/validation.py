@@ -55,13 +55,13 @@ def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     return BadRequestProblem(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
 
 
-def decode_body(data: bytes, media_type: str) -> Any:
-    """Return the tree in a body.
+def decode_body(data: bytes, media_type: str, *, max_array_bytes: int) -> Any:
+    """Return the tree in a body, whose arrays may have `max_array_bytes`.
 
     Raises `BadRequestProblem` if it cannot be decoded, and `InvalidProblem` if it contains values that are not allowed.
     """
     try:
-        return codecs.decode_tree(data, media_type)
+        return codecs.decode_tree(data, media_type, max_array_bytes=max_array_bytes)
     except codecs.CodecError as error:
         fault = FieldError(pointer=error.pointer, code=error.code, detail=error.detail)
         if error.code == "too-large":

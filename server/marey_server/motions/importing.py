@@ -61,11 +61,6 @@ class PreparedImport:
     entry: ImportEntry | None = None
 
 
-def require_importer(tx: Transaction, project: str) -> None:
-    """Check that the caller may import into the project, before the files are received."""
-    projects.require(tx, project)
-
-
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
     """Read the skeleton named in the options of an import. Raises `NotFoundProblem`."""
     from marey_motion.importing.items import GivenSkeleton

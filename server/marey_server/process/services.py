@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +34,7 @@ ANSWER_ENTRY_BYTES = 512
 MODEL_CACHE_BYTES = 64 << 20
 """Greatest size of the cache of parsed models; models with search trees have a cache of the same size."""
 TOKENS_REMEMBERED = 10_000
+ADMISSIONS_REMEMBERED = 10_000
 
 
 class TryLimit:
@@ -85,6 +86,8 @@ class Services:
         self.searchables: LruCache[SearchableKey, Searchable] = LruCache(
             max_bytes=MODEL_CACHE_BYTES, size_of=searchable_bytes
         )
+        self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)
+        """Times at which callers were admitted, by what the admission depends on."""
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))

@@ -12,13 +12,19 @@ from bson import Binary, Code, Decimal128, Int64, ObjectId, Regex
 from marey_schemas.encoding import blocks, codecs
 from marey_schemas.encoding.codecs import (
     BSON,
+    BSON_COPIES,
+    FREE_ARRAY_BYTES,
+    FREE_LISTS,
     JSON,
     MAX_LIST,
+    MAX_VALUES,
     MEDIA_TYPES,
     MSGPACK,
+    UNPACKING,
     CodecError,
     decode_tree,
     encode_tree,
+    unpacked_limit,
 )
 
 
@@ -193,3 +199,39 @@ def test_an_error_reads_as_a_place_and_a_reason() -> None:
         encode_tree({"a": [1, float("nan")]}, JSON)
     assert str(caught.value) == "/a/1: nan cannot be encoded; only finite numbers can"
     assert codecs.CodecError("bad-syntax", "", "no").args == ("bad-syntax", "", "no")
+
+
+def test_a_document_of_any_size_may_contain_some_lists_and_a_large_one_more() -> None:
+    fits: list[Any] = [[]] * (FREE_LISTS - 1)
+    for media_type in (JSON, MSGPACK):
+        assert len(decode_tree(encode_tree(fits, media_type), media_type)) == len(fits)
+        assert refusal(encode_tree([*fits, []], media_type), media_type).code == "too-large"
+    long = [["twelve bytes"]] * (FREE_LISTS + 1)
+    for media_type in (JSON, MSGPACK):
+        assert len(decode_tree(encode_tree(long, media_type), media_type)) == len(long)
+
+
+def test_values_are_limited_beyond_the_length_of_each_list() -> None:
+    half = [0] * (MAX_VALUES // 2)
+    assert refusal(encode_tree([half, half], MSGPACK), MSGPACK).pointer == "/1"
+    assert len(decode_tree(encode_tree([half, half[:-2]], MSGPACK), MSGPACK)) == 2
+
+
+def test_bson_whose_levels_would_be_copied_again_and_again_is_refused() -> None:
+    tree: dict[str, Any] = {"text": "x" * MAX_LIST}
+    for _ in range(BSON_COPIES - 2):
+        tree = {"a": tree}
+    data = bson.encode(tree)
+    assert decode_tree(data, BSON) == tree
+    deeper = bson.encode({"a": {"a": {"a": tree}}})
+    assert refusal(deeper, BSON).code == "too-deep"
+    assert decode_tree(encode_tree({"a": {"a": {"a": tree}}}, MSGPACK), MSGPACK) == {"a": {"a": {"a": tree}}}
+
+
+def test_arrays_of_untrusted_documents_unpack_in_proportion_to_their_bytes() -> None:
+    assert unpacked_limit(0) == unpacked_limit(8192) == FREE_ARRAY_BYTES
+    assert unpacked_limit(1 << 20) == UNPACKING << 20
+    data = encode_tree({"a": np.zeros((1000, 100), np.float32)}, MSGPACK, arrays="blocks")
+    assert decode_tree(data, MSGPACK, max_array_bytes=400_000)["a"].shape == (1000, 100)
+    with pytest.raises(CodecError, match="/a: "):
+        decode_tree(data, MSGPACK, max_array_bytes=399_999)

@@ -56,11 +56,11 @@ def test_where_nothing_can_be_asked_every_parameter_is_unknown() -> None:
 
 def test_a_body_that_is_no_document_is_a_bad_request_and_one_that_may_not_travel_is_invalid() -> None:
     with pytest.raises(BadRequestProblem):
-        decode_body(b"{", "application/json")
+        decode_body(b"{", "application/json", max_array_bytes=0)
     with pytest.raises(BadRequestProblem):
-        decode_body(b"\xff", "application/bson")
+        decode_body(b"\xff", "application/bson", max_array_bytes=0)
     with pytest.raises((BadRequestProblem, InvalidProblem)):
-        decode_body(b'{"a": NaN}', "application/json")
+        decode_body(b'{"a": NaN}', "application/json", max_array_bytes=0)
 
 
 def test_a_whole_number_is_an_integer_however_it_is_spelt() -> None:
