@@ -4,6 +4,7 @@ import errno
 import gzip
 import hashlib
 import json
+import logging
 import socket
 import time
 from asyncio import Future
@@ -23,6 +24,7 @@ from marey_schemas.encoding.codecs import MEDIA_TYPES, decode_tree
 from marey_server.http import reply
 from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.negotiation import MediaType
+from marey_server.process.observe import without_received_text
 from marey_server.store.blobs import Spool
 
 JOINTS = ("hips", "knee", "foot")
@@ -539,3 +541,31 @@ def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Serve
     done = owner.patch(path, content=data[offset:], headers={"Upload-Offset": str(offset)}).json()
     assert done["offset"] == len(data)
     assert owner.get(f"/blobs/{done['digest']}").content == data
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Authorization: Bearer marey_secret\r",  # a token read from a file with DOS line ends
+        "Authorization: Bearer marey_\x01secret",
+        "Bearer marey_secret: x",
+        "Content-Length: marey_secret",
+        "Transfer-Encoding: marey_secret",
+        "Host: marey_secret x",
+    ],
+)
+def test_no_text_of_a_malformed_request_is_logged(
+    server: Server, header: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    general = logging.getLogger("tornado.general")
+    general.addFilter(without_received_text)
+    address = urlsplit(server.address)
+    try:
+        with caplog.at_level("INFO"), socket.create_connection((address.hostname, address.port), timeout=60) as sent:
+            sent.sendall(f"GET /api/v1/me HTTP/1.1\r\nHost: x\r\n{header}\r\n\r\n".encode())
+            while sent.recv(1024):  # to the end of the connection, which the server closes after it has logged
+                pass
+    finally:
+        general.removeFilter(without_received_text)
+    assert "Malformed HTTP message from 127.0.0.1" in caplog.text
+    assert "secret" not in caplog.text

@@ -16,6 +16,17 @@ from marey_schemas.log_lines import LogForm, log_to_standard_error
 
 _SANE_ID = re.compile(r"[A-Za-z0-9._:-]{8,128}")
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)
+_MALFORMED = (
+    "Invalid Host header",
+    "Invalid header name",
+    "Invalid header value",
+    "Malformed HTTP request line",
+    "Only integer Content-Length is allowed",
+    "Unsupported Transfer-Encoding",
+    "header line cannot start with whitespace",
+    "no colon in header line",
+)
+"""Beginnings of Tornado's messages about malformed requests; the rest may quote what was received."""
 
 access_log = logging.getLogger("marey_server.access_log")
 
@@ -29,7 +40,19 @@ def configure_logging(form: LogForm, level: str) -> None:
     """Send every log record of the process to standard error, in one form."""
     log_to_standard_error(form, level)
     logging.getLogger("tornado.access").setLevel("ERROR")  # requests are logged by log_request
+    logging.getLogger("tornado.general").addFilter(without_received_text)
     logging.getLogger("alembic.runtime.migration").addFilter(_tells_of_an_upgrade)
+
+
+def without_received_text(record: logging.LogRecord) -> bool:
+    """Remove what a client sent from Tornado's messages about malformed requests: a header may contain a token."""
+    if isinstance(record.args, tuple):
+        record.args = tuple(_kind_of_fault(arg) if isinstance(arg, Exception) else arg for arg in record.args)
+    return True
+
+
+def _kind_of_fault(error: Exception) -> str:
+    return next((known for known in _MALFORMED if str(error).startswith(known)), "the request is malformed")
 
 
 def _tells_of_an_upgrade(record: logging.LogRecord) -> bool:
