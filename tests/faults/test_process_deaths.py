@@ -135,10 +135,13 @@ def test_a_server_killed_among_200_uploads_keeps_what_it_acknowledged(
     server: ServerProcess, takes: list[LocalFile]
 ) -> None:
     acknowledged: dict[str, str] = {}
+    killed = threading.Event()
 
     def upload_until_the_server_dies() -> None:
         with server.client(patient=False) as marey:
             for take in takes:
+                if take is takes[-1]:
+                    killed.wait(240)
                 try:
                     [entry] = marey.project("lab").imports.upload([take])
                 except MareyError:
@@ -152,6 +155,7 @@ def test_a_server_killed_among_200_uploads_keeps_what_it_acknowledged(
     uploading.start()
     wait_until(lambda: len(acknowledged) >= 70)
     server.kill()
+    killed.set()
     uploading.join(60)
     assert 70 <= len(acknowledged) < 200
 

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.support.rest_server import PATIENCE_S
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
@@ -80,7 +81,10 @@ def test_others_write_while_commands_are_carried_out(
 
     def write() -> None:
         answer = httpx.post(
-            f"{owner.base_url}projects/lab/collections", json={"path": "other"}, headers=owner.headers, timeout=3
+            f"{owner.base_url}projects/lab/collections",
+            json={"path": "other"},
+            headers=owner.headers,
+            timeout=PATIENCE_S,
         )
         seen.append(answer.status_code)
 

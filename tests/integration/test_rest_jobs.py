@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from tests.support.database_fixtures import AdjustableClock
-from tests.support.rest_server import Server, running
+from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding import codecs
 from marey_server.access.principal import SYSTEM
@@ -249,8 +249,8 @@ def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chore
         worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
         job = submit(owner)
         claim(worker)
-        assert tried.wait(5)
-        (again,) = claim(worker, wait_s=5)
+        assert tried.wait(PATIENCE_S)
+        (again,) = claim(worker, wait_s=30)
         assert again["job"] == job["id"]
 
 
@@ -262,5 +262,5 @@ def test_the_server_takes_back_jobs_of_lost_workers_by_itself(
         worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
         job = submit(owner)
         (first,) = claim(worker)
-        (second,) = claim(worker, wait_s=20)
+        (second,) = claim(worker, wait_s=30)
         assert (second["job"], second["fence"] > first["fence"]) == (job["id"], True)

@@ -16,7 +16,7 @@ from typing import Any
 
 import httpx
 import pytest
-from tests.support.rest_server import Server, running
+from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.access import UserCreate
 from marey_server.access.passwords import hash_password
@@ -43,7 +43,7 @@ class Process:
         self._listening = threading.Event()
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
-        assert self._listening.wait(30), self.lines
+        assert self._listening.wait(PATIENCE_S), self.lines
         self.address = next(found[1] for line in self.lines if (found := re.search(r"(http://\S+)", line["message"])))
 
     def _read(self) -> None:
@@ -63,8 +63,8 @@ class Process:
     def end(self) -> int:
         """Ask it to stop; its exit status."""
         self.process.send_signal(signal.SIGTERM)
-        status = self.process.wait(40)
-        self._reader.join(10)
+        status = self.process.wait(PATIENCE_S)
+        self._reader.join(PATIENCE_S)
         return status
 
 
@@ -117,14 +117,15 @@ def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process:
     host, port = process.address.removeprefix("http://").split(":")
     body = json.dumps({"name": "slow"}).encode()
     head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {process.token}\r\n"
-    with socket.create_connection((host, int(port)), timeout=20) as connection:
-        connection.sendall(head.encode() + f"Content-Length: {len(body)}\r\n\r\n".encode() + body[:5])
-        time.sleep(0.3)
+    with socket.create_connection((host, int(port)), timeout=PATIENCE_S) as connection:
+        connection.sendall(f"{head}Content-Length: {len(body)}\r\nExpect: 100-continue\r\n\r\n".encode())
+        assert connection.recv(65536).startswith(b"HTTP/1.1 100")  # it has begun
+        connection.sendall(body[:5])
         process.process.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             try:
-                httpx.get(f"{process.address}/healthz", timeout=1)
+                httpx.get(f"{process.address}/healthz", timeout=PATIENCE_S)
             except httpx.TransportError:
                 break
             time.sleep(0.05)
@@ -133,7 +134,7 @@ def test_a_stopping_server_finishes_what_it_began_and_takes_nothing_new(process:
         assert process.process.poll() is None
         connection.sendall(body[5:])
         assert connection.recv(65536).startswith(b"HTTP/1.1 201")
-    assert process.process.wait(30) == 0
+    assert process.process.wait(PATIENCE_S) == 0
 
 
 def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_path: Path) -> None:
@@ -232,7 +233,7 @@ def test_questions_for_work_that_find_none_and_probes_are_not_logged(process: Pr
 def test_a_worker_beside_the_server_logs_in_the_same_form(tmp_path: Path) -> None:
     process = Process(tmp_path / "data", MAREY_LOCAL_WORKERS="1")
     try:
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE_S
         while not any(line["logger"] == "marey_worker.supervisor" for line in process.lines):
             assert time.monotonic() < deadline, process.lines
             time.sleep(0.1)

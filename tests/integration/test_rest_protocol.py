@@ -1,5 +1,6 @@
 """HTTP protocol of the server: media types, preconditions, pages, byte ranges, errors."""
 
+import contextlib
 import errno
 import gzip
 import hashlib
@@ -16,7 +17,7 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from tests.support.rest_server import Server
+from tests.support.rest_server import PATIENCE_S, Server
 from tornado.iostream import IOStream
 
 from marey_schemas.encoding.arrays import EncodedArray
@@ -380,24 +381,23 @@ def test_a_fault_of_ours_shows_nothing_of_its_inside(
 
 
 def talk(server: Server, data: bytes) -> bytes:
-    """What the server says to raw bytes until it closes the connection or a second passes."""
+    """Return what the server answers to raw bytes, after which it has to close the connection."""
     address = urlsplit(server.address)
-    with socket.create_connection((address.hostname, address.port), timeout=1) as connection:
-        connection.sendall(data)
-        said = b""
-        while True:
-            try:
-                chunk = connection.recv(65536)
-            except TimeoutError:
-                return said
-            if not chunk:
-                return said
+    said = b""
+    connecting = socket.create_connection((address.hostname, address.port), timeout=PATIENCE_S)
+    with (
+        connecting as connection,
+        contextlib.suppress(ConnectionError),
+    ):
+        connection.sendall(data)  # the server may hang up before it has read everything
+        while chunk := connection.recv(65536):
             said += chunk
+    return said
 
 
 def test_a_refused_sender_who_waits_for_a_go_is_told_at_once(server: Server) -> None:
-    head = b"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\nExpect: 100-continue\r\n\r\n"
-    said = talk(server, head)
+    head = b"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\nExpect: 100-continue\r\n"
+    said = talk(server, head + b"Connection: close\r\n\r\n")
     assert said.startswith(b"HTTP/1.1 401")
     assert b"100 (Continue)" not in said
 
@@ -415,15 +415,16 @@ def test_a_length_that_is_no_number_is_refused(server: Server, length: str) -> N
 def talk_of_a_project(server: Server, length: str) -> bytes:
     """What is answered to a body of 15 bytes whose Content-Length is `length`."""
     head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {server.make_user('olga')}\r\n"
-    return talk(server, f'{head}Content-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1"))
+    return talk(
+        server, f'{head}Connection: close\r\nContent-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1")
+    )
 
 
 def test_the_headers_of_a_stream_of_events_come_without_its_body(server: Server) -> None:
     token = server.make_project()
-    asked = f"Host: x\r\nAuthorization: Bearer {token}\r\nAccept: text/event-stream\r\n\r\n"
-    said = talk(
-        server, f"HEAD /api/v1/projects/lab/events HTTP/1.1\r\n{asked}GET /healthz HTTP/1.1\r\n{asked}".encode()
-    )
+    asked = f"Host: x\r\nAuthorization: Bearer {token}\r\nAccept: text/event-stream\r\n"
+    first = f"HEAD /api/v1/projects/lab/events HTTP/1.1\r\n{asked}\r\n"
+    said = talk(server, f"{first}GET /healthz HTTP/1.1\r\n{asked}Connection: close\r\n\r\n".encode())
     head, _, following = said.partition(b"\r\n\r\n")
     assert b"Content-Type: text/event-stream" in head
     assert following.startswith(b"HTTP/1.1 406")  # what was asked next over the same connection
@@ -531,14 +532,18 @@ def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Serve
     with socket.create_connection((address.hostname, address.port)) as connection:
         head = f"PATCH /api/v1{path} HTTP/1.1\r\nHost: x\r\nAuthorization: {token}\r\nUpload-Offset: 0\r\n"
         connection.sendall(head.encode() + f"Content-Length: {len(data)}\r\n\r\n".encode() + data[:1_500_000])
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + PATIENCE_S
         while owner.get(path).json()["offset"] == 0 and time.monotonic() < deadline:
             time.sleep(0.02)
     offset = int(owner.head(path).headers["Upload-Offset"])
     assert 0 < offset < len(data)
-    wrong = owner.patch(path, content=data, headers={"Upload-Offset": "7"})
-    assert (wrong.status_code, wrong.headers["Upload-Offset"]) == (409, str(offset))
-    done = owner.patch(path, content=data[offset:], headers={"Upload-Offset": str(offset)}).json()
+    answer = owner.patch(path, content=data, headers={"Upload-Offset": "7"})
+    assert answer.status_code == 409
+    while answer.status_code == 409:  # a piece of the broken connection may still be on its way into the database
+        offset = int(answer.headers["Upload-Offset"])
+        assert 0 < offset < len(data)
+        answer = owner.patch(path, content=data[offset:], headers={"Upload-Offset": str(offset)})
+    done = answer.json()
     assert done["offset"] == len(data)
     assert owner.get(f"/blobs/{done['digest']}").content == data
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -22,6 +23,7 @@ from marey_server.app import connect_database
 from marey_server.process.settings import Settings
 from marey_server.store.fsck import check_store
 
+PORTS = range(20_000, 30_000)
 READY_S = 120.0
 """A machine that does much else at once takes its time."""
 
@@ -90,7 +92,7 @@ class ServerProcess(MareyProcess):
     def __init__(self, folder: Path, database_url: str | None = None, **environment: str) -> None:
         super().__init__(folder / "server.log")
         self.data = folder / "data"
-        self.port = free_port()
+        self.port = reserved_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._settings = Settings(data=self.data, database_url=database_url, blobs="database")
         self.environment = {"MAREY_DATA": str(self.data), "MAREY_PORT": str(self.port), **environment}
@@ -151,9 +153,24 @@ def serving(folder: Path, database_url: str | None = None) -> Iterator[ServerPro
     assert status == 0, process.log.read_text()[-3000:]
 
 
-def free_port() -> int:
-    """Return an unused port of the loopback interface."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+_RESERVED: list[socket.socket] = []
+
+
+def reserved_port() -> int:
+    """Return a port for a server that starts on it again and again; no other test gets it while this process runs.
+
+    Systems give none of these ports to sockets that ask for any port. A datagram socket, which disturbs no server,
+    keeps it from the other processes that run tests.
+    """
+    for port in random.SystemRandom().sample(PORTS, 100):
+        reserving, probe = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
+        with contextlib.closing(probe):
+            try:
+                reserving.bind(("127.0.0.1", port))
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                reserving.close()
+                continue
+        _RESERVED.append(reserving)
         return port
+    raise AssertionError(f"no port of {PORTS} is free")

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from benchmarks.pipeline_under_fire import write_takes
 from tests.support.command_line import CommandLine
@@ -144,17 +145,25 @@ def test_takes_that_did_not_get_into_the_model_are_told_with_why(
     assert len(list(lab.items(Kind.PROCESSED).list(collection="walk/aligned"))) == TAKES
 
 
+def questions_about_jobs(run: CommandLine) -> list[str]:
+    """Return the lines of the server's metrics that count its answers to clients that wait for a job."""
+    lines = httpx.get(f"{run.server.url}/metrics").text.splitlines()
+    return [
+        line for line in lines if line.startswith('marey_http_requests_total{method="GET",route="/api/v1/jobs/{job}"')
+    ]
+
+
 def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
     lab: ProjectHandle, run: CommandLine, marey: Marey
 ) -> None:
+    asked_before = questions_about_jobs(run)
     waiting = run.start(
         "build-model", "takes", "--project", "lab", "--to", skeleton_path(lab), "--name", "walk", *QUICK_FLAGS
     )
-    deadline = time.monotonic() + 60
-    while not list(lab.jobs()):
+    deadline = time.monotonic() + 120
+    while questions_about_jobs(run) == asked_before:
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    time.sleep(0.5)
     waiting.send_signal(signal.SIGINT)
     _, told = waiting.communicate(timeout=60)
     assert waiting.returncode == 130, told

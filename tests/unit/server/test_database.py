@@ -120,7 +120,7 @@ def test_a_deadlock_is_resolved_by_trying_again(database: Database) -> None:
     def cross(tx: Transaction, first: str, second: str) -> None:
         tx.execute(sqlalchemy.update(user).where(user.c.name == first).values(rev=user.c.rev + 1))
         if not met.is_set():
-            both.wait(10)
+            both.wait(60)
             met.set()
         tx.execute(sqlalchemy.update(user).where(user.c.name == second).values(rev=user.c.rev + 1))
 
@@ -223,6 +223,7 @@ def test_a_long_log_is_written_back_under_steady_reads(
 ) -> None:
     monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
     monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
+    monkeypatch.setattr(database_module, "WAL_PATIENCE_MS", 10_000)  # readers of a busy machine take long
     stop = threading.Event()
 
     def keep_reading() -> None:
