@@ -204,7 +204,7 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) 
                     blobs.put_blob(tx, source.content, expected=source.digest)
     every = [draft for some in drafts.values() for draft in some]
     published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id))
-    made = {name: [next(published) for _ in some] for name, some in drafts.items()}
+    made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}
     return [file.entry or _entry(file, made[file.name]) for file in files]
 
 
@@ -226,7 +226,10 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
 
 def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:
     made = {one.kind: one for one in published}
-    main = next(made[kind] for kind in (Kind.CLIP, Kind.MODEL, Kind.GRAPH, Kind.SKELETON) if kind in made)
+    kinds = [kind for kind in (Kind.CLIP, Kind.MODEL, Kind.GRAPH, Kind.SKELETON) if kind in made]
+    if not kinds:  # not a StopIteration: a future does not accept it, so the request would wait for ever
+        raise RuntimeError(f"the import of {file.name} published no clip, model, graph or skeleton")
+    main = made[kinds[0]]
     skeleton = made.get(Kind.SKELETON)
     return ImportEntry(
         name=file.name,

@@ -48,6 +48,12 @@ def test_a_file_that_cannot_be_stored_harms_no_other(lab: Lab) -> None:
     assert [clip.name for clip in lab.read(items.list_items, "lab", Kind.CLIP, sort="name").items] == ["a", "d"]
 
 
+def test_an_import_without_a_main_item_is_an_error_that_ends_the_request(lab: Lab) -> None:
+    edit = Draft("clean-up", Kind.EDIT, "clean-up", {"edit": {"commands": [{"command": "trim", "start": 1}]}}, "takes")
+    with pytest.raises(RuntimeError, match=r"the import of walk\.bvh published no clip, model, graph or skeleton"):
+        store(lab, PreparedImport("walk.bvh", drafts=(edit,)))
+
+
 def test_the_same_take_twice_in_one_request_is_one_revision(lab: Lab) -> None:
     first, again = store(lab, read_file("walk.bvh"), read_file("walk.npz"))
     assert (first.status, again.status) == ("created", "unchanged")
