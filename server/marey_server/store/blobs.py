@@ -37,15 +37,13 @@ from marey_server.store.tables import (
     project,
     revision_part,
 )
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 GRACE_US = 24 * 3600 * 1_000_000
 """Time after which garbage collection deletes a blob or document that nothing refers to."""
 
 RENEW_US = GRACE_US // 2
 """Age after which an unreferenced blob must be sent again, so that it is not deleted while a client relies on it."""
-
-IN_LIST = 500
 
 
 class Spool:

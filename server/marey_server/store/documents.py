@@ -26,7 +26,7 @@ from marey_server.field_errors import field_errors
 from marey_server.store import blobs
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.tables import blob, document, document_blob
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import IN_LIST, Transaction
 
 OPEN_SCHEMA = "marey/document@1"
 
@@ -288,8 +288,8 @@ def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
     wanted = list(digests)
     bodies = {
         row.digest: dict(row.body)
-        for start in range(0, len(wanted), blobs.IN_LIST)
-        for row in tx.run(_BODIES, {"digests": padded(wanted[start : start + blobs.IN_LIST])})
+        for start in range(0, len(wanted), IN_LIST)
+        for row in tx.run(_BODIES, {"digests": padded(wanted[start : start + IN_LIST])})
     }
     if missing := [digest for digest in digests if digest not in bodies]:
         raise NotFoundProblem(f"There is no document {missing[0]}.")

@@ -17,7 +17,7 @@ from marey_server.store.database.clock import Clock
 from marey_server.store.database.prepared import Prepared
 
 IN_LIST = 1000
-"""Most values of one statement: longer lists are cut, because databases limit the parameters of a statement."""
+"""Maximum number of list values in one statement; longer lists are split, because databases limit the parameters."""
 
 Event = tuple[str, str | None, str, dict[str, Any]]
 """Kind of an event, project id, id of its subject, and body."""
