@@ -1,4 +1,4 @@
-"""Runs migrations in the transaction that `store.schema` opens, or in one of its own for the commands of Alembic."""
+"""Run migrations in the transaction that `store.schema` opens, or, for Alembic's commands, in a new one."""
 
 import os
 
@@ -10,7 +10,7 @@ from marey_server.store.tables import metadata
 
 
 def migrate(connection: Connection) -> None:
-    """Bring the database at `connection` to the revision asked for."""
+    """Migrate the database at `connection` to the requested revision."""
     context.configure(connection=connection, target_metadata=metadata, render_as_batch=True, transactional_ddl=True)
     with context.begin_transaction():
         context.run_migrations()

@@ -18,7 +18,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Apply."""
+    """Create the tables."""
     op.create_table(
         "blob",
         sa.Column("digest", DIGEST, nullable=False),
@@ -473,7 +473,7 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Take back."""
+    """Drop the tables."""
     op.drop_table("revision_part")
     op.drop_table("lineage")
     op.drop_table("staged_output")

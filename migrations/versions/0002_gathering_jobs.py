@@ -10,10 +10,10 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Apply."""
+    """Add the column `gathers` to `job`."""
     op.add_column("job", sa.Column("gathers", sa.Boolean(), nullable=False, server_default=sa.false()))
 
 
 def downgrade() -> None:
-    """Undo."""
+    """Drop the column."""
     op.drop_column("job", "gathers")

@@ -1,4 +1,4 @@
-"""Streams of frames whose coverage is measured."""
+"""Table of coverage streams."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -14,7 +14,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Apply."""
+    """Create the table."""
     op.create_table(
         "coverage_stream",
         sa.Column("id", ID, nullable=False),
@@ -38,5 +38,5 @@ def upgrade() -> None:
 
 
 def downgrade() -> None:
-    """Undo."""
+    """Drop the table."""
     op.drop_table("coverage_stream")

@@ -1,4 +1,4 @@
-"""Inputs that other jobs have yet to make."""
+"""Inputs of jobs that other jobs will produce."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,13 +10,13 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Apply."""
+    """Add the column `unbound` and the index of retries to `job`."""
     op.add_column("job", sa.Column("unbound", sa.Boolean(), nullable=False, server_default=sa.false()))
     tried_again = sa.text("retry_of IS NOT NULL")
     op.create_index("ix_job_retry", "job", ["retry_of"], sqlite_where=tried_again, postgresql_where=tried_again)
 
 
 def downgrade() -> None:
-    """Undo."""
+    """Drop the index and the column."""
     op.drop_index("ix_job_retry", "job")
     op.drop_column("job", "unbound")
