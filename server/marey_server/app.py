@@ -103,7 +103,7 @@ def create_app(settings: Settings, database: Database) -> Application:
 
 
 def describe(routes: RouteTable) -> Description:
-    """Return the description of the API for programs and for people."""
+    """Return the description of the API, as an OpenAPI document and as an HTML page."""
     document = build_document(routes, version("marey"))
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
     return Description(text, render_page(document), hashlib.sha256(text).hexdigest()[:16])

@@ -60,7 +60,7 @@ class UnauthenticatedProblem(ApiProblem):
 
 
 class ForbiddenProblem(ApiProblem):
-    """You may see this, but not do that."""
+    """You may not perform this operation."""
 
     status = 403
     code = "forbidden"
@@ -77,7 +77,7 @@ class NotFoundProblem(ApiProblem):
 
 
 class MethodNotAllowedProblem(ApiProblem):
-    """The resource does not know this method."""
+    """The resource does not support this method."""
 
     status = 405
     code = "method-not-allowed"
@@ -135,7 +135,7 @@ class PreconditionFailedProblem(ApiProblem):
 
 
 class PreconditionRequiredProblem(ApiProblem):
-    """Say which state you are changing: send If-Match."""
+    """Send If-Match with the state that you are changing."""
 
     status = 428
     code = "precondition-required"

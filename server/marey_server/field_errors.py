@@ -1,4 +1,4 @@
-"""Conversion of pydantic's validation errors to those of answers: a pointer into the request, a code, a sentence."""
+"""Conversion of pydantic's validation errors to field errors: JSON Pointer into the request, code and sentence."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def json_pointer(steps: Sequence[str]) -> str:
 def field_errors(
     error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` faults of `tree` that validation found; `pointer` formats the place of each."""
+    """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of each to text."""
     entries = error.errors(include_url=False, include_context=False, include_input=False)
     return [
         FieldError(

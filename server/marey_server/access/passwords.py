@@ -57,7 +57,7 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """Return a hash that no password matches; checking it for unknown users makes the answer take the same time."""
+    """Return a hash that no password matches, to check for unknown users, so that all checks take the same time."""
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

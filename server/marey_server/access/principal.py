@@ -12,8 +12,8 @@ from marey_schemas.access import Scope
 class Principal:
     """Caller, with the scopes of its credential.
 
-    `scopes` are texts such as `write` or `write!project=walk`. An attempt is a running try of a job: it reads its
-    project, and writes only through the endpoints of its attempt.
+    `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job: it may
+    read the project of the job, and write only through the endpoints of its attempt.
     """
 
     kind: Literal["anonymous", "user", "attempt", "system"]

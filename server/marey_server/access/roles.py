@@ -18,7 +18,7 @@ def includes(role: Role, required: Role) -> bool:
 class RequiredRole:
     """Role and scope that an operation requires in a project.
 
-    Handlers declare them, the transaction of a request holds them, and `store.projects.require` enforces them.
+    Handlers declare it, the transaction of a request contains it, and `store.projects.require` enforces them.
     `guests`: whether callers without a role may perform a reader's operation in a public project.
     """
 

@@ -19,6 +19,6 @@ def reaches_somewhere(scopes: Iterable[str], need: str) -> bool:
 
 
 def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
-    """Return those of the scopes `wanted` that `held` does not include."""
+    """Return the scopes in `wanted` that `held` does not include."""
     held = set(held)
     return [scope for scope in wanted if scope not in held and scope.partition("!")[0] not in held]

@@ -32,10 +32,10 @@ class AnnotationCommands(Resource):
         idempotency="key",
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationChange) -> Rendered:
-        """Change an annotation (kind `annotations`) by commands: all of them, as one new revision, or none.
+        """Apply commands to an annotation (kind `annotations`); together they create one new revision.
 
-        Each command is applied to the result of the one before it. If a command cannot be applied, the answer is 422
-        and points at it.
+        Each command is applied to the result of the previous one. If a command cannot be applied, none is, and the
+        answer is 422 with a pointer to this command.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
             raise NotFoundProblem(f"Commands can be applied to annotations, not to {kind}.", code="no-commands")
@@ -70,7 +70,7 @@ class ClipAnnotations(Resource):
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
         """Create an annotation of a clip (kind `clips`), in the clip's folder, from a document of the predecessor."""
         if kind_of(kind) is not Kind.CLIP:
-            raise NotFoundProblem(f"Clips are annotated, not {kind}.", code="no-annotations")
+            raise NotFoundProblem(f"Only clips can be annotated, not {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
         prepared = await self.compute(prepare_annotation, clip, body)
         return await self.answer_with(

@@ -40,7 +40,7 @@ class Blob(BlobSender):
 
     @writes(access=Access.SIGNED_IN, body=RequestBody(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False))
     async def put(self, digest: str) -> Rendered:
-        """Send bytes by their digest.
+        """Store bytes under their digest.
 
         Others can read them once a document refers to them; bytes without a reference are deleted after a day.
         """
@@ -56,7 +56,7 @@ class Blob(BlobSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, digest: str) -> Rendered | None:
-        """Return bytes by their digest, whole or a range."""
+        """Return the bytes of a blob, or a range of them."""
         return await self.send_blob(require_digest(digest))
 
 

@@ -45,7 +45,7 @@ class ProjectCoverageStreams(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
-        """Start to measure the coverage of a performance, from nothing or from the result of an evaluation.
+        """Start to measure the coverage of a recording; it starts empty, or with the coverage of an evaluation.
 
         A stream that receives no frames for a day is deleted; the number of streams of a project is limited.
         """
@@ -67,7 +67,7 @@ class CoverageStreamResource(Resource):
 
     @reads(access=Access.READER, answer=CoverageStreamState, etag=True)
     async def get(self, project: str, stream: str) -> Reply:
-        """Return a stream with its coverage map, the performer's state, and what to record next."""
+        """Return a stream with its coverage map, the performer's state, and the motions to record next."""
         held = await self.look_up(coverage_streams.read_stream, project, stream)
         state = await self.compute(coverage.look, held)
         return Reply(state, rev=held.rev)
@@ -92,8 +92,8 @@ class CoverageStreamFrames(Resource):
     async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
         """Send the next frames, as poses of the stream's skeleton or as roots; the answer lists what is still missing.
 
-        The same frames at the same offset get the same answer again. For another offset than the stream's, the answer
-        is 409 with the current offset in the context.
+        If the last frames are sent again at the same offset, the answer is repeated. If the offset is not that of the
+        stream, the answer is 409 with the current offset in the context.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
         step = await self.compute(coverage.advance, held, body)

@@ -26,7 +26,7 @@ class Healthz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
     async def get(self) -> Reply:
-        """Answer if the process is alive."""
+        """Answer with success while the process is alive."""
         return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
 
 

@@ -61,11 +61,11 @@ class ProjectImports(Resource):
         self._field: bytearray | None = None
 
     async def receive(self, chunk: bytes) -> None:
-        """Take the next bytes of the files."""
+        """Receive the next bytes of the files."""
         if self.parts is None:
             self.body += chunk
             if len(self.body) > MIB:
-                raise TooLargeProblem(f"A list of files may have {MIB} bytes.")
+                raise TooLargeProblem(f"A list of files may have at most {MIB} bytes.")
             return
         for piece in self.parts.feed(chunk):
             await self._take(piece)
@@ -81,7 +81,7 @@ class ProjectImports(Resource):
         elif isinstance(piece, bytes) and self._field is not None:
             self._field += piece
             if sum(map(len, self.fields.values())) > MAX_FORM_BYTES:
-                raise TooLargeProblem(f"The form fields may have {MAX_FORM_BYTES} bytes together.")
+                raise TooLargeProblem(f"The form fields may have at most {MAX_FORM_BYTES} bytes together.")
         elif self._file is not None:
             await self._take_file(*self._file)
             self._file = None
@@ -113,7 +113,8 @@ class ProjectImports(Resource):
         """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
 
         Send files as multipart/form-data, with the options as form fields, or name files by digest. Files with known
-        content change nothing. Many files, or many bytes, become a job (202), whose result is the same answer.
+        content change nothing. Many files, or many bytes, are imported by a job (202), whose result has the form of
+        the answer.
         """
         if self.parts is not None:
             self.parts.finish()

@@ -121,7 +121,7 @@ class ItemResource(Resource):
 
     @reads(access=Access.READER, answer=Item, etag=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
-        """Return an item at its newest revision: name, place, tags, summary, documents."""
+        """Return an item at its newest revision: name, folder, tags, summary, documents."""
         return await self.answer(items.read_item, project, kind_of(kind), item)
 
     @writes(access=Access.CONTRIBUTOR, body=ItemChange, answer=Item, precondition="required", etag=True)

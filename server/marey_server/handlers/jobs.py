@@ -102,7 +102,7 @@ class ProjectJobs(Resource):
         headers=("Prefer",),
     )
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
-        """Submit a job. Inputs are pinned to their newest revisions; many inputs are split over many tasks.
+        """Submit a job. Inputs are pinned to their newest revisions; a job with many inputs is divided into tasks.
 
         An input `{"job": id}` stands for all outputs of that job that have the input's kind; the new job waits for it.
         With `Prefer: wait=n`, the answer is sent when the job has ended, at the latest after n seconds.
@@ -149,7 +149,7 @@ class JobResource(Resource):
 
     @reads(access=Access.READER, answer=Job, headers=("Prefer",))
     async def get(self, job: str) -> Rendered | Reply:
-        """Return the state of a job; with `Prefer: wait=n`, when it has ended, at the latest after n seconds."""
+        """Return the state of a job; with `Prefer: wait=n`, wait at most n seconds for its end."""
         wait_s = wait_preferred(self)
         if wait_s == 0:
             return await self.answer(reading.read_job, job)
@@ -195,7 +195,7 @@ class JobOutputs(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=JobOutput, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """List the revisions created by a job or its tasks; for tasks, a page holds the outputs of `limit` tasks."""
+        """List the revisions created by a job or its tasks; for tasks, a page contains the outputs of `limit` tasks."""
         return await self.answer(reading.list_outputs, job, query.cursor, query.limit)
 
 
@@ -247,7 +247,7 @@ class JobLog(Resource):
     async def get(self, job: str, query: JobLogQuery) -> Rendered:
         """Return the output of a job's attempts, one after another, from an offset in bytes.
 
-        The header `Log-Offset` is the offset of the next page; `Log-Sealed: true` says that there is none.
+        The header `Log-Offset` is the offset of the next page; `Log-Sealed: true` means that there is no next page.
         """
         return await self.answer_with(_log_reply, reading.read_job_log, job, query.offset, query.limit)
 
@@ -265,7 +265,7 @@ class JobCancellation(Resource):
 
     @writes(access=Access.CONTRIBUTOR, scope="jobs", answer=Job)
     async def post(self, job: str) -> Rendered:
-        """Cancel a job and its tasks: at once if no worker has it, else as soon as the worker stops."""
+        """Cancel a job and its tasks: at once if no worker runs it, otherwise as soon as the worker has stopped."""
         return await self.answer(reading.cancel_job, job, self.services.queue_policy)
 
 
@@ -279,8 +279,8 @@ class JobRetry(Resource):
     async def post(self, job: str) -> Rendered:
         """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 
-        Unsuccessful jobs that it depends on are retried before it, and jobs that ended only because it did not succeed
-        after it, so that the rest of a pipeline continues.
+        Dependencies of the job that did not succeed are retried, too, and so are jobs that ended only because this job
+        did not succeed. So the rest of a pipeline continues.
         """
         return await self.answer_with(_accepted, retrying.retry_job, job)
 

@@ -89,7 +89,7 @@ class AttemptHeartbeat(Resource):
 
     @writes(access=Access.ATTEMPT, scope=None, body=RequestBody(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
     async def post(self, job: str, fence: int, body: Heartbeat) -> Rendered:
-        """Renew the lease; the answer says whether to stop."""
+        """Renew the lease; the answer says whether the worker must stop."""
         return await self.answer(queue.heartbeat, job, fence, body, self.services.queue_policy)
 
 
@@ -107,7 +107,7 @@ class AttemptLog(Resource):
         headers=("Upload-Offset",),
     )
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
-        """Append to the attempt's log at `Upload-Offset`; 409 with the current offset if that is another one."""
+        """Append to the attempt's log at `Upload-Offset`; if this is not its end, the answer is 409 with the end."""
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequestProblem(
@@ -151,7 +151,7 @@ class AttemptCompletion(Resource):
         access=Access.ATTEMPT, scope=None, body=RequestBody(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer
     )
     async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
-        """Publish the staged outputs and end the job; repeating a `write_id` repeats the answer."""
+        """Publish the staged outputs and end the job; a request with the same `write_id` gets the same answer."""
         return await self.answer(completion.complete, job, fence, body)
 
 
@@ -163,7 +163,7 @@ class AttemptFailure(Resource):
 
     @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer)
     async def post(self, job: str, fence: int, body: FailRequest) -> Rendered:
-        """End the attempt; the job is retried or has failed. Repeating a `write_id` repeats the answer."""
+        """End the attempt; the job is retried or fails. A request with the same `write_id` gets the same answer."""
         return await self.answer(completion.fail, job, fence, body, self.services.queue_policy)
 
 

@@ -1,4 +1,4 @@
-"""Resources of the documents of items: read, whole or in part, and replaced by a new revision."""
+"""Resources that read the documents of items, whole or in part, and replace them in new revisions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resources of the reports of evaluations and models, and of their figures, as stored with the item."""
+"""Resources of the reports of evaluations and models and of their figures, which are stored with the item."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class StoredFileSender(BlobSender):
     """Base of resources that answer with a file named by a document."""
 
     async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
-        """Answer with the file, to be displayed by browsers, with headers that restrict its rights."""
+        """Answer with the file for display in a browser, under a content security policy."""
         return await self.send_blob(
             file.blob,
             disposition="inline",
@@ -112,7 +112,7 @@ class Figure(StoredFileSender):
 
 
 def _scripts(report: ReportDocument) -> str:
-    """Return the part of the policy that allows the scripts of the page itself, by digest, and no others."""
+    """Return the part of the content security policy that allows only the page's own scripts, by digest."""
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"

@@ -59,9 +59,9 @@ class Search(Searcher):
     async def post(self, project: str, kind: str, item: str, body: SearchRequest) -> Rendered:
         """Return the motion of a model (kind `models`) that meets constraints best, or a sequence of motions.
 
-        The model's tree is searched, and the best sample is refined. For a model without a tree, or with the tree of
-        another one, a tree is drawn for the search; `steps[].tree` says so. Nothing is stored, and the same request
-        gets the same answer.
+        The model's tree is searched, and the best sample is refined. If the model has no tree, or the tree belongs to
+        another state of the model, a tree of new samples is built for the search; `steps[].tree` reports this. Nothing
+        is stored, and the same request gets the same answer.
         """
         found, searchables = await self.searchables(project, kind, item, body)
         form, answers = self.answer_form, self.services.answers

@@ -1,4 +1,4 @@
-"""Resumable uploads: creation, sending of pieces, state, and their end as blobs."""
+"""Resumable uploads: creation, receipt of pieces, state, and storage as blobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Execution of a request in one transaction: identification of the caller, the function, and rendering of the answer.
+"""Execution of a request in one transaction: identifies the caller, runs the function and renders the answer.
 
 All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once.
 """

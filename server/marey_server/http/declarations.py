@@ -28,7 +28,7 @@ Declared = Callable[..., Coroutine[Any, Any, None]]
 
 
 class Access(StrEnum):
-    """Least access that an operation requires. Roles are roles in the project of the path, and include higher ones."""
+    """Minimum access that an operation requires. A role is one in the project of the path; higher roles include it."""
 
     ANYONE = "anyone"
     SIGNED_IN = "signed_in"
@@ -48,7 +48,7 @@ class Access(StrEnum):
 
 
 class Document:
-    """Marker of a body or an answer that is a document: a tree with arrays, of the schema it names."""
+    """Marker of a body or an answer that is a document: a tree with arrays that names its schema."""
 
 
 class Bytes:
@@ -130,8 +130,8 @@ def reads(
     """Declare a method that changes nothing.
 
     `answer` is the type of the answer, or, with `paged`, of one element of a page; `answer_types` are its media types,
-    if they are not those of models and documents. `stream`: the answer is also available as server-sent events.
-    `public=False`: guests of a public project are refused. `also` are further statuses, `headers` further request
+    if they differ from those of models and documents. `stream`: the answer is also available as server-sent events.
+    `public=False`: guests of a public project are refused. `also` lists further statuses, `headers` further request
     headers. A `body` is for queries that are too long for an address.
     """
     return _declare(

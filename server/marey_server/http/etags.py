@@ -78,7 +78,7 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":
-            raise BadRequestProblem("If-None-Match of a change must be *, which creates and never replaces.")
+            raise BadRequestProblem("If-None-Match of a change must be *: create the resource, but never replace it.")
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")

@@ -63,7 +63,7 @@ class Exchange(RequestHandler):
     # -- the body that comes ------------------------------------------------------------------------------------------
 
     def declared_length(self) -> int:
-        """Return the Content-Length of the request; 0 if it is missing, or malformed so that Tornado refuses it."""
+        """Return the Content-Length of the request; 0 if it is missing or malformed."""
         text = self.request.headers.get("Content-Length", "0").partition(",")[0].strip()  # the same may stand twice
         return int(text) if _LENGTH.fullmatch(text) else 0
 
@@ -79,7 +79,7 @@ class Exchange(RequestHandler):
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
     def send(self, rendered: Rendered, *, whole_bytes: int | None = None) -> None:
-        """Set status, headers and body of the response, or the start of its body, which has `whole_bytes` in all."""
+        """Set status, headers and body of the response, or only the start of a body of `whole_bytes` bytes."""
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
@@ -98,7 +98,7 @@ class Exchange(RequestHandler):
             raise StreamClosedError from None
 
     async def refuse(self, error: ApiProblem) -> None:
-        """Answer before the body is read, then discard the rest of it; closing at once could lose the answer."""
+        """Answer before the body is read, then discard the body; closing the connection could lose the answer."""
         self.refused = True
         self._write_problem(error)
         if self.request.headers.get("Expect", "").lower() == "100-continue":

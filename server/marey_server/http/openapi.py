@@ -127,7 +127,7 @@ class _Models:
         return {"$ref": _REF.format(model=name)}
 
     def document(self) -> Schema:
-        """Return the schema of any document; "any of", because the open schema matches documents of the others, too."""
+        """Return the schema of any document: `anyOf`, because the open schema also matches the other documents."""
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 
 

@@ -1,4 +1,4 @@
-"""Streaming of blobs, whole or one byte range (RFC 9110, section 14); several ranges get the whole blob."""
+"""Streaming of a blob or of one byte range (RFC 9110, section 14); a request for several ranges gets the whole blob."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ByteRange:
 def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRange | None:
     """Return the requested range, or None for the whole.
 
-    Several or malformed ranges, and an If-Range of another state, get the whole, too.
+    It is also None for several or malformed ranges, and if If-Range names another state.
     """
     if header is None or (if_range is not None and if_range.strip() != etag):
         return None
@@ -121,7 +121,7 @@ class BlobSender(Resource):
         return None
 
     async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:
-        """Send the pieces of a blob, each read after the one before was sent."""
+        """Send the pieces of a blob; each is read after the previous one was sent."""
         self.send(first, whole_bytes=opened.stop - opened.start)
         if self.request.method == "HEAD":
             return
@@ -131,6 +131,8 @@ class BlobSender(Resource):
             stop = min(opened.stop, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:
-                raise UnavailableProblem(f"Bytes of {digest} are lost.", code="blob-damaged")
+                raise UnavailableProblem(
+                    f"The store has lost bytes of the blob {digest}; run `marey db fsck`.", code="blob-damaged"
+                )
             self.write(piece)
             position = stop

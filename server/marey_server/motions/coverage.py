@@ -208,7 +208,7 @@ def _load_kernels(body: MatchingBody | None) -> None:
 
 @contextmanager
 def refusing(field: str) -> Iterator[None]:
-    """Turn motion errors inside the block into an answer that points at a field of the request."""
+    """Convert motion errors inside the block to errors that point at a field of the request."""
     from marey_motion.errors import MotionError
 
     try:

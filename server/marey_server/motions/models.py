@@ -157,7 +157,10 @@ def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, li
     frames = float((primitive.time_functions(latents)[:, -1] + 1.5).sum())
     size = frames * primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
-        shown = f"{size / MIB:,.0f} MiB of poses, over {LARGEST_ANSWER_BYTES // MIB}"
-        raise InvalidProblem(f"These samples are {shown}; ask for fewer at a time.", code="samples-too-large")
+        raise InvalidProblem(
+            f"These samples have {size / MIB:,.0f} MiB of poses; request fewer, with at most "
+            f"{LARGEST_ANSWER_BYTES // MIB} MiB.",
+            code="samples-too-large",
+        )
     motions = primitive.motions(latents)
     return latents, [motion.as_clip(primitive.skeleton, primitive.frame_rate_hz) for motion in motions]

@@ -29,9 +29,9 @@ PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PRO
 class PredecessorOptions:
     """Options of the predecessor's formats.
 
-    `end_index` and `form` apply to annotations, `layout` to models; the default layout is that of the file that an
-    unchanged model was imported from, otherwise 3. `part` selects a model or its tree, or the data of an aligned clip
-    other than its motion.
+    `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model has the layout of
+    its imported file; other models have layout 3. `part` selects a model or its tree, or the alignment of an aligned
+    clip instead of its motion.
     """
 
     end_index: EndIndex = DEFAULT_END_INDEX

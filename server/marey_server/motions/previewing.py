@@ -38,7 +38,7 @@ MOST_SHOWN = 5_000_000
 class PreviewSource:
     """Inputs of a preview: commands, motions, and their skeletons and mappings.
 
-    `hierarchies` are by item and revision, `mappings` by item, at its newest revision.
+    `hierarchies` maps items and revisions to skeletons, `mappings` maps items to their newest mappings.
     """
 
     edit: EditDocument
@@ -91,12 +91,13 @@ def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
             raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
     if request.piece >= len(made):
-        raise _invalid("/piece", "no-piece", f"The edit makes {counted(len(made), 'clip')}, counted from 0.")
+        raise _invalid("/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}, counted from 0.")
     wanted = made[request.piece]
     start, stop = request.frames
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
-        raise _invalid("/frames", "no-frames", f"The result has {counted(wanted.clip.frame_count, 'frame')}.")
+        held = counted(wanted.clip.frame_count, "frame")
+        raise _invalid("/frames", "no-frames", f"The range contains no frame of the result, which has {held}.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > MOST_SHOWN:
         raise TooLargeProblem(

@@ -91,8 +91,8 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
 def _require_quick(work: float) -> None:
     if work > MOST_WORK:
         raise TooLargeProblem(
-            f"This takes about {work / MOST_WORK:.1f} times as long as allowed; request fewer steps, constraints, "
-            "candidates, passes or iterations.",
+            f"This search takes about {work / MOST_WORK:.1f} times as long as allowed; request fewer steps, "
+            "constraints, candidates, passes or iterations.",
             code="search-too-large",
         )
 
@@ -218,7 +218,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def placement_of(start: StartPlacement) -> Placement:
-    """Return the place of the canonical frame."""
+    """Return position and heading of the canonical frame."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

@@ -38,7 +38,7 @@ class FoundSearchable:
     mapping: FoundPart | None
 
     def key(self, seed: int) -> SearchableKey:
-        """Return the cache key; it contains `seed` if the model has no tree, because a tree is then drawn with it."""
+        """Return the cache key; it contains `seed` if the model has no tree, which then determines the tree."""
         tree = f"seed {seed}" if self.tree is None else self.tree.digest
         return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
 

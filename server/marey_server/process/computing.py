@@ -2,8 +2,8 @@
 
 Long computations must leave a thread for short ones: exports, documents, passwords.
 
-By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. For
-clips, that takes as long as the rest of reading one.
+By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. For a
+clip, this takes as long as the rest of a read.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def configure_logging(form: LogForm, level: str) -> None:
     log_to_standard_error(form, level)
     logging.getLogger("tornado.access").setLevel("ERROR")  # requests are logged by log_request
     logging.getLogger("tornado.general").addFilter(without_received_text)
-    logging.getLogger("alembic.runtime.migration").addFilter(_tells_of_an_upgrade)
+    logging.getLogger("alembic.runtime.migration").addFilter(_is_of_an_upgrade)
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
@@ -55,8 +55,8 @@ def _kind_of_fault(error: Exception) -> str:
     return next((known for known in _MALFORMED if str(error).startswith(known)), "the request is malformed")
 
 
-def _tells_of_an_upgrade(record: logging.LogRecord) -> bool:
-    """Filter out the log records of the schema check in each readiness request."""
+def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
+    """Return whether a record belongs to an upgrade and not to the schema check of a readiness request."""
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
 

@@ -107,7 +107,7 @@ class Settings(BaseSettings):
         lease_ttl_s = others.data.get("lease_ttl_s")  # absent where it was refused itself
         if lease_ttl_s is not None and heartbeat_s > lease_ttl_s / 2:
             raise ValueError(
-                f"at most half of lease_ttl_s, which is {lease_ttl_s:g}: otherwise running jobs would be lost"
+                f"must be at most half of lease_ttl_s, which is {lease_ttl_s:g}; otherwise running jobs would be lost"
             )
         return heartbeat_s
 

@@ -108,7 +108,8 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
     if expected is not None and digest != expected:
         raise InvalidProblem(
-            f"The bytes are {digest}, not {expected}: they were changed in transit.", code="digest-mismatch"
+            f"The bytes have the digest {digest}, not {expected}: they were changed in transit; send them again.",
+            code="digest-mismatch",
         )
     store_blobs(tx, {digest: content})
     add_holder(tx, digest)
@@ -126,7 +127,7 @@ def require_sender(principal: Principal) -> None:
 
 
 def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool | Pieces]) -> None:
-    """Store bytes under their digests, once; bytes that are there already count as new again."""
+    """Store bytes under their digests; if some are stored already, renew their age."""
     rows = [
         {"digest": digest, "size_bytes": _size_bytes(content), "created_us": tx.now_us}
         for digest, content in contents.items()
@@ -186,7 +187,7 @@ def add_holder(tx: Transaction, digest: str) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return those of `digests` that the caller may refer to, locked against deletion until the end of this write."""
+    """Return the digests that the caller may refer to; their blobs are not deleted before the end of this write."""
     return _renew(tx, blob, readable(tx, digests))
 
 
@@ -203,7 +204,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> ConflictProblem:
-    """Return the error for a document or job that names blobs which are not stored."""
+    """Return the error for a document or job that names blobs that are not stored."""
     detail = "This names blobs that are not here; send them first."
     return ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
@@ -212,14 +213,14 @@ def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> 
 
 
 def readable(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return those of `digests` that are stored and that the caller may read or refer to."""
+    """Return the digests whose blobs are stored and may be read or referred to by the caller."""
     wanted = set(digests)
     held = _held(tx, wanted, since_us=0)
     return held | _referenced(tx, wanted - held)
 
 
 def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
-    """Return those of `digests` that the caller must send before referring to them, in the order of `digests`."""
+    """Return, in order, the digests whose bytes the caller must send before referring to them."""
     digests = list(dict.fromkeys(digests))
     there = _referenced(tx, digests)
     there |= _held(tx, [digest for digest in digests if digest not in there], since_us=tx.now_us - RENEW_US)
@@ -245,7 +246,7 @@ def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, in
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:
-    """Return bytes `start` to `stop` of a blob without a check of access; the caller has done that."""
+    """Return bytes `start` to `stop` of a blob. Access is not checked: the caller of this function has done so."""
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))

@@ -82,7 +82,7 @@ def list_collections(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the collections at and below `path` by path, without the root; or the deleted ones."""
+    """List the collections at and below `path` in the order of paths, without the root; or the deleted ones."""
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
     statement = select(collection).where(
@@ -143,7 +143,7 @@ def move_collection(
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     if new.startswith(f"{old}/"):
-        raise InvalidProblem(f"{old!r} cannot move into itself.", code="into-itself")
+        raise InvalidProblem(f"{old!r} cannot be moved into itself.", code="into-itself")
     if new != old:
         ensure(tx, project_row, new.rpartition("/")[0])
     with taken(_path_taken(new)):
@@ -184,7 +184,7 @@ def _lock_inside(tx: Transaction, project_row: ProjectRow, path: str) -> Sequenc
 
 
 def delete_collection(tx: Transaction, project: str, collection_id: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide a folder and its contents; `restore_collection` brings them back."""
+    """Hide a folder and its contents; `restore_collection` restores them."""
     project_row = projects.require(tx, project)
     path = _find(tx, project_row, collection_id, _ALIVE, lock=True).path
     _require_no_root(path)

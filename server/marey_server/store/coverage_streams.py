@@ -29,7 +29,7 @@ Tree = dict[str, Any]
 
 
 class CoverageOffset(ConflictProblem):
-    """Frames were sent for another offset than the one at which the stream continues."""
+    """Frames were sent for an offset that is not the current offset of the stream."""
 
     code = "coverage-offset"
 

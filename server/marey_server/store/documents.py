@@ -40,7 +40,7 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class PreparedDocument:
-    """Document that is checked and encoded, which takes most of the time of storing it and needs no database."""
+    """Checked and encoded document; checking and encoding take longer than storing it, and need no database."""
 
     digest: str
     schema: str
@@ -97,7 +97,7 @@ def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
 
 
 def digest_of_body(body: Tree) -> str:
-    """Return the digest of the document with this text, which has references in place of arrays."""
+    """Return the digest of a document, given as JSON text with references in place of arrays."""
     return blobs.digest_of(canonical_json(body))
 
 
@@ -106,7 +106,7 @@ def _check(tree: Any, schema: str | None) -> str:
         raise InvalidProblem("A document must be an object.", code="bad-document")
     named = tree.get("schema", schema)
     if schema is not None and schema != OPEN_SCHEMA and named != schema:
-        raise InvalidProblem(f"This part holds {schema}, not {named!r}.", code="bad-schema")
+        raise InvalidProblem(f"This part must have the schema {schema}, not {named!r}.", code="bad-schema")
     for pointer, leaf in _members(tree):
         if _is_reference(leaf):
             detail = "Send the array itself (dtype, shape, data); a reference to content is no document's own."
@@ -207,7 +207,7 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> No
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
-    """Store documents with the arrays and files of others, given by digest, and other text."""
+    """Store documents that have the arrays and files of stored documents, given by digest, but other text."""
     if not variants:
         return
     digests = [digest_of_body(body) for _, body in variants]
@@ -243,7 +243,7 @@ def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> Non
 
 
 def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
-    """Record which blobs documents hold: digest of the document, JSON Pointer, digest of the blob."""
+    """Record references of documents to blobs: digest of the document, JSON Pointer, digest of the blob."""
     columns = ("document_digest", "pointer", "blob_digest")
     rows = [dict(zip(columns, one, strict=True)) for one in references]
     if rows:

@@ -88,14 +88,14 @@ def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElemen
 
 
 def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_us: int) -> list[str]:
-    """Return those of `digests` that may still be deleted, locked so that this stays true."""
+    """Return the digests whose rows may still be deleted, and lock these rows so that this stays true."""
     chosen = table.c.digest.in_(digests)
     tx.execute(select(table.c.digest).where(chosen).order_by(table.c.digest).with_for_update()).all()
     return list(tx.execute(select(table.c.digest).where(chosen, *_garbage(tx, table, grace_us))).scalars())
 
 
 def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of the given documents that have no references."""
+    """Delete the given documents, except those with references."""
     going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
     tx.execute(delete(document_blob).where(document_blob.c.document_digest.in_(going)))
     tx.execute(delete(document).where(document.c.digest.in_(going)))
@@ -116,7 +116,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
 
 
 def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete those of the given blobs that have no references."""
+    """Delete the given blobs, except those with references."""
     going = _still_garbage(tx, blob, digests, grace_us)
     for digest in going:
         tx.blobs.release(tx.connection, digest)

@@ -33,7 +33,7 @@ class StoredAnswer:
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
     """Claim `key` for a request and return None, or return the stored answer of the same request.
 
-    `fingerprint` identifies the request and the reach of the token, so that a token with fewer rights cannot get the
+    `fingerprint` identifies the request and the scopes of the token, so that a token with fewer rights cannot get the
     answer given to one with more. Raises `InvalidProblem` if the key was used for another request. The caller must call
     `finish` in the same transaction.
     """

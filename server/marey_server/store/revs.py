@@ -1,4 +1,4 @@
-"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count says if it held."""
+"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count shows if it held."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ExpectedRev = int | frozenset[int] | None
 
 
 def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
-    """Return the condition, for the statement that writes, that the row is at an expected `rev`."""
+    """Return the condition that the row is at an expected `rev`, for the statement that writes."""
     if expected is None:
         return true()
     return column == expected if isinstance(expected, int) else column.in_(sorted(expected))

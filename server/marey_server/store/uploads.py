@@ -45,7 +45,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
     """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
     user_id = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
-        raise TooLargeProblem(f"An upload holds 1 to {MAX_UPLOAD_BYTES} bytes.")
+        raise TooLargeProblem(f"An upload must have 1 to {MAX_UPLOAD_BYTES} bytes.")
     upload_id = new_id("upload")
     row = {
         "id": upload_id, "user_id": user_id, "length": length, "offset": 0, "digest": digest,

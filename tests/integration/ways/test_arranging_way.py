@@ -100,7 +100,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is nothing at lab/raw/nobody"),
         (["mv", "lab/raw/a"], 2, "give what to move and the destination"),
         (["mv", "lab", "lab/b"], 2, "'lab' is a project"),
-        (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot move into itself"),
+        (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot be moved into itself"),
         (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),
         (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: confirm with --yes"),
         (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is given, too"),

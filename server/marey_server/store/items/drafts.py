@@ -12,7 +12,7 @@ from marey_server.store.documents import PreparedDocument
 
 @dataclass(frozen=True, slots=True)
 class StoredDocument:
-    """Digest of a stored document. Only for digests from the server itself: possession is not checked."""
+    """Digest of a stored document. Only for digests from the server itself: the caller's access is not checked."""
 
     digest: str
 
@@ -41,7 +41,7 @@ class Draft:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Revision published from a draft. `created`: whether this draft created it, or it existed before."""
+    """Revision published from a draft. `created` is false if the revision existed before."""
 
     name: str
     item: str

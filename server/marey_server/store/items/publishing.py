@@ -164,7 +164,7 @@ class _Publication:
         self._references = references.ReferenceCheck(self.tx, self.project)
 
     def add(self, group: Sequence[_Loaded]) -> None:
-        """Publish drafts of one kind that are found in one way and have different places."""
+        """Publish drafts that have the same kind, the same `reuse`, and different places."""
         kind, reuse = group[0].draft.kind, group[0].draft.reuse
         waiting = self._store(group)
         for one in waiting:
@@ -215,7 +215,7 @@ class _Publication:
     # -- finding -------------------------------------------------------------------------------------------------------
 
     def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
-        """Return the existing items to which drafts add revisions or which have their content, by the drafts' names."""
+        """Return existing items by the names of drafts that add a revision to them or have the same content."""
         if reuse == "new":
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
@@ -236,7 +236,7 @@ class _Publication:
         return found
 
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
-        """Find the first item whose required parts are equal, for each draft."""
+        """For each draft, find the first item whose required parts are equal."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
         statement = select(item.c.id, item.c.head).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
@@ -255,7 +255,7 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first of the drafts with equal content: the others find the item that it makes."""
+        """Return the first draft of each content; drafts with the same content then find the item that it creates."""
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)

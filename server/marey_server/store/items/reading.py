@@ -1,4 +1,4 @@
-"""Reading of items, their parts and the documents of these."""
+"""Reading of items, of their parts, and of the documents of parts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from marey_server.store.transaction import Transaction
 
 
 def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
-    """Return those of the digests that are the current content of a part of some item of the project."""
+    """Return the digests that are the current content of a part of any item of the project."""
     row = projects.require(tx, project)
     statement = (
         select(revision_part.c.document_digest)

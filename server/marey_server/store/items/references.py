@@ -81,7 +81,7 @@ class ReferenceCheck:
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
     def know(self, published: Published, bodies: Mapping[str, Tree]) -> None:
-        """Keep the parts of a revision that this write has stored or found, so that they are not read."""
+        """Remember the parts of a revision that this write has stored or found, so that they are not read again."""
         for part, body in bodies.items():
             self._seen[published.item, published.revision, published.kind, part] = body
 

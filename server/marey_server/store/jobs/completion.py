@@ -42,7 +42,7 @@ _Place = tuple[str, int]
 
 
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
-    """End the job with success and publish its staged outputs; repeating a `write_id` repeats the answer.
+    """End the job with success and publish its staged outputs; a repeated `write_id` gets the same answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended it with another `write_id`.
     """
@@ -203,7 +203,7 @@ def _result(
     place = (one.job, one.fence)
     try:
         if place not in own:
-            raise NotFoundProblem(f"You have not claimed an attempt {one.fence} of {one.job}.")
+            raise NotFoundProblem(f"You have not claimed attempt {one.fence} of {one.job}.")
         if place in refused:
             raise refused[place]
         answer = answers.get(place) or _same_answer(tx, place, one.write_id)
@@ -218,7 +218,7 @@ def _result(
 def fail(
     tx: Transaction, job_id: str, fence: int, request: FailRequest, policy: QueuePolicy = DEFAULT_POLICY
 ) -> FailAnswer:
-    """End the attempt without success; repeating a `write_id` repeats the answer.
+    """End the attempt without success; a repeated `write_id` gets the same answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended with another `write_id`.
     """

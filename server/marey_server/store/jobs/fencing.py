@@ -49,8 +49,7 @@ def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
     """Check that the caller's credential belongs to this attempt.
 
-    Raises `NotFoundProblem` for a credential of no attempt of this job, and `LeaseLostProblem` for one of another
-    attempt of it.
+    Raises `LeaseLostProblem` if it belongs to another attempt of the job, and `NotFoundProblem` if it belongs to none.
     """
     if principal.kind == "system":
         return
@@ -87,5 +86,5 @@ def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> di
 
 
 def earlier(first: Any, second: Any) -> ColumnElement[int]:
-    """Return the SQL expression for the smaller of two times, whose function differs between the databases."""
+    """Return the SQL expression for the earlier of two times; SQLite and Postgres have different functions for it."""
     return case((first < second, first), else_=second)

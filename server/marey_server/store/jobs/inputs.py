@@ -67,7 +67,7 @@ def pin_inputs(
     known: dict[str, FoundItem],
     at: str = "",
 ) -> PinnedInputs:
-    """Pin every input to the revision named or the newest; collections are replaced by their items.
+    """Pin every input to the named revision, or else to the newest; collections are replaced by their items.
 
     Outputs of other jobs are pinned later (`late_inputs`). `known` holds the items that `find_items` returned for the
     request.

@@ -66,7 +66,7 @@ def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]
 
 
 def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
-    """Return the job with its inputs pinned, by the current declaration of its kind, which may have changed since."""
+    """Return the job with its inputs pinned; its kind may have changed since the submission."""
     try:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)

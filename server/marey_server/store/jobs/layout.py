@@ -108,7 +108,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """Return the tasks of a job that has several, and make it a gathering job; its tasks start when it does."""
+    """If a job has several tasks, make it a gathering job and return the tasks; they start when it does."""
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []
@@ -126,7 +126,7 @@ def _spread(head: NewJob) -> list[NewJob]:
 
 
 def _shares(submission: Submission) -> list[PinnedInputs]:
-    """Return the inputs of each task: a share of the input that is split, or all inputs if tasks are only counted."""
+    """Return the inputs of each task: a share of the input that is split, or all inputs if none is split."""
     fanned = submission.kind.fan_out
     if fanned is None:
         return [submission.pins] * submission.task_count

@@ -165,7 +165,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel tasks that have not started, if a worker would gather them: after a failure nothing is gathered."""
+    """Cancel tasks that have not started, if a worker would combine the results: after a failure it does not."""
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)

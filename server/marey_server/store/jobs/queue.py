@@ -50,7 +50,7 @@ from marey_server.store.transaction import Transaction
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
     """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
-    Raises `ForbiddenProblem` if the caller may not work, and `InvalidProblem` for another version of the protocol.
+    Raises `ForbiddenProblem` if the caller may not claim jobs, and `InvalidProblem` for another protocol version.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
@@ -153,7 +153,7 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
 
 
 def _pick(restriction: _Restriction) -> CTE:
-    """Return the query for ids to claim: of jobs with one concurrency key the first, and none while one is running."""
+    """Return the query for ids to claim: at most one job of each concurrency key, and none if one is running."""
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
         conditions = [

@@ -228,7 +228,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the shared result of a waiting job as its own; return no end if the result is no longer stored.
+    """Publish the shared result of a waiting job as its own; return None if the result is no longer stored.
 
     Raises the errors of `publish`.
     """

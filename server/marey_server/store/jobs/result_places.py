@@ -1,4 +1,4 @@
-"""Places of results: checks before a job is queued that do not need its results.
+"""Checks of the places of results before a job is queued, when its results are not known yet.
 
 The worker checks again for each clip, but each task of a job knows only its own share of the inputs.
 """

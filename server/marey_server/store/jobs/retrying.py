@@ -1,4 +1,4 @@
-"""Retries of jobs without success, of their unsuccessful dependencies, and of dependants that ended with them."""
+"""Retries of failed or cancelled jobs, of unsuccessful dependencies, and of dependants that ended because of them."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return jobs without a retry that ended because one of these did, if the caller may retry them."""
+        """Return the jobs that ended because one of these did, have no retry, and may be retried by the caller."""
         later = job.alias("later")
         statement = (
             select(job)

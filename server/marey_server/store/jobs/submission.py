@@ -80,8 +80,8 @@ def submit_checked(
 ) -> list[Job]:
     """Insert the rows of checked jobs and queue those without unfinished dependencies.
 
-    `upstream` holds the states of the jobs they depend on, which must be locked; one that is among the submissions
-    counts as waiting.
+    `upstream` maps the jobs that they depend on to their states; these jobs must be locked. A dependency among the
+    submissions counts as waiting.
     """
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
@@ -191,7 +191,7 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
 
 
 def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
-    """Check that jobs named as sources of an input have a kind that produces it; those of the request are steps."""
+    """Check that each source job of an input produces items of its kind; errors call jobs of the same request steps."""
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind
         try:
@@ -199,7 +199,8 @@ def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_b
         except UnknownKindError:
             continue  # of a kind that this server knew once: what it made counts
         if wanted not in makes:
-            detail = f"{upstream[maker].kind} makes {', '.join(sorted(set(makes))) or 'nothing'}, and no {wanted}."
+            made = ", ".join(sorted(set(makes))) or "nothing"
+            detail = f"A job of the kind {upstream[maker].kind} creates {made}, but this input needs {wanted}."
             raise _invalid(f"{place}/{'step' if maker in to_be else 'job'}", "wrong-kind", detail)
 
 
