@@ -1,9 +1,10 @@
 """Verdict on a data set by simple rules.
 
-A trial counts as followed when the character, on average over it,
+A trial counts as followed if the character meets three limits, on average over the trial:
 
-* is no farther from the desired position than it travels in half a second at the desired speed, * is no more than 15 %
-faster or slower than desired, and * turns no more than 10 degrees a second faster or slower than desired.
+* its distance from the desired position is at most the distance that it travels in half a second at the desired speed,
+* its speed differs from the desired speed by at most 15 %,
+* its turn rate differs from the desired one by at most 10 degrees a second.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
 poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade is within reach.
