@@ -27,7 +27,7 @@ class Visibility(StrEnum):
 
 
 class Scope(StrEnum):
-    """Permission of a token, which never exceeds that of its user."""
+    """Permission that a token grants, within the permissions of its user."""
 
     READ = "read"
     WRITE = "write"
@@ -52,7 +52,7 @@ class UserCreate(Request):
 
 
 class UserChange(Request):
-    """Changes of a user; absent fields stay unchanged. Users who change their own password give the current one."""
+    """Request to change a user; absent fields stay unchanged. A new password of one's own requires the current one."""
 
     display_name: DisplayName | None = None
     password: Password | None = None
@@ -129,7 +129,7 @@ class ProjectCreate(Request):
 
 
 class ProjectChange(Request):
-    """Changes of a project; absent fields stay unchanged."""
+    """Request to change a project; absent fields stay unchanged."""
 
     title: DisplayName | None = None
     description: str | None = Field(None, max_length=10_000)

@@ -17,10 +17,10 @@ class Backoff:
     Parameters
     ----------
     first_s : seconds to wait after the first failure
-    longest_s : seconds that no wait exceeds
+    longest_s : longest wait in seconds
     factor : growth of the wait from one failure to the next
-    jitter : largest share of a wait that is taken off at random; 1 for any wait from zero on
-    random_unit : draws from [0, 1); a test that gives its own makes the waits predictable
+    jitter : largest share of a wait that is subtracted at random, from 0 to 1
+    random_unit : function that returns a random number in [0, 1); tests replace it to make the waits predictable
     """
 
     first_s: float

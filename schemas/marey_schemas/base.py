@@ -22,15 +22,16 @@ class Answer(BaseModel):
 
 
 class Options(Request):
-    """Base of the options of a computation: each option has its type, range, default and description here only.
+    """Base of the options of a computation.
 
-    Parameters of jobs embed or extend them, and `marey_motion` takes them as they are. A value out of range raises
+    Subclasses declare the type, range, default and description of each option. Parameters of jobs embed or extend
+    these classes, and functions of `marey_motion` take their instances. A value out of range raises
     `pydantic.ValidationError`, which names the field. Instances are frozen, and hashable if their values are.
     """
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Return these options from a model that extends them, without its other fields."""
+        """Return an instance of this class with the values that a model with at least the same fields has for them."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:
@@ -43,9 +44,9 @@ def _require_tag(schema: dict[str, Any], model: type[Any]) -> None:
 
 
 class Tagged(Options):
-    """Options of one of several classes that the value of a field, their tag, distinguishes.
+    """Options with several alternative classes, which are distinguished by the value of one field, the tag.
 
-    Documents must contain the tag. In Python it is the default of its class.
+    Documents must contain the tag. In Python it may be omitted, because each class has its own value as default.
     """
 
     model_config = ConfigDict(json_schema_extra=_require_tag)
@@ -53,5 +54,5 @@ class Tagged(Options):
 
     @model_serializer(mode="wrap")
     def _with_tag(self, serialise: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Write the tag also into documents without defaults or without fields that were not set."""
+        """Include the tag in documents from which default values or unset fields are omitted."""
         return {**serialise(self), self.tag: getattr(self, self.tag)}

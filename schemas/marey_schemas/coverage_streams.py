@@ -52,7 +52,9 @@ class CoverageStreamCreate(Request):
         description="Frame rate of the frames that will be sent, in hertz.",
     )
     skeleton: ItemId | None = Field(None, description="Skeleton of the poses that will be sent; not needed for roots.")
-    evaluation: ItemId | None = Field(None, description="Evaluation whose grid and coverage the stream starts with.")
+    evaluation: ItemId | None = Field(
+        None, description="Evaluation whose grid and coverage are the initial state of the stream."
+    )
     speeds_m_s: tuple[Speed, ...] | None = Field(
         None,
         min_length=1,
@@ -83,7 +85,7 @@ class CoverageStreamCreate(Request):
     def _check_grid(self) -> Self:
         for name in ("speeds_m_s", "turn_rates_deg_s", "least_s"):
             if self.evaluation is not None and getattr(self, name) is not None:
-                raise ValueError(f"{name}: the evaluation sets it already; give only one of the two")
+                raise ValueError(f"{name}: the evaluation contains it already; give only one of the two")
         for name in ("speeds_m_s", "turn_rates_deg_s"):
             values = getattr(self, name) or ()
             if len(set(values)) != len(values):
@@ -96,7 +98,7 @@ class CoverageStreamCreate(Request):
 
 
 class CoverageFrames(Request):
-    """Next frames of a performance, of type <f4 or <f8."""
+    """Next frames of a performance, as arrays of dtype <f4 or <f8."""
 
     offset: int = Field(ge=0, le=2**53, description="Number of frames that were sent before these.")
     poses: Annotated[NDArray[Any], ArrayOf(ndim=2)] | None = Field(
@@ -158,7 +160,7 @@ class CoverageTarget(CoverageCell):
 
 
 class Performer(Answer):
-    """Position of the performer in the newest frame, and motion in the newest second that is measured."""
+    """Position of the performer in the newest frame, and velocity over the newest measured second."""
 
     x_m: float
     z_m: float
@@ -221,7 +223,7 @@ class CoverageStreamState(CoverageStream, CoverageNow):
 
 
 class MeasuredOptions(Answer):
-    """The options of an evaluation that its coverage depends on."""
+    """Options of an evaluation that determine its coverage."""
 
     grid: Grid
     coverage_least_s: float = Field(gt=0, le=3600)

@@ -45,16 +45,16 @@ class FileFormat:
     ----------
     name : name in choices and options, and of the modules of its reader and writer
     endings : endings of file names, lower case; folders are searched for them, and the first is the one written
-    media_type : of written files
+    media_type : media type of written files
     reads, writes : contents that its reader understands and its writer can write
-    units : units of length that it is written in; more than one: the caller chooses
+    units : units of length in which files can be written; if there are several, the caller chooses one
     begins : pattern that only the beginning of such a file matches; None if the name alone identifies it
     other_endings : endings that identify a named file, but that folders are not searched for
-    euler : its rotations are Euler angles, whose orders an export keeps from the import
-    archive : its files are ZIP archives with an ending of their own
+    euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
+    archive : whether files are ZIP archives with an ending of their own
     companion : format of a second file that its reader takes
-    needs_companion : why that file is needed; empty if it is optional
-    unread : why there is no reader, for files that people expect to be read
+    needs_companion : reason why the second file is needed; empty if it is optional
+    unread : reason why there is no reader, for formats that users may expect
     """
 
     name: str
@@ -161,11 +161,11 @@ SAMPLE_FORMATS = (*MOTION_FORMATS, "json")
 EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
 """Choices of an export."""
 WRITTEN_UNITS = tuple(dict.fromkeys(unit for one in FORMATS if len(one.units) > 1 for unit in one.units))
-"""Units that the caller can choose from where a format leaves its unit open."""
+"""Units that the caller can choose from if the format does not fix the unit."""
 DEFAULT_FORMAT = "bvh"
-"""Format of motion files that are written where the caller chooses none."""
+"""Default format of written motion files."""
 DEFAULT_UNIT = "cm"
-"""Unit of length of files that are written where the caller chooses none."""
+"""Default unit of length of written files."""
 MOTION_MEDIA_TYPES = tuple(dict.fromkeys(format_named(name).media_type for name in MOTION_FORMATS))
 EXPORT_MEDIA_TYPES = tuple(dict.fromkeys((OCTETS, *(one.media_type for one in FORMATS if one.writes))))
 

@@ -14,8 +14,8 @@ from marey_schemas.kinds import Kind
 class ItemToExport:
     """Documents of an item at one revision.
 
-    `hierarchy` is that of the skeleton of its motion or model. `tags` None leaves them out of the file: a job does not
-    read them, because they may change although its inputs are pinned.
+    `hierarchy` belongs to the skeleton of the motion or model. If `tags` is None, the file contains no tags: jobs omit
+    tags, because these can change without a new revision.
     """
 
     item: str

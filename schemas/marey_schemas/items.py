@@ -125,7 +125,7 @@ class LineageEdge(Answer):
     name: str
     revision: int
     job: str | None
-    role: str = Field(description="The job input that the revision was used as.")
+    role: str = Field(description="Name of the job input for which the revision was used.")
 
 
 class Lineage(Answer):
@@ -162,7 +162,7 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Question which of the given blobs the server lacks; blobs hidden from the caller count as lacking."""
+    """Query which of the given blobs are missing on the server; blobs hidden from the caller count as missing."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 

@@ -20,7 +20,7 @@ from marey_schemas.kinds import PARTS, Kind
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
-"""Tasks that the parameters of one job may make."""
+"""Greatest number of tasks of a job whose parameters determine the number."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,22 @@ class KindDeclaration:
     `version` changes whenever the same inputs, parameters and seed may give other results; cached results of another
     version are not used. `implementation` names the worker's function `run(context, params)` as `module:function`.
 
-    A job is spread over tasks in one of two ways. With `fan_out`, each task gets `batch_size` items of that input, and
-    the whole is the sum of its tasks. With `task_count`, the checked parameters say how many tasks there are; each gets
-    all inputs, and `context.task` is its number. When all have succeeded, a worker runs `gathering`, a function
-    `gather(context, params, results)`, on their results in order. If `task_count` is one, a single job runs both
-    functions.
+    A job is split into tasks in one of two ways. With `fan_out`, each task gets `batch_size` items of that input, and
+    the result of the job is the sum of the results of its tasks. With `task_count`, this function returns the number of
+    tasks for given parameters; each task gets all inputs, and `context.task` is its number. When all tasks have
+    succeeded, a worker runs `gathering`, a function `gather(context, params, results)`, on their results in order. If
+    there is only one task, a single job runs both functions.
 
-    Results are published again for identical jobs: for those of the same parameters, seed, and inputs, each with its
-    name, place and content. Further facts that determine the results are declared, and distinguish jobs:
+    Identical jobs reuse results. Jobs are identical if they have the same parameters, seed, and inputs with the same
+    names, places and contents. Further facts that determine the results of a kind are declared, and distinguish jobs:
 
-    * `place_counts`: the collection they go to.
-    * `newest_of`: parameters that each name an item, or none, whose newest revision is read.
-    * `never_cached_for`: returns whether a job with the given parameters looks up names while it runs.
-    * `in_place`: a parameter with which results replace their sources, if these are still the newest revisions.
-      `never_cached_without`: inputs without which a job looks up names while it runs. Results of jobs that look up
-      names are not used again.
+    * `place_counts`: whether the collection that receives the results is such a fact.
+    * `newest_of`: parameters that are the id of an item, or null; the newest revision of that item is such a fact.
+    * `never_cached_for`: function that returns whether a job with the given parameters looks up names while it runs.
+    * `never_cached_without`: inputs without which a job looks up names while it runs.
+    * `in_place`: parameter with which results replace their sources, if these are still the newest revisions.
+
+    Results of jobs that look up names are never reused.
 
     `named_after` is the input whose items lend their places and names to the results; the parameter `suffix` is
     appended. `unclear_place` returns the reason why parameters and a collection do not determine the place of the
@@ -131,7 +132,7 @@ _RIGS = InputSpec(
 
 
 def _may_hold_graphs(params: Mapping[str, Any]) -> bool:
-    """Return whether a file of an import may be a graph, whose models are found by their names."""
+    """Return whether an import may contain a graph, whose models are looked up by name."""
     rows = [row for row in IMPORTED if "graph" in row.reads]
     return any(row.names(file["name"]) for file in params["files"] for row in rows)
 

@@ -123,7 +123,7 @@ class CutParams(TaggedResults):
 
 MOST_TRIALS = 2000
 MOST_SIMULATED_S = 100_000.0
-"""Greatest duration of all trials together in seconds; that of the default suite is 5,346 s."""
+"""Greatest total duration of all trials, in seconds; the default suite has 5,346 s."""
 TRIALS_PER_TASK = 8
 MOST_EVALUATION_TASKS = 64
 
@@ -169,13 +169,13 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Return the number of tasks for the trials: a few trials each, so that a lost task loses little."""
+    """Return the number of tasks for the trials; each task runs few trials, so that its failure loses little work."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 
 
 WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
-"""Groups of every database; the settings of extra joints, where there are any, are spread over the same tasks."""
+"""Number of feature groups of every database, without extra joints, which do not increase the number of tasks."""
 
 
 class CompareParams(Request):

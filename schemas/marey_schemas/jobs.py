@@ -116,7 +116,7 @@ class JobCreate(Request):
     priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(
-        "fail", description="The reaction if a job in `after` does not succeed."
+        "fail", description="Consequence for this job if a job in `after` does not succeed."
     )
     concurrency_key: str | None = Field(
         None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
@@ -168,7 +168,7 @@ class Job(Answer):
     state: JobState
     params: dict[str, Any]
     inputs: dict[str, Any] = Field(
-        description="Inputs by name: items with their revisions, or `{job}` for results that this job has yet to make."
+        description="Inputs by name: items with their revisions, or `{job}` for outputs of an unfinished job."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str

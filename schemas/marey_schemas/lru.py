@@ -16,7 +16,7 @@ class LruCache(Generic[Key, Value]):
 
     Parameters
     ----------
-    max_entries : largest number of values; None for any number
+    max_entries : largest number of values; None for no limit
     max_bytes : largest sum of `size_of` over all values; None for any sum. The newest value is kept even if it alone
         is larger, unless it exceeds `largest_bytes`.
     largest_bytes : values larger than this are not kept, so that one of them does not displace all others

@@ -16,7 +16,7 @@ StepName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]
 
 
 class StepOutputsInput(Request):
-    """All outputs of another step that have the input's kind. The step waits for that one."""
+    """All outputs of another step that have the input's kind. The step with this input waits for the other step."""
 
     step: StepName
 
@@ -25,7 +25,7 @@ StepInput = JobInput | StepOutputsInput
 
 
 class PipelineStep(Request):
-    """Job of a pipeline. Fields of the second group that are absent are those of the pipeline."""
+    """Job of a pipeline. The fields from `into` on default to those of the pipeline."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)

@@ -103,7 +103,7 @@ class SearchRequest(RefineOptions):
 
 
 class ConstraintError(Answer):
-    """Error of a constraint, in the unit at the end of its name."""
+    """Error of a constraint; the unit is at the end of the field's name."""
 
     step: int = Field(description="Index of the step, from 0.")
     constraint: int = Field(description="Index of the constraint within its step, from 0.")
@@ -128,7 +128,7 @@ class FoundStep(Answer):
     log_likelihood: float
     likelihood_percentile: float | None = Field(
         None,
-        description="Percentage of the training examples that are less likely; null if their likelihoods are unknown.",
+        description="Percentage of training examples less likely than the motion; null if unknown.",
     )
     duration_s: float
     placement: StartPlacement

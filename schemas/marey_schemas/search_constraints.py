@@ -101,12 +101,12 @@ class LookDirectionConstraint(_AngularConstraint):
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
     )
-    axis: Direction = Field((0.0, 0.0, 1.0), description="Axis that shall point there, in the joint's own frame.")
+    axis: Direction = Field((0.0, 0.0, 1.0), description="Axis that points there, in the joint's own frame.")
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if (self.direction is None) == (self.point_m is None):
-            raise _invalid("direction: give a direction or a point")
+            raise _invalid("give either direction or point_m")
         return self
 
 

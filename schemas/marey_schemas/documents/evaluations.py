@@ -9,14 +9,14 @@ from pydantic import ConfigDict, Field
 from marey_schemas.base import Request
 
 COSTS = ("match_cost", "continuing_cost", "pose_cost")
-"""Costs that the part `trials` holds for each tick."""
+"""Costs that the part `records` contains for each tick."""
 
 
 class EvaluationDocument(Request):
     """Part `evaluation`: options, provenance, metrics of every trial, usage, coverage, baseline.
 
-    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves; what is fixed
-    here is what lists and summaries show.
+    Its members are those of `marey_motion.evaluation.result.EvaluationResult`, with arrays as leaves. This class
+    declares only the members that lists and summaries show.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -29,7 +29,7 @@ class EvaluationDocument(Request):
 
 
 class EvaluationRecords(Request):
-    """Part `records`: every tick of every trial, joined over the trials."""
+    """Part `records`: the ticks of all trials, one trial after the other."""
 
     model_config = ConfigDict(extra="allow")
 

@@ -72,7 +72,7 @@ class MixtureDocument(Request):
     def _check_shapes(self) -> Self:
         count, dimensions = self.means.shape
         if count < 1 or self.weights.shape != (count,):
-            raise ValueError(f"weights: {len(self.weights)} for {count} means")
+            raise ValueError(f"weights: {len(self.weights)} values for {count} means")
         if self.covariances.shape != (count, dimensions, dimensions):
             expected = (count, dimensions, dimensions)
             raise ValueError(f"covariances: shape {self.covariances.shape}, expected {expected}")
@@ -82,7 +82,7 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Record of the training of a model; some members are read again, others are allowed and ignored."""
+    """Base of records of the training of a model; members that the record does not declare are allowed and ignored."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -120,9 +120,10 @@ class TrainingNotes(Noted):
 class MotionPrimitiveDocument(Request):
     """Part `model`: a generative model of one action.
 
-    A latent vector holds the scores of the spatial components, then `temporal_weight` times those of the temporal ones.
-    The spatial functions give root translation (m) and local quaternions, to be brought to unit length, at canonical
-    frames; the temporal function the natural logarithm of how many frames of real time pass in each canonical step.
+    A latent vector contains the scores of the spatial components, then `temporal_weight` times the scores of the
+    temporal components. The value of the spatial functions at a canonical frame is the root translation (m) and local
+    quaternions, which must be normalised. The value of the temporal function is ln(dt), where dt is the number of
+    frames of real time that pass in one canonical step.
     """
 
     schema_: Literal["marey/motion-primitive@1"] = Field("marey/motion-primitive@1", alias="schema")
@@ -175,7 +176,7 @@ class MotionPrimitiveDocument(Request):
             raise ValueError("duration_range_s: the second number must not be less than the first")
         dimensions = len(self.spatial.directions) + len(self.temporal.directions)
         if self.mixture.means.shape[1] != dimensions:
-            raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for {dimensions} components")
+            raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for the {dimensions} components")
         if self.log_slope_range is not None and not self.log_slope_range[0] <= self.log_slope_range[1]:
             raise ValueError("log_slope_range: the second number must not be less than the first")
         return self
@@ -195,7 +196,7 @@ def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
 
 
 def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the examples' log-likelihoods in a part `model`; none if an older document has another form."""
+    """Return the examples' log-likelihoods in a part `model`; empty if an older document has another form."""
     try:
         examples = TrainingNotes.model_validate(model.get("training") or {}).examples
     except ValidationError:

@@ -17,7 +17,7 @@ class RevisionRef(Request):
 
 
 class OutputRef(Request):
-    """A reference to another output of the same write; the store replaces it by the item it becomes."""
+    """A reference to another output of the same write; the store replaces it by a reference to the stored item."""
 
     output: str
 

@@ -45,5 +45,5 @@ class SampleTreeDocument(Request):
         if not len(self.sizes) or self.sizes[0] != len(self.samples):
             raise ValueError(f"sizes: the first node must hold all {len(self.samples)} samples")
         if len(self.samples) > MOST_TREE_SAMPLES:
-            raise ValueError(f"samples: {len(self.samples):,}, over {MOST_TREE_SAMPLES:,}")
+            raise ValueError(f"samples: {len(self.samples):,} samples; at most {MOST_TREE_SAMPLES:,} are accepted")
         return self

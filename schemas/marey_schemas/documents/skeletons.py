@@ -54,7 +54,7 @@ class SkeletonHierarchy(Request):
             seen.add(joint.name)
             if (joint.parent == -1) != (index == 0) or joint.parent >= index:
                 place = f"joints[{index}] ({joint.name})"
-                raise ValueError(f"{place}: parent {joint.parent} must come before it; only joint 0 is the root")
+                raise ValueError(f"{place}: parent {joint.parent} must come before the joint; only joint 0 is the root")
         for index, site in enumerate(self.end_sites):
             if site.joint >= len(self.joints):
                 raise ValueError(f"end_sites[{index}]: joint {site.joint} does not exist")

@@ -47,7 +47,7 @@ class MergeSegment(Request):
 
     command: Literal["merge_segment"]
     at: Frame = Field(description="Any frame of the segment whose label is kept.")
-    neighbour: Literal["next", "previous", "nearest"] = "next"
+    neighbour: Literal["next", "previous", "nearest"] = Field("next", description="The segment to merge with.")
 
 
 class MoveBoundary(Request):
@@ -121,7 +121,9 @@ class AnnotationChange(Request):
 
 
 class AnnotationImport(Request):
-    """An annotation of a clip in one of the predecessor's forms: `sections`, or `semantic_annotation`."""
+    """Request to import an annotation of a clip from a document of Marey's predecessor.
+
+    The document has one of the forms `sections` and `semantic_annotation`."""
 
     document: dict[str, Any] = Field(description="The predecessor's document, as it stores or exports it.")
     layer: LayerName = "imported"

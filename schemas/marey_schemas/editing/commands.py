@@ -165,15 +165,15 @@ class Face(NamedCommand):
     command: Literal["face"] = "face"
     heading_deg: Degrees = Field(0.0, description="Heading in degrees; 0 faces +z, and positive is to the left.")
     frame: Frame = Field(
-        0, description="The frame in which the body shall face there; its position in that frame does not change."
+        0, description="The frame in which the body has this heading; its position in that frame does not change."
     )
 
 
 class MoveToOrigin(NamedCommand):
-    """Shift the whole motion on the ground so that the body is above the origin in a frame; heights stay."""
+    """Shift the whole motion on the ground so that the body is above the origin in a frame; heights do not change."""
 
     command: Literal["move_to_origin"] = "move_to_origin"
-    frame: Frame = Field(0, description="The frame in which the body shall be at the place.")
+    frame: Frame = Field(0, description="The frame in which the body is above the origin.")
 
 
 class Scale(NamedCommand):
@@ -188,24 +188,24 @@ SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
 class FlipAxes(NamedCommand):
-    """Turn a world with other axes, such as Blender's with Z up, to Y up."""
+    """Convert a motion recorded with other axes, such as Blender's Z up, to axes with Y up."""
 
     command: Literal["flip_axes"] = "flip_axes"
-    up: SignedAxis = Field("+z", description="The axis of the clip that points up now.")
-    forward: SignedAxis = Field("-y", description="The axis that shall become +z; it is orthogonal to `up`.")
+    up: SignedAxis = Field("+z", description="The axis of the clip that points up before the conversion.")
+    forward: SignedAxis = Field("-y", description="The axis that becomes +z; it is orthogonal to `up`.")
 
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
         if self.up[1] == self.forward[1]:
-            raise ValueError(f"up {self.up} and forward {self.forward} lie on one axis")
+            raise ValueError(f"up {self.up} and forward {self.forward} lie on one axis; choose two different axes")
         return self
 
 
 class FixDrift(NamedCommand):
-    """Spread a shift and a turn of the body over a range of frames; the frames after it are moved by all of it."""
+    """Spread a shift and a turn of the body over a range of frames; later frames get the whole shift and turn."""
 
     command: Literal["fix_drift"] = "fix_drift"
-    shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range.")
+    shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range, in metres along x, y and z.")
     turn_deg: Degrees = Field(
         0.0, description="Turn of the end of the range about the vertical, in degrees, positive to the left."
     )
@@ -224,7 +224,7 @@ class MoveToGround(NamedCommand):
     command: Literal["move_to_ground"] = "move_to_ground"
     height_m: Metres | None = Field(
         None,
-        description="Present height of the ground, in metres; absent: estimated from the feet during their contacts.",
+        description="Height of the ground before the command, in metres; absent: estimated from feet in contact.",
     )
 
 
@@ -243,7 +243,7 @@ class FindContacts(NamedCommand, ContactOptions):
         gt=0,
         le=100,
         allow_inf_nan=False,
-        description="Greatest height above the ground of a foot in contact; null: any height.",
+        description="Greatest height above the ground of a foot in contact, in metres; null: any height.",
     )
 
 
@@ -296,7 +296,7 @@ class RotateJoint(NamedCommand):
 
 
 class Paste(NamedCommand):
-    """Put the motion of joints of another clip in place of their own, stretched in time to fit."""
+    """Replace the motion of joints by their motion in another clip, stretched in time to fit."""
 
     command: Literal["paste"] = "paste"
     source: ItemId = Field(description="The clip to copy from.")

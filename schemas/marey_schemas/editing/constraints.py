@@ -44,7 +44,7 @@ Opening = Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)]
 
 def _require_range(angles: tuple[float, float]) -> tuple[float, float]:
     if angles[0] > angles[1]:
-        raise ValueError(f"the least angle {angles[0]} is greater than {angles[1]}")
+        raise ValueError(f"the least angle, {angles[0]}, is greater than the greatest angle, {angles[1]}")
     return angles
 
 
@@ -70,7 +70,7 @@ class _Constraint(Tagged):
 
 
 class PositionConstraint(_Constraint):
-    """Position of a joint or of a point that it carries; by default its initial position is kept."""
+    """Position of a joint, or of a point fixed to a joint; by default, its position in the first frame is kept."""
 
     kind: Literal["position"] = "position"
     point_m: Shift | None = Field(None, description="Target position in the world, in metres.")
@@ -107,7 +107,7 @@ class LookAtConstraint(_Constraint):
     point_m: Shift
     axis: Axis | None = Field(
         None,
-        description="The direction that shall point at the target, in the joint's frame; absent: the front "
+        description="The direction that points at the target, in the joint's frame; absent: the front "
         "of head and trunk, the bone of limbs.",
     )
     offset_m: Shift = Field((0.0, 0.0, 0.0), description="Offset of the eye from the joint, in the joint's frame.")
@@ -189,7 +189,7 @@ class PlantOptions(Options):
         ge=0,
         le=90,
         allow_inf_nan=False,
-        description="Angle before full extension at which a stretching knee is damped.",
+        description="Angle before full extension at which the damping of a stretching knee begins, in degrees.",
     )
 
 

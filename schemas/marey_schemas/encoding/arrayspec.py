@@ -89,5 +89,5 @@ def require_finite(array: NDArray[Any]) -> NDArray[Any]:
         if not finite.all():
             index = np.unravel_index(int(np.argmin(finite)), array.shape)
             where = [int(i) for i in index]
-            raise ArrayError("not-finite", f"element {where} is {array[index]};only finite numbers can be encoded")
+            raise ArrayError("not-finite", f"element {where} is {array[index]}; only finite numbers can be encoded")
     return array

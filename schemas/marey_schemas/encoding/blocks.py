@@ -190,7 +190,7 @@ def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
     sizes = np.frombuffer(data, "<u4", count, table)
     starts = [end + 4, *(end + 4 + np.cumsum(sizes, dtype=np.int64)).tolist()]
     if starts[-1] != len(data):
-        raise BlockError(f"{len(data)} bytes were given, but the index gives {starts[-1]}")
+        raise BlockError(f"{len(data)} bytes were given, but the index requires {starts[-1]}")
     return layout, starts
 
 
@@ -214,8 +214,9 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Yield, for each block with some of the ascending `rows`: its index, and their indices in the result and in the
-    block.
+    """Yield the index of each block with some of the rows, and their indices in the result and in the block.
+
+    `rows` are in ascending order.
     """
     done = 0
     while done < len(rows):
@@ -230,7 +231,7 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Yield, for each group with some of the columns: its index, and their indices in the result and in the group."""
+    """Yield the index of each group with some of the columns, and their indices in the result and in the group."""
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)

@@ -186,7 +186,7 @@ def _too_many_lists(data: bytes) -> CodecError:
 def _parse_bson(data: bytes) -> Any:
     # Read lazily, object by object: an eager read would turn {"$ref", "$id"} into a database reference.
     if int.from_bytes(data[:4], "little", signed=True) != len(data):
-        raise ValueError(f"its stated size differs from the {len(data)} bytes that were given")
+        raise ValueError(f"the size in its header differs from the {len(data)} bytes that were given")
     return RawBSONDocument(data)
 
 
@@ -269,7 +269,9 @@ class _Walk:
         keys = [self._key(key) for key in value]
         if LEAF_KEYS.issubset(keys):
             if self._on_array is not None:
-                raise self._error("reserved-keys", "dtype, shape and data together are an array; pass an ndarray")
+                raise self._error(
+                    "reserved-keys", "dtype, shape and data together mean an array; pass an ndarray instead"
+                )
             return self._array(self._take_leaf, value)
         members = {}
         for key, member in zip(keys, value.values(), strict=True):
@@ -280,7 +282,7 @@ class _Walk:
 
     def _list(self, value: list[Any] | tuple[Any, ...]) -> list[Any]:
         if len(value) > MAX_LIST:
-            raise self._error("too-large", f"a list of {len(value)}; above {MAX_LIST} numbers must be sent as an array")
+            raise self._error("too-large", f"a list of {len(value)}; send more than {MAX_LIST} numbers as an array")
         self._enter(len(value))
         items = []
         for index, item in enumerate(value):

@@ -103,14 +103,14 @@ class _Sections:
 
     def require_end(self) -> None:
         if self._rest.size:
-            raise TileError(f"{self._rest.size} bytes are left over")
+            raise TileError(f"{self._rest.size} bytes are left over after the last section")
 
 
 # Floats as integers
 
 
 def _to_integers(channels: NDArray[Any]) -> Integers:
-    """Return the values as unsigned integers; those of floats, read as signed, have the order of the numbers."""
+    """Return the values as unsigned integers; interpreted as signed, those of floats sort like the floats."""
     bits = channels.view(f"<u{channels.dtype.itemsize}")
     return _order(bits) if channels.dtype.kind == "f" else bits
 
@@ -143,7 +143,7 @@ def _unfold_sign(folded: Integers) -> Integers:
 
 
 def _difference(channels: Integers) -> list[Bytes]:
-    """Return the orders (one byte per channel), then the byte planes of the differences, lowest byte first."""
+    """Return the difference order of each channel (one byte), then the differences' byte planes, lowest byte first."""
     best = _fold_sign(channels)
     cost = _bits_needed(best)
     orders = np.zeros(len(channels), np.uint8)
@@ -158,7 +158,9 @@ def _difference(channels: Integers) -> list[Bytes]:
 
 
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
-    """Return, for each channel, about the sum of log2 of the numbers: a float's exponent grows with its logarithm."""
+    """Return an estimate that grows with the sum of log2 of each channel's numbers.
+
+    The bits of a float, read as an integer, grow almost linearly with its logarithm."""
     logarithms = (folded | 1).astype(np.float32).view(np.int32)
     cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)
     return cost
@@ -215,7 +217,7 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
     lead = int(body.take(1)[0])
     count = (columns - lead) // 4
     if count < 1:
-        raise TileError(f"there is no quaternion behind {lead} of {columns} columns")
+        raise TileError(f"there is no quaternion after the first {lead} of {columns} columns")
     choice = body.take(count)
     if (choice > 7).any():
         raise TileError("the number of a quaternion's predicted component must be 0 to 7")

@@ -119,7 +119,7 @@ class WristContactProposal(_Proposal):
         gt=OUT_OF_REST,
         le=1,
         allow_inf_nan=False,
-        description="Share of the distance of its far place at which a hand has arrived.",
+        description="Share of the farthest distance from rest at which a hand has arrived.",
     )
     release: bool = Field(False, description="Also add a keyframe `release` at the last frame at the far place.")
 

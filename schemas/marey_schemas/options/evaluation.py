@@ -73,7 +73,9 @@ class EvaluationOptions(Grid):
         allow_inf_nan=False,
         description="Seconds of data that a cell needs to count as covered.",
     )
-    literal_formulas: bool = Field(False, description="Add the values of the published formulas taken literally.")
+    literal_formulas: bool = Field(
+        False, description="Also compute the measures by the published formulas, taken literally."
+    )
     database: DatabaseOptions = Field(
         DatabaseOptions(), description="Options of the database that is built from the clips."
     )

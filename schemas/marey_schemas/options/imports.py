@@ -15,10 +15,10 @@ Handedness = Literal["right", "left"]
 
 
 class ImportOptions(Options):
-    """Facts about files that the user knows. An absent fact is inferred from the file, or the file is refused if it is
-    ambiguous.
+    """Facts that the user knows about the files to import.
 
-    `marey_motion.read_motion` uses those about the content of a file: unit, axes, frame rate, rest pose and floor.
+    An absent fact is inferred from the file; the file is refused if the fact is ambiguous. `marey_motion.read_motion`
+    uses the facts about the content of a file: unit, axes, frame rate, rest pose and floor.
 
     Examples
     --------
@@ -54,7 +54,7 @@ class ImportOptions(Options):
 
     @property
     def metres_per_unit(self) -> float | None:
-        """Size of the given unit in metres; the size counts before the name, and None means that neither is given."""
+        """Metres per unit of length: `unit_scale_m` if given, else the size of `unit`, else None."""
         if self.unit_scale_m is not None or self.unit is None:
             return self.unit_scale_m
         return UNITS_M[self.unit]

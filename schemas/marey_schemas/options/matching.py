@@ -96,7 +96,9 @@ class DatabaseOptions(Options):
     def _check_horizons(self) -> Self:
         ticks = [0, *(round(horizon_s * self.rate_hz) for horizon_s in self.horizons_s)]
         if any(after <= before for before, after in pairwise(ticks)):
-            raise ValueError(f"horizons_s: must be at least one frame (1/{self.rate_hz:g} s) ahead and apart")
+            raise ValueError(
+                f"horizons_s: must be at least one frame (1/{self.rate_hz:g} s) ahead and apart from each other"
+            )
         return self
 
 

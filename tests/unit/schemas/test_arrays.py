@@ -55,7 +55,7 @@ def test_a_model_dumped_to_python_keeps_its_arrays() -> None:
         (POSES.astype(np.float64), "expected dtype <f4, not <f8"),
         (POSES[0], "expected 2 dimensions"),
         (POSES[:, :6], r"expected 7 columns, not shape \[3, 6\]"),
-        (POSES * np.float32(np.nan), "only finite numbers"),
+        (POSES * np.float32(np.nan), "nan; only finite numbers"),
         (POSES.tolist(), "expected an array"),
         ("poses", "expected an array"),
         (leaf([1, 2]), r"axis 0 must be a list of 3, not a list of 2"),

@@ -217,7 +217,7 @@ def test_every_truncation_and_extension_is_noticed(encoded: bytes) -> None:
     for length in [*range(60), *range(60, len(encoded), 199)]:
         with pytest.raises(BlockError):
             blocks.decode(encoded[:length])
-    with pytest.raises(BlockError, match="index gives"):
+    with pytest.raises(BlockError, match="index requires"):
         blocks.decode(encoded + b"\0")
 
 
