@@ -52,7 +52,7 @@ class Blobs:
         return lacking
 
     def put(self, data: bytes, *, digest: str | None = None) -> str:
-        """Send bytes, whether the server has them or not; return their digest."""
+        """Send bytes, even if the server already has them; return their digest."""
         name = digest or digest_of(data)
         self.transport.send("PUT", f"/blobs/{name}", content=data, media_type=OCTETS)
         return name

@@ -30,7 +30,7 @@ class NoCredential(MareyError):
 
 
 class BadCredentialFile(MareyError):
-    """A file that should hold a token does not, or others may read it."""
+    """A token file contains no token, or other users may read it."""
 
 
 class BadToken(MareyError):
@@ -127,7 +127,7 @@ class RequestFailed(MareyError):
 
     @property
     def context(self) -> dict[str, Any]:
-        """Facts of this code, such as the current revision."""
+        """Details of the error, such as the current revision."""
         return self.problem.context
 
 
@@ -172,7 +172,7 @@ class PreconditionFailed(RequestFailed):
 
 
 class TooLarge(RequestFailed):
-    """The request is larger than the server takes."""
+    """The request is larger than the server accepts."""
 
     status = 413
 

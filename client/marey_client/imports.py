@@ -176,7 +176,7 @@ class Imports:
         return list(entries.values())
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; if the server makes it a job, wait for that."""
+        """Import up to 1000 files whose bytes the server has; if the import becomes a job, wait for its end."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(
@@ -189,7 +189,7 @@ class Imports:
         return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
-        """Send the bytes that the server lacks; return the files in the form that an import names them.
+        """Send the bytes that the server lacks; return the files in the form of an import request.
 
         Raises `BadFileName` if a name cannot be sent.
         """
@@ -228,7 +228,7 @@ def _refused_name(name: str) -> ImportEntry:
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
-    """Return the entry of a job with the items that were published for its file."""
+    """Return an entry of an import job, completed with the items that were published for its file."""
     skeleton = outputs.get(skeleton_output(entry.name))
     made = outputs.get(entry.name) or skeleton
     if made is None:

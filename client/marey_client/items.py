@@ -57,7 +57,9 @@ class ItemHandle:
         return dict(tree)
 
     def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
-        """Create a revision with `document` as `part`. Raises `PreconditionFailed` if the item was changed since."""
+        """Create a revision with `document` as `part`.
+
+        Raises `PreconditionFailed` if the item was changed since it was read."""
         response = self.transport.send_tree(
             "PUT", f"{self.url}/parts/{part}", document, params={"message": message}, headers=self._if_match()
         )

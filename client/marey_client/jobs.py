@@ -51,7 +51,7 @@ class Jobs:
         return pages(self.transport, Job, f"/projects/{project}/jobs", params)
 
     def get(self, job_id: str, *, wait_s: float = 0.0) -> Job:
-        """Return the current state of a job; with `wait_s`, when the job ends, or after that time."""
+        """Return the current state of a job, after waiting up to `wait_s` for its end."""
         if wait_s <= 0:
             return self.transport.get(Job, f"/jobs/{job_id}")
         return self.transport.get(

@@ -25,10 +25,10 @@ class Marey:
 
     Parameters
     ----------
-    url : address of the server, such as `https://marey.example.org`; without one, server and token are those that
-        the environment or `marey login` name, as for the command line
-    token : a personal token; None with a url reads public projects only
-    retries : number and duration of repetitions of requests that are safe to repeat
+    url : address of the server, such as `https://marey.example.org`; default: server and token from the environment or
+        from `marey login`, as on the command line
+    token : a personal token; with a `url` and no token, only public projects can be read
+    retries : limits of the retries of requests that are safe to repeat
     timeout_s : how long the server may stay silent
     http : replaces the network in tests
     """
@@ -89,7 +89,7 @@ class Marey:
 
     @cached_property
     def blobs(self) -> Blobs:
-        """Return a blob's bytes by its digest."""
+        """Blobs by digest."""
         return Blobs(self.transport)
 
     @cached_property

@@ -18,12 +18,12 @@ Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[CollectionInput | ItemInput, ...]:
-    """Return one place or several as inputs of jobs; a handle stands for the revision that was read."""
+    """Return one place or several as inputs of jobs; a handle refers to the revision that was read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items at one place or several, at the newest revision or the one that a place names."""
+    """Yield the items at one place or several; the newest revision is used if a place names none."""
     for place in _as_list(places):
         if isinstance(place, ItemHandle):
             yield place.item

@@ -1,4 +1,4 @@
-"""Repeated requests: after which failures a request is sent again, how often, and after how long a wait."""
+"""Retries of requests: the failures that are retried, the number of tries, and the waits between them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ class Retries:
 
     Parameters
     ----------
-    tries : how often a request is sent at most
-    first_s, longest_s : the wait before the second try is at most `first_s`, doubles, and never exceeds `longest_s`
-    total_s : no try starts later than this after the first
+    tries : greatest number of times that a request is sent
+    first_s : longest wait before the second try, in seconds; it doubles with each further try
+    longest_s : limit of that doubling, in seconds
+    total_s : seconds after the first try after which no try starts
     sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
     """
 

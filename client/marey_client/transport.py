@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class BearerToken(httpx.Auth):
-    """Adds the token to requests; shows it nowhere else."""
+    """Authentication that adds the token to requests and shows it nowhere else."""
 
     def __init__(self, token: str) -> None:
         self._token = as_token(token)
@@ -130,12 +130,13 @@ class Transport:
         repeatable: bool | None = None,
         timeout_s: float | None = None,
     ) -> httpx.Response:
-        """Send a request until it is answered, and return the answer, read whole.
+        """Send a request, if necessary several times, and return the complete answer.
 
-        A POST carries an idempotency key unless `repeatable` is given. If it is False, or the method changes things, a
-        request whose connection broke is not sent twice. A streamed `content` is a function that returns a new stream.
+        A POST has an idempotency key unless `repeatable` is given. If `repeatable` is False, the request is not sent
+        again after its connection broke; the default is False for PUT, PATCH and DELETE with `If-Match`, else True. A
+        streamed `content` is a function that returns a new stream.
 
-        Raises `RequestFailed` for a problem document, `Unreachable` without an answer.
+        Raises `RequestFailed` for a problem document, `Unreachable` if there is no answer.
         """
         sent_headers = {"Accept": JSON, **(headers or {})}
         if content is not None:
@@ -215,7 +216,7 @@ class Transport:
 
 
 def _quoted(path: str) -> str:
-    """Return a path, whose names may hold any character, in the form of an address."""
+    """Return a path with percent-encoded names, which may contain any character."""
     return quote(path, safe="/:@!$&'()*+,;=~")
 
 
@@ -235,13 +236,13 @@ def _revealed(value: Any) -> Any:
 
 
 def read_model(answer: type[Model], response: httpx.Response) -> Model:
-    """Return the body of `response` as a model; `UnexpectedAnswer` if it is none."""
+    """Return the body of `response` as a model. Raises `UnexpectedAnswer` if it does not fit."""
     try:
         return answer.model_validate_json(response.content)
     except ValidationError as error:
         raise UnexpectedAnswer(
-            f"{response.request.method} {response.request.url.path}: not a {answer.__name__} ({error.error_count()} "
-            "fields differ). Is the client older than the server?"
+            f"{response.request.method} {response.request.url.path}: the answer is not a {answer.__name__} "
+            f"({error.error_count()} fields differ). Is the client older than the server?"
         ) from error
 
 

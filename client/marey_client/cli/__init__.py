@@ -30,7 +30,7 @@ def _run() -> None:
 
 
 def _take_any_text() -> None:
-    """Make output streams escape characters that their encoding lacks, and ignore output to a closed stream."""
+    """Escape characters that the encoding of an output stream lacks, and ignore output to a closed stream."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open to the end

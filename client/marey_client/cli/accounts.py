@@ -39,7 +39,7 @@ def login(
     ] = False,
     days: Annotated[int, typer.Option(min=1, max=90, help="Days until the login expires.")] = 7,
 ) -> None:
-    """Remember a server and a token for it, readable by you alone."""
+    """Store a server and a token for it in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
     from marey_client.marey import Marey
     from marey_schemas.access import Login
@@ -89,7 +89,7 @@ def create_token(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a token. Its secret is shown once."""
+    """Create a token. Its secret is shown only once."""
     from marey_schemas.access import TokenCreate
 
     lasting = days * SECONDS_PER_DAY or None
@@ -106,7 +106,7 @@ def create_token(
 
 
 def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
-    """Create a token and write its secret to a new file; if the file cannot be created, no token is."""
+    """Create a token and write its secret to a new file; create no token if the file cannot be created."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         try:
             made = marey.tokens.create(wanted)
@@ -157,7 +157,7 @@ def create_user(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a user; asks for the password, twice."""
+    """Create a user; the command asks for the password twice."""
     from marey_schemas.access import UserCreate
 
     password = None
@@ -191,7 +191,7 @@ def show_user(
     name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a user, or who you are."""
+    """Show a user; default: yourself."""
     with connect(context) as marey:
         found = marey.users.get(name) if name else marey.me()
     if as_json:
@@ -205,7 +205,7 @@ def show_user(
 def change_password(
     context: typer.Context, name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None
 ) -> None:
-    """Set a new password; your own needs the current one."""
+    """Set a new password. To change your own password, enter the current one first."""
     from marey_schemas.access import UserChange
 
     with connect(context) as marey:
@@ -222,7 +222,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Disable a user; the data that they made stays."""
+    """Disable a user; the user's data stays."""
     with connect(context) as marey:
         marey.users.disable(name)
     tell(f"{name} is disabled; marey user enable {name} undoes it")
@@ -230,7 +230,7 @@ def disable_user(context: typer.Context, name: UserName) -> None:
 
 @user.command("enable")
 def enable_user(context: typer.Context, name: UserName) -> None:
-    """Enable a disabled user again, with their password and tokens."""
+    """Enable a disabled user again, with the same password and tokens."""
     with connect(context) as marey:
         marey.users.enable(name)
     tell(f"{name} is enabled")
@@ -244,7 +244,7 @@ def change_user(
     administrator: Annotated[bool | None, typer.Option(help="Grant or revoke the rights of an administrator.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change the displayed name of a user, and whether they are an administrator."""
+    """Change the displayed name and the administrator rights of a user."""
     from marey_schemas.access import UserChange
 
     given = {"display_name": display_name, "administrator": administrator}
@@ -270,7 +270,9 @@ def _ask_secret(what: str, *, twice: bool = False) -> str:
         return str(typer.prompt(what, hide_input=True, confirmation_prompt=twice, err=True))
     if secret := sys.stdin.readline().rstrip("\r\n"):
         return secret
-    raise WrongUsage(f"{what}: there is neither a terminal to ask at nor a line on standard input")
+    raise WrongUsage(
+        f"{what}: there is neither a terminal to ask at nor a line on standard input; run the command in a terminal"
+    )
 
 
 def _yes(value: bool) -> str:

@@ -53,7 +53,7 @@ class Address:
 
 
 def find_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> ItemHandle | None:
-    """Return the item at an address, of the first of `kinds` that has one; None if there is none."""
+    """Return the item at an address, or None. `kinds` are tried in order."""
     project = marey.project(address.project)
     if not address.path:
         return None
@@ -213,8 +213,8 @@ class SingleItem:
 def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
     """Return the folder or item at an address; a final `/` means a folder.
 
-    Raises `WrongUsage` if there is none, or several. Of several that were deleted at one place, the last one is
-    returned.
+    Raises `WrongUsage` if there is none, or several. If several were deleted at this address, returns the one that was
+    deleted last.
     """
     address = Address.parse(text)
     if not address.path:
@@ -241,7 +241,7 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
-    """Yield the folders and items at an address: folders first, and within each sort the last deleted one first."""
+    """Yield the folders and items at an address: folders before items, the most recently deleted first."""
     from marey_schemas.kinds import Kind
 
     if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +24,9 @@ if TYPE_CHECKING:
 
 
 ANNOTATE = OptionsOf("marey_schemas.job_params:AnnotateParams")
+MERGE = OptionsOf(
+    "marey_schemas.editing.annotation_commands:MergeSegment", only=("neighbour",), short={"neighbour": "--with"}
+)
 DEFAULT_PROPOSAL = {"method": "steps"}
 
 annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edit segments and keyframes of clips.")
@@ -34,17 +36,10 @@ At = Annotated[int, typer.Argument(min=0, help="Any frame of the segment.")]
 Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
-class Neighbour(StrEnum):
-    """Segment to merge with."""
-
-    NEXT = "next"
-    PREVIOUS = "previous"
-    NEAREST = "nearest"
-
-
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.add_typer(annotation, name="annotation")
+    add_command(annotation, merge, params=MERGE)
     add_command(annotation, propose, params=ANNOTATE, job=JOB)
 
 
@@ -84,7 +79,7 @@ def create(
     keyframe: Annotated[list[str] | None, typer.Option(help="Keyframe as label=frame; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make an annotation of a clip, with segments and keyframes or without any."""
+    """Create an annotation of a clip, which may contain segments and keyframes."""
     from marey_schemas.kinds import Kind
 
     segments = sorted((_segment(text) for text in segment or ()), key=lambda one: one[1:])
@@ -108,7 +103,7 @@ def add(
     frames: Annotated[str, typer.Argument(help="Frames as first:end; the frame `end` is not included.")],
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Shorten or remove overlapping segments.")] = False,
 ) -> None:
-    """Add a segment: frames under a label."""
+    """Add a segment: a range of frames with a label."""
     _, start, end = _segment(f"{label}={frames}")
     _apply(context, place, command="create_segment", label=label, start=start, end=end, overwrite=overwrite)
 
@@ -126,15 +121,9 @@ def split(
     _apply(context, place, command="split_segment", at=at, label=label)
 
 
-@annotation.command()
-def merge(
-    context: typer.Context,
-    place: Place,
-    at: At,
-    neighbour: Annotated[Neighbour, typer.Option("--with", help="Neighbour to merge with.")] = Neighbour.NEXT,
-) -> None:
+def merge(context: typer.Context, place: Place, at: At, params: Chosen) -> None:
     """Merge a segment with its neighbour and the gap between them."""
-    _apply(context, place, command="merge_segment", at=at, neighbour=neighbour.value)
+    _apply(context, place, command="merge_segment", at=at, **params)
 
 
 @annotation.command()
@@ -162,7 +151,7 @@ def relabel(context: typer.Context, place: Place, at: At, label: Label) -> None:
 
 @annotation.command()
 def remove(context: typer.Context, place: Place, at: At) -> None:
-    """Remove a segment; its frames have no label then."""
+    """Remove a segment; its frames then have no label."""
     _apply(context, place, command="remove_segment", at=at)
 
 
@@ -202,7 +191,7 @@ def propose(
     into: Annotated[
         str,
         typer.Option(
-            help="Folder of the annotations, which repeats the clips' folders; default: the folders of the clips."
+            help="Folder of the annotations, with the same subfolders as the clips; default: the folders of the clips."
         ),
     ] = "",
     wait: Wait = True,
@@ -224,7 +213,7 @@ def propose(
 def import_annotation(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
-    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of the predecessor.")],
+    file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of Marey's predecessor.")],
     layer: Annotated[str, typer.Option(help="Name of the layer.")] = "imported",
     name: Annotated[
         str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
@@ -235,7 +224,7 @@ def import_annotation(
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Annotate a clip from a file of the predecessor: sections, or the frames of labels."""
+    """Import an annotation of a clip from a file of Marey's predecessor."""
     from marey_schemas.kinds import Kind
 
     document = read_json(file)
@@ -261,7 +250,7 @@ def export_annotation(
         EndIndex, typer.Option(help="Whether a section includes its frame end_idx.")
     ] = DEFAULT_END_INDEX,
 ) -> None:
-    """Write an annotation to a file of the predecessor."""
+    """Write an annotation to a file for Marey's predecessor."""
     with connect(context) as marey:
         found = annotation_at(marey, place)
         typer.echo(found.export(output, format="predecessor", form=form, end_index=end_index))

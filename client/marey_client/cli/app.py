@@ -59,7 +59,7 @@ def marey(
         bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Motion capture goes in; it is versioned, checked, retargeted, and comes out right."""
+    """Store, check, retarget, edit and evaluate motion data on a Marey server."""
     context.obj = Invocation(server, token_file, verbose)
 
 

@@ -86,7 +86,7 @@ def align(
 ) -> None:
     """Align clips of one action with each other, as a job.
 
-    `--reference` takes the address of a clip, too.
+    `--reference` also accepts the address of a clip.
     """
     from marey_schemas.kinds import Kind
 
@@ -112,7 +112,7 @@ def cut(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Cut clips along the segments of annotations; keyframes within stay with the pieces."""
+    """Cut clips along the segments of annotations; each piece keeps its keyframes."""
     from marey_schemas.kinds import Kind
 
     addresses = addresses_in_one_project(sources)

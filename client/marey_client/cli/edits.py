@@ -1,4 +1,4 @@
-"""Command `edit`: commands on clips, saved, applied and previewed."""
+"""Command `edit`: saves, previews and applies commands that edit clips."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def save_edit(
     message: Annotated[str, typer.Option("--message", "-m", help="Message shown in the history.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Keep commands as an edit, or change one."""
+    """Save commands as an edit, or replace the commands of a saved edit."""
     place = Address.parse(address)
     if not place.path:
         raise WrongUsage(f"{address!r} is not the address of an edit; write project/folder/name")

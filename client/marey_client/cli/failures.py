@@ -29,7 +29,7 @@ class WrongUsage(Exception):
 
 @contextmanager
 def reported(*, verbose: bool) -> Iterator[None]:
-    """Turn errors that users can understand into a line and an exit status. Others keep their traceback."""
+    """Print expected errors as one line and exit with their status; other errors keep their traceback."""
     try:
         yield
     except Refused:
@@ -56,7 +56,7 @@ def reported(*, verbose: bool) -> Iterator[None]:
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error in one line, with what is needed to ask for help."""
+    """Return an error in one line, with its code, request id and notes if it has them."""
     from marey_client.errors import NotFound, RequestFailed
 
     text = " ".join(_told(error).split()) or type(error).__name__

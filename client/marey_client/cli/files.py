@@ -46,7 +46,7 @@ def upload(
     left_handed: Annotated[bool, typer.Option("--left-handed", help="Short form of --handedness left.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Import motion files. A file may be refused with a reason; one that was imported before changes nothing."""
+    """Import motion files. Refused files are listed with a reason; importing a file again changes nothing."""
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions
 
@@ -97,7 +97,7 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
 def ls(
     context: typer.Context,
     place: Annotated[
-        str | None, typer.Argument(help="What to list: project or project/folder; default: all projects.")
+        str | None, typer.Argument(help="Project or folder to list: project[/folder]; default: all projects.")
     ] = None,
     recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Include all folders below.")] = False,
     kind: Annotated[list[str] | None, typer.Option(help="List only items of this kind; may be repeated.")] = None,
@@ -107,7 +107,7 @@ def ls(
     deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, here and below.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show what a folder holds."""
+    """List the contents of a folder."""
     if place is None:
         from marey_client.cli.projects import list_projects
 
@@ -270,7 +270,7 @@ def download(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files, those of a folder with those below it; a folder without clips gives its aligned clips.
+    """Write clips to files: one clip, or all clips in a folder and below, or its aligned clips if it has no others.
 
     An existing file is replaced; if several clips would have the same file name, the later ones get a number.
     """

@@ -26,14 +26,16 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job
 
 
 def clips_at(marey: Marey, address: Address) -> ItemInput | CollectionInput:
-    """Return the clips at an address as the input of a job: a clip, or else a folder."""
+    """Return the clip at an address as the input of a job; if there is none, the folder."""
     from marey_schemas.kinds import Kind
 
     return input_at(marey, address, Kind.CLIP, pinned=False)
 
 
 def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ItemInput | CollectionInput:
-    """Return the input of a job at an address: an item of the kind, `pinned` to its revision, or else a folder."""
+    """Return the item at an address as the input of a job; if there is none, the folder.
+
+    `pinned` fixes the revision of the item."""
     from marey_schemas.jobs import CollectionInput, ItemInput
 
     found = find_item(marey, address, [kind])
@@ -81,7 +83,9 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the result of a job by `show`, or else its counts, and its refused inputs. Raises `Refused` for those."""
+    """Print the refused inputs of a job, and its result by `show`, or its counts if `show` is None.
+
+    Raises `Refused` if inputs were refused."""
     result = ended.result or {}
     refused = result.get("refused", ())
     if as_json:

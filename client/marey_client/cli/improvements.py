@@ -103,7 +103,7 @@ def suggest(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Find clips of an evaluated set that can be removed, and others that would fill its holes."""
+    """Find clips of an evaluated set that can be removed, and other clips that would fill its gaps."""
     if remove_out is not None and not wait:
         raise WrongUsage("--remove-out needs the result; remove --no-wait")
     with connect(context) as marey:
@@ -145,7 +145,7 @@ def sweep(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate again with other weights of the features, and show which of them matter."""
+    """Evaluate again with other weights of the features, and rank the features by their effect."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         if (found := _found(marey, handle, handle.sweep_request(**params), job, wait, as_json)) is not None:

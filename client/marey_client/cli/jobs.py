@@ -73,7 +73,7 @@ def submit_job(
         list[str] | None,
         typer.Option(
             "--input",
-            help="Input as name=folder, name=folder/item, or name=id of the job that makes it; may be repeated.",
+            help="Input as name=folder, name=folder/item, or name=ID of a job whose outputs are used; may be repeated.",
         ),
     ] = None,
     params: Annotated[
@@ -137,7 +137,7 @@ def list_jobs(
         str | None,
         typer.Option(help="List only jobs in this state: waiting, queued, running, succeeded, failed or cancelled."),
     ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs, the newest first.")] = 50,
+    limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs to list, newest first.")] = 50,
     as_json: AsJson = False,
 ) -> None:
     """Show the jobs of a project, newest first."""
@@ -194,7 +194,7 @@ def retry_job(
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Submit a job that failed or was cancelled again, with those it needs and those that failed because of it."""
+    """Submit a failed or cancelled job again, with the jobs that it needs and those that failed because of it."""
     with connect(context) as marey:
         ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)
     if ended is not None:

@@ -23,7 +23,9 @@ Places = Annotated[
 ]
 KindOf = Annotated[
     str | None,
-    typer.Option("--kind", help="Kind of the item, if several have the same name; `collection` selects the folder."),
+    typer.Option(
+        "--kind", help="Kind of the item, needed if items of several kinds have this name; `collection` means a folder."
+    ),
 ]
 
 
@@ -44,10 +46,10 @@ def mv(
     kind: KindOf = None,
     as_json: AsJson = False,
 ) -> None:
-    """Move or rename items and folders within a project. Ids and history stay."""
+    """Move or rename items and folders within a project. Ids and history do not change."""
     *sources, target = places
     if not sources:
-        raise WrongUsage("give what to move and the destination, such as: marey mv lab/raw/walk lab/raw/stroll")
+        raise WrongUsage("give the items to move and the destination, such as: marey mv lab/raw/walk lab/raw/stroll")
     to = Address.parse(target)
     for source in sources:
         if Address.parse(source).project != to.project:
@@ -74,7 +76,7 @@ def rm(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove items, and folders with all they hold; `marey restore` brings them back."""
+    """Remove items, and folders with their contents; `marey restore` brings them back."""
     with connect(context) as marey:
         things = [the_thing(marey, place, kind) for place in places]
         require_apart(things)
@@ -172,7 +174,7 @@ def _ask(question: str) -> None:
 
 
 def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_json: bool) -> None:
-    """Apply a function to each folder or item, also after a refusal, which is printed. Raises `Refused` at the end."""
+    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were any."""
     from marey_client.errors import RequestFailed
 
     results: list[Any] = []

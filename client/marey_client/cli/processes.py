@@ -53,7 +53,7 @@ def serve(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run a server, its database file and a local worker until stopped."""
+    """Run a server with its database and a local worker until stopped."""
     from marey_client import embedded
 
     form = None if log_form is None else log_form.value
@@ -129,7 +129,7 @@ def backup_database(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Copy the database, consistently, while the server may be running."""
+    """Write a consistent copy of the database; the server may be running."""
     _database("backup", data, database_url, target=target)
 
 
@@ -145,19 +145,19 @@ def restore_database(
 
 @db.command("fsck")
 def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as_json: AsJson = False) -> None:
-    """Verify every digest and every reference."""
+    """Verify all digests and references in the database."""
     _database("fsck", data, database_url, as_json=as_json)
 
 
 @db.command("admin-token")
 def make_admin_token(
     user: Annotated[
-        str | None, typer.Option(help="Name of the administrator; default: the one who was created first.")
+        str | None, typer.Option(help="Name of the administrator; default: the first one that was created.")
     ] = None,
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Write a new administrator's token to admin.token in the data folder, in place of a lost one."""
+    """Write a new token of an administrator to admin.token in the data folder, for example after its loss."""
     _database("admin_token", data, database_url, user=user)
 
 

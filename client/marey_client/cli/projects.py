@@ -30,7 +30,7 @@ def create_project(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a project; you become its owner."""
+    """Create a project; you become its owner."""
     from marey_schemas.access import ProjectCreate, Visibility
 
     visibility = Visibility.PUBLIC if public else Visibility.PRIVATE
@@ -72,7 +72,7 @@ def change_project(
     visibility: Annotated[str | None, typer.Option(help="Visibility: private or public.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change the title of a project, and who may read it."""
+    """Change the title, the description and the visibility of a project."""
     from marey_schemas.access import ProjectChange
 
     given = {"title": title, "description": description, "visibility": visibility}

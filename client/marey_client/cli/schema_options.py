@@ -1,11 +1,11 @@
 """Options of commands that come from a model of `marey_schemas`: names, types, ranges, defaults and help.
 
-The options are made when their command runs or is asked for help, so that `marey --help` imports no models:
+The options are made when their command runs or shows its help, so that `marey --help` imports no models:
 
     add_command(app, retarget, params=OptionsOf("marey_schemas.job_params:RetargetParams"))
 
-The parameter `params` of `retarget` then gets what was typed, checked, as a dict. An option has the name of its field;
-commands add shorter spellings.
+The parameter `params` of `retarget` then gets the given options, validated, as a dict. An option has the name of its
+field; commands add shorter spellings.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class OptionsOf:
     model : module and name of the model, as `module:name`
     short : further spellings of an option, by the name of its field
     without : fields that the command sets itself
-    only : the fields that become options; all where it is empty
+    only : the fields that become options; all fields if empty
     nulls : further texts for null, by the name of the field
     """
 

@@ -43,7 +43,7 @@ def tree(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Group samples of a model into a tree, which makes searches for motions that meet constraints quick."""
+    """Group samples of a model into a tree, which speeds up searches for motions that meet constraints."""
     with connect(context) as marey:
         found = model_at(marey, place)
         submitted = marey.project(found.project).submit(found.tree_request(**params).model_copy(update=job))
@@ -106,7 +106,7 @@ def search(
     if constraints:
         asked["constraints"] = constraints
     if not (asked.get("constraints") or asked.get("steps")):
-        raise WrongUsage("there are no constraints; give --at WHEN:JOINT=x,y,z or another one")
+        raise WrongUsage("there are no constraints; give --at WHEN:JOINT=x,y,z or another constraint")
     asked |= params
     if start is not None:
         asked["start"] = _start(start)

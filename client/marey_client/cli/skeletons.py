@@ -34,7 +34,7 @@ def map_joints(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the mapping of standard joints to joints, or change it; a change is a new revision."""
+    """Show the mapping of standard joints to joints, or change it; a change creates a new revision."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
@@ -65,7 +65,7 @@ def joint_axes(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show the twist and swing axes of joints, or change those of one."""
+    """Show the twist and swing axes of joints, or change the axes of one joint."""
     from marey_schemas.documents.skeletons import JointAxesDocument
     from marey_schemas.kinds import Kind
 
@@ -74,7 +74,7 @@ def joint_axes(
         mapping = found.mapping()
         if twist or swing:
             if joint not in mapping.axes:
-                raise WrongUsage(f"{joint!r} has no axes; marey skeleton axes {place} shows the joints that have")
+                raise WrongUsage(f"{joint!r} has no axes; marey skeleton axes {place} shows the joints with axes")
             old = mapping.axes[joint]
             new = JointAxesDocument(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
             mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})

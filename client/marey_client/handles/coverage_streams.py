@@ -84,9 +84,10 @@ class CoverageStreamHandle:
     ) -> CoverageProgress:
         """Send the next frames: poses (n, 3 + 4·joints), or roots (n, 3) of x, z in metres and heading in radians.
 
-        `translations` (n, k, 3) go with poses whose joints move in their parents, too. At most 4096 frames at a time; a
-        tenth of a second to a second is usual. Frames whose answer was lost on the way are sent again and count once.
-        Raises `Conflict` if another sender uses the stream, too.
+        `translations` (n, k, 3) are local translations of k joints in metres that replace the joints' offsets.
+
+        At most 4096 frames at a time; 0.1 s to 1 s is usual. Frames whose answer was lost are sent again and count
+        once. Raises `Conflict` if another sender uses the stream, too.
         """
         said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:
@@ -102,7 +103,7 @@ class CoverageStreamHandle:
         return self.transport.get(CoverageStreamState, self.url)
 
     def delete(self) -> None:
-        """Delete the stream; the server deletes it a day after its last frame."""
+        """Delete the stream at once; otherwise, the server deletes it a day after its last frame."""
         self.transport.send("DELETE", self.url)
 
     def _send(self, said: dict[str, Any]) -> CoverageProgress:

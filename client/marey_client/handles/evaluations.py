@@ -1,4 +1,4 @@
-"""Evaluations of locomotion clips: results, and jobs that improve the clips by them."""
+"""Evaluations of locomotion clips: results, and jobs that use them to improve the clips."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class EvaluationHandle(ReportedHandle):
         """Write the walk graph to a file, as GraphML or JSON according to its ending."""
         form = Path(path).suffix.lower().removeprefix(".")
         if form not in ("json", "graphml"):
-            raise ValueError(f"{path}: the name of a walk graph must end in .json or .graphml")
+            raise ValueError(f"{path}: the file name of a walk graph must end in .json or .graphml")
         return saved(path, self._walk_graph(form, trial))
 
     def _walk_graph(self, form: str, trial: str | None) -> bytes:

@@ -30,7 +30,7 @@ class Samples:
     ----------
     latents : (n, L) latent vectors of the motions
     log_densities : (n,) natural logarithm of the density of each
-    motions : n of them, in the canonical frame: the body begins at x = z = 0 and faces +z
+    motions : n motions in the canonical frame: the body begins at x = z = 0 and faces +z
     """
 
     latents: NDArray[np.float64]
@@ -92,8 +92,8 @@ class ModelHandle(SearchableHandle):
     ) -> list[ClipHandle]:
         """Draw `n` motions and create clips from them in the folder `into`, on the model's skeleton.
 
-        By default, they are called after the model, then seed and number; `names` gives other names. Raises `Conflict`
-        if a name is taken.
+        By default, a clip is named after the model, the seed and its number; `names` gives other names. Raises
+        `Conflict` if a name is taken.
         """
         tree = self._samples(n, seed, self.item.revision)
         clips = Items(self.transport, self.project, Kind.CLIP, ClipHandle)

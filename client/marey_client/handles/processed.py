@@ -34,7 +34,7 @@ class ProcessedHandle(ItemHandle):
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:
-        """Return the source clip at its newest revision; None if it is not in the store."""
+        """Return the source clip at its newest revision; None if the source is not a stored clip."""
         clip = self.info().clip
         if clip is None:
             return None

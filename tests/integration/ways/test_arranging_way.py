@@ -98,7 +98,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is a clip of that name there already."),
         (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is nothing at lab/raw/nobody"),
-        (["mv", "lab/raw/a"], 2, "give what to move and the destination"),
+        (["mv", "lab/raw/a"], 2, "give the items to move and the destination"),
         (["mv", "lab", "lab/b"], 2, "'lab' is a project"),
         (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot be moved into itself"),
         (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),

@@ -15,9 +15,9 @@ from marey_client.project import ProjectHandle
 
 NAME = "evaluation"
 TRAVEL_M = 0.5
-"""Distance in metres that the root of a locomotion clip travels within `TRAVEL_WINDOW_S`."""
+"""Least median horizontal displacement of the root of a locomotion clip over `TRAVEL_WINDOW_S`, in metres."""
 TRAVEL_WINDOW_S = 1.0
-"""Time in seconds within which the root travels `TRAVEL_M`, from most frames."""
+"""Time in seconds over which the displacement of the root is measured."""
 OPTIONS: dict[str, Any] = {
     "speeds_m_s": (1.0, 1.5, 2.0, 2.5, 3.0),
     "turn_rates_deg_s": (-100.0, -50.0, 0.0, 50.0, 100.0),
@@ -67,7 +67,7 @@ def evaluate_locomotion(
 
 
 def travels(clip: ClipHandle, root: str) -> bool:
-    """Return whether the clip's root travels `TRAVEL_M` within `TRAVEL_WINDOW_S`, from most frames."""
+    """Return whether the root's median horizontal displacement over `TRAVEL_WINDOW_S` is at least `TRAVEL_M`."""
     rate_hz = float(clip.item.summary["frame_rate_hz"])
     window = round(TRAVEL_WINDOW_S * rate_hz)
     if int(clip.item.summary["frames"]) <= window:

@@ -151,7 +151,7 @@ def _generated_takes(folder: Path) -> FoundFiles:
 
 
 def _game_skeleton_parts() -> dict[str, Any]:
-    """Return a skeleton that differs from the takes': names, proportions, rest pose and axes."""
+    """Return a skeleton with other names, proportions, rest pose and axes than the skeleton of the takes."""
     documents = embedded.room("marey_motion.documents", "all")
     rigs = embedded.room("marey_motion.rigs", "all")
     skeleton = embedded.room("marey_motion.gait", "all").game_skeleton()
