@@ -57,10 +57,10 @@ TRANSFERS_AT_ONCE = 4
 
 
 class LogUploader:
-    """Upload of the file that a job prints to, with the number of bytes that the server has.
+    """Upload of the file that contains the output of a job.
 
-    The log of the attempt is a prefix of this file, so that its length, which the server returns, is where to continue,
-    even if earlier answers were lost.
+    The attempt's log on the server is a prefix of this file. The server returns the length of the log, which is the
+    offset of the next bytes to send, even if earlier answers were lost.
     """
 
     def __init__(self, api: AttemptApi, path: Path) -> None:
@@ -178,7 +178,7 @@ class RunningAttempt:
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Run the job in `child`, which is idle or dead afterwards; then call `finish`."""
+        """Run the job in `child`, which is idle or dead afterwards. The caller then calls `finish`."""
         try:
             child.send(self._order())
             end = self._attend(child)
@@ -266,7 +266,7 @@ class RunningAttempt:
                 return None
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Return documents from the cache or the server; if they are large together, the last ones are missing."""
+        """Return documents from the cache or the server; if their total size is large, the last ones are left out."""
         keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
         found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
         sizes = accumulate(len(data or b"") for data in found)

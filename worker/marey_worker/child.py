@@ -59,7 +59,7 @@ def main() -> None:
 class Garbage:
     """Collection of cyclic garbage after each job, without the objects of loaded modules.
 
-    Modules hold nearly all objects and live as long as the process; searching them would take 0.1 s after every job.
+    Modules own nearly all objects and live as long as the process; searching these would take 0.1 s after every job.
     """
 
     def __init__(self) -> None:
@@ -120,7 +120,9 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """Run a task, a gathering job, or a whole job; a fan-out without tasks is run and then gathered."""
+    """Run a task, a gathering job, or a whole job.
+
+    A kind with a gathering function whose job is not split into tasks runs both functions."""
     params = kind.params.model_validate(run.params)
     is_task, gathers = run.position is not None, run.position is None and run.size is not None
     results = context.task_results() if gathers else [_function(kind.implementation)(context, params)]

@@ -53,7 +53,7 @@ class RequestRefused(Exception):
 
 
 class NoSuchThing(RequestRefused):
-    """Something that does not exist or that the job may not see; `code` names it, as in `no-skeleton`."""
+    """A requested object does not exist, or the job may not read it; `code` names the object, as in `no-skeleton`."""
 
     def __init__(self, detail: str, code: str = "not-found") -> None:
         super().__init__(detail)
@@ -96,8 +96,9 @@ class Context:
     def documents(
         self, pins: Iterable[PinnedInput], part: str, *, required: bool = True
     ) -> Iterator[tuple[PinnedInput, Any]]:
-        """Yield each input with one of its parts, read ahead of the caller; None for an optional part that does not
-        exist.
+        """Yield each input with one of its parts, or with None if an optional part does not exist.
+
+        Parts are read ahead of the caller.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -108,7 +109,9 @@ class Context:
     def documents_of_each(
         self, pins: Iterable[PinnedInput], *parts: str
     ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
-        """Yield each input with several of its parts, read ahead of the caller; None for a part that does not exist."""
+        """Yield each input with several of its parts, and None for each part that does not exist.
+
+        Parts are read ahead of the caller."""
         wanted = (
             (pin, PartPlace(kind=pin.kind, item=pin.item, revision=pin.revision, part=part))
             for pin in pins

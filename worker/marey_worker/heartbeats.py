@@ -56,7 +56,7 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Check that the lease is still held before the final request; `patiently` if there are results to lose.
+        """Check that the lease is still valid before the final request; `patiently` retries for longer.
 
         Raises `LeaseLost`, or the client's error if the server does not answer.
         """

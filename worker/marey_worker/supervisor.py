@@ -65,7 +65,7 @@ def default_cache(environment: Mapping[str, str]) -> Path:
 class Supervisor:
     """Supervisor process of a worker, which communicates with the server for its children.
 
-    It goes on if a child crashes.
+    It continues if a child crashes.
     """
 
     def __init__(self, transport: Transport, options: WorkerOptions) -> None:
@@ -171,7 +171,7 @@ class Supervisor:
 
 
 class _Bench:
-    """Holder of a slot's child process, which is replaced after it died or has run a certain number of jobs."""
+    """Child process of a slot; it is replaced after it died or has run a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options

@@ -89,7 +89,7 @@ def test_two_pieces_of_one_name_are_refused_before_any_is_made(lab: ProjectHandl
     (clip,) = lab.clips.list(path="walks/walk 1 0")
     for layer in ("mine", "yours"):
         clip.annotate(layer, segments=[{"label": "a", "start": 0, "end": 60}])
-    with pytest.raises(JobUnsuccessful, match=r"same-name.*2 pieces would be walks/walk 1 0_a_01"):
+    with pytest.raises(JobUnsuccessful, match=r"same-name.*2 pieces would have the path walks/walk 1 0_a_01"):
         done(lab, lab.cut("walks", into="pieces"))
     assert not list(lab.clips.list(collection="pieces"))
     done(lab, lab.cut("walks", into="pieces", layer="mine"))

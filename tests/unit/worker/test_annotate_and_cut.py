@@ -110,7 +110,7 @@ def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out
 
 def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project: ProjectInMemory) -> None:
     annotated(project, segments=[{"label": "a", "start": 0, "end": 10}])
-    with pytest.raises(JobRefused, match="the labels there are: a") as refused:
+    with pytest.raises(JobRefused, match="their labels are a") as refused:
         cut.run(project, CutParams(labels=("b",)))
     assert refused.value.code == "nothing-to-cut"
 
@@ -118,7 +118,7 @@ def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project:
 def test_layers_that_would_make_pieces_of_one_name_are_refused(project: ProjectInMemory) -> None:
     for layer in ("mine", "yours"):
         annotated(project, segments=[{"label": "a", "start": 0, "end": 10}], layer=layer)
-    with pytest.raises(JobRefused, match="2 pieces would be walks/walk_a_01") as refused:
+    with pytest.raises(JobRefused, match="2 pieces would have the path walks/walk_a_01") as refused:
         cut.run(project, CutParams())
     assert (refused.value.code, project.staged) == ("same-name", [])
     assert cut.run(project, CutParams(layer="yours"))["clips"] == 1

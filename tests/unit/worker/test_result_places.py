@@ -132,7 +132,7 @@ def test_results_that_would_get_one_name_are_refused_before_any_is_computed(
     project: ProjectInMemory, run: Callable[..., Any], params: Any
 ) -> None:
     again(project, 0, revision=2)
-    with pytest.raises(JobRefused, match="2 results would be walks/left") as refused:
+    with pytest.raises(JobRefused, match="2 results would have the path walks/left") as refused:
         run(project, params)
     assert (refused.value.code, project.told) == ("same-name", [])
 
@@ -141,7 +141,7 @@ def test_a_clip_called_like_the_mirrored_twin_of_another_is_refused_before_any_i
     project: ProjectInMemory,
 ) -> None:
     again(project, 1, item="clip_twin", name="left mirrored")
-    with pytest.raises(JobRefused, match="2 results would be walks/left mirrored"):
+    with pytest.raises(JobRefused, match="2 results would have the path walks/left mirrored"):
         align.run(project, AlignParams(mirroring="add"))
     assert project.told == []
     align.run(project, AlignParams(mirroring="add", suffix=" aligned"))
@@ -153,7 +153,7 @@ def test_a_second_result_of_one_name_is_refused_and_does_not_replace_the_first(p
     one = StagedOutput(name="a", kind=Kind.CLIP, item_name="a", parts={"motion": {}})
     results.add(one)
     results.flush()
-    with pytest.raises(JobRefused, match="two results of the job would be a"):
+    with pytest.raises(JobRefused, match="two results of the job would have the name a"):
         results.add(one)
 
 

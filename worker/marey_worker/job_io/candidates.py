@@ -34,7 +34,7 @@ class Unusable(NamedTuple):
 
 @dataclass
 class Candidates:
-    """Matching databases by folder, with the options and normaliser of the set; and the folders that are unusable."""
+    """Matching databases by folder, with the options and normaliser of the evaluated set, and unusable folders."""
 
     databases: dict[str, MatchingDatabase] = field(default_factory=dict)
     unusable: list[Unusable] = field(default_factory=list)

@@ -189,13 +189,15 @@ def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, 
         place = commonest.path
         raise JobRefused(
             "several-skeletons",
-            f"the clips move {len(others) + 1} skeletons: {count} of {len(used)} move {place}, but not {_listed(odd)}; "
-            "move all to one of them first, with marey retarget",
+            f"the clips have {len(others) + 1} skeletons: {count} of {len(used)} have {place}, but not {_listed(odd)}; "
+            "move all clips to one skeleton first, with marey retarget",
         )
     skeleton = max(used, key=lambda ref: ref.revision)
     edited = wanted.rig
     if edited is not None and edited.item != most:
-        raise JobRefused("wrong-rig", f"the input rig is {edited.item}; the clips move {most}")
+        raise JobRefused(
+            "wrong-rig", f"the input rig is the skeleton {edited.item}, but the clips have the skeleton {most}"
+        )
     mapping = skeleton if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
     return Rig(skeleton, mapping)
 

@@ -30,8 +30,8 @@ class ResultPlaces:
             if (kind, "/".join(filter(None, (self._into, collection))), name) in self._inputs:
                 path = "/".join(filter(None, (self._into, collection, name)))
                 raise MotionError(
-                    f"the result would take the place of {path}, which is an input of the job; send results into "
-                    "another folder, or let their names differ",
+                    f"the result would take the place of {path}, which is an input of the job; choose "
+                    "another folder or another name for the results",
                     code="own-input",
                 )
         self._taken |= {(kind, collection, name) for name in names}
@@ -43,7 +43,9 @@ class ResultPlaces:
 
     def _require_free(self, kind: Kind, collection: str, name: str) -> None:
         if len(name) > MAX_NAME_LENGTH:
-            raise MotionError(f"{name!r} has {len(name)} of {MAX_NAME_LENGTH} characters", code="name-too-long")
+            raise MotionError(
+                f"{name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are possible", code="name-too-long"
+            )
         if (kind, collection, name) in self._taken:
             raise MotionError(f"another result of the job is called {name!r}", code="same-name")
 
@@ -56,6 +58,6 @@ def require_different(places: Iterable[tuple[str, str]]) -> None:
             path = "/".join(filter(None, (folder, name)))
             raise JobRefused(
                 "same-name",
-                f"{count} results would be {path}; name each clip at one revision, and clips of one folder"
-                " so that their results differ",
+                f"{count} results would have the path {path}; give each clip at one revision only, and rename clips of "
+                "one folder whose results have the same name",
             )

@@ -32,7 +32,7 @@ class StagedResults:
         Raises `JobRefused` for a repeated name, because the second result would replace the first.
         """
         if output.name in self.names:
-            raise JobRefused("same-name", f"two results of the job would be {output.name}")
+            raise JobRefused("same-name", f"two results of the job would have the name {output.name}")
         self.names.add(output.name)
         self._ready.append(output)
         self._ready_bytes += _array_bytes(output.parts)

@@ -101,7 +101,9 @@ class _Job:
         require_different(names)
         long = [name for _, name in names if len(name) > MAX_NAME_LENGTH]
         if long:
-            raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
+            raise JobRefused(
+                "name-too-long", f"{long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible"
+            )
 
     def _name(self, pin: PinnedInput, twin: str) -> str:
         return f"{pin.name}{self._params.suffix}{twin}"
@@ -125,8 +127,8 @@ class _Job:
         if others:
             theirs = self._context.item(Kind.SKELETON, str(most)).path
             error = MotionError(
-                f"it moves another skeleton than {counts[str(most)]} of {len(clips)} clips, which move {theirs}; "
-                "carry all over to one with marey retarget, or build-model --to",
+                f"it has another skeleton than {counts[str(most)]} of {len(clips)} clips, which have {theirs}; "
+                "move all clips to one skeleton with marey retarget, or build-model --to",
                 code="skeleton-mismatch",
             )
             for clip in others:
@@ -140,7 +142,10 @@ class _Job:
         skeleton = max((clip.skeleton for clip in clips), key=lambda ref: ref.revision)
         for edited in self._context.inputs.get("rig", ()):
             if edited.item != skeleton.item:
-                raise JobRefused("wrong-rig", f"the input rig is {edited.item}; the clips move {skeleton.item}")
+                raise JobRefused(
+                    "wrong-rig",
+                    f"the input rig is the skeleton {edited.item}, but the clips have the skeleton {skeleton.item}",
+                )
             return Rig(skeleton, RevisionRef(item=edited.item, revision=edited.revision))
         return Rig.as_stored(skeleton)
 
@@ -159,13 +164,14 @@ class _Job:
         count = len(examples) * (2 if self._params.mirroring == "add" else 1)
         if count < 2:
             raise JobRefused(
-                "too-few-clips", f"{len(examples)} of {len(clips)} clips are left to align{self._refusals.first}"
+                "too-few-clips",
+                f"{len(examples)} of {len(clips)} clips are left; alignment needs two{self._refusals.first}",
             )
         if count > MOST_EXAMPLES and self._params.reference == MEDOID:
             raise JobRefused(
                 "too-many-clips",
-                f"{count} clips are too many to compare all with each other, over {MOST_EXAMPLES}; name a reference, "
-                f"or take {NEAREST_MEAN_LENGTH}",
+                f"{count} clips are too many to compare each with every other, which is possible for {MOST_EXAMPLES}; "
+                f"choose a clip or {NEAREST_MEAN_LENGTH} as reference",
             )
 
     # -- annotations --

@@ -105,7 +105,8 @@ def _body(rigged: Rigged) -> MatchingBody:
 def _require_name(pin: PinnedInput, layer_name: str) -> None:
     if len(pin.name) + 1 + len(layer_name) > MAX_NAME_LENGTH:
         raise AnnotationError(
-            f"its name and that of the layer together have more than {MAX_NAME_LENGTH} characters", code="name-too-long"
+            f"the names of the clip and the layer together have more than {MAX_NAME_LENGTH} characters",
+            code="name-too-long",
         )
 
 

@@ -94,7 +94,7 @@ class _Cutting:
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
-        """Return the annotated clip with its name and place; if clips are inputs of the job, those at submission.
+        """Return the annotated clip with its name and place, which date from submission if clips are inputs of the job.
 
         In that case only inputs may determine the results, because the results are cached for jobs with the same
         inputs. Raises `MotionError`, `NoSuchThing`.
@@ -103,8 +103,8 @@ class _Cutting:
             return self._context.item(Kind.CLIP, clip.item)
         if clip.item not in self._clips:
             raise MotionError(
-                f"it is of the clip {clip.item}, which is not among the clips that are given; give that one, too, or "
-                "no clips",
+                f"the annotation belongs to the clip {clip.item}, which is not among the clips that are given; add it, "
+                "or give no clips",
                 code="clip-not-given",
             )
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
@@ -122,7 +122,7 @@ class _Cutting:
         places = Counter((self._folder(one, segment), name) for one in todo for segment, name in one.pieces)
         if not places:
             labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
-            known = f"the labels there are: {', '.join(labels)}" if labels else "they have none"
+            known = f"their labels are {', '.join(labels)}" if labels else "they have no segments"
             raise JobRefused(
                 "nothing-to-cut", f"no segment of {len(todo)} annotations was selected; {known}{self._refusals.first}"
             )
@@ -130,12 +130,14 @@ class _Cutting:
         if count > 1:
             raise JobRefused(
                 "same-name",
-                f"{count} pieces would be {folder}/{name}; cut one layer at a time, or, where clips of one folder have "
-                "pieces of the same name, those clips into different folders",
+                f"{count} pieces would have the path {folder}/{name}; cut one layer at a time, or cut clips of one "
+                "folder whose pieces have the same name into different folders",
             )
         long = [name for _, name in places if len(name) > MAX_NAME_LENGTH]
         if long:
-            raise JobRefused("name-too-long", f"{long[0]!r} has {len(long[0])} of {MAX_NAME_LENGTH} characters")
+            raise JobRefused(
+                "name-too-long", f"{long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible"
+            )
 
     def _folder(self, one: _AnnotatedClip, segment: Segment) -> str:
         folder = one.item.folder if isinstance(one.item, PinnedInput) else one.item.collection
@@ -181,7 +183,7 @@ class _Cutting:
         return max(0, segment.start - before), min(len(motion.poses), segment.end + after)
 
     def _info(self, clip: RevisionRef) -> ClipInfo:
-        """Return the part `info` of the pieces: the facts about the clip that hold for them, too."""
+        """Return the part `info` of the pieces: the facts about the clip that are also true of the pieces."""
         try:
             stored = self._context.document(Kind.CLIP, clip.item, clip.revision, "info")
         except NoSuchThing:

@@ -99,7 +99,7 @@ class _Editing:
         clip = documents.clip_from_document(motion, body.skeleton)
         made = edit_clip(clip, self._edit.commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
-            raise EditError("the edit splits it, and several clips cannot replace one", code="several-clips")
+            raise EditError("the edit splits the clip, and several clips cannot replace one", code="several-clips")
         info = self._info(pin, known)
         names = [f"{pin.name}{self._params.suffix}" + "".join(f"-{n}" for n in one.pieces) for one in made]
         if self._params.in_place:
@@ -149,7 +149,7 @@ class _Editing:
         return self._bodies[used]
 
     def _info(self, pin: PinnedInput, stored: dict[str, Any] | None) -> ClipInfo:
-        """Return the part `info` of a result: the facts about the clip that still hold, and the applied edit."""
+        """Return the part `info` of a result: the facts about the clip that are still true, and the applied edit."""
         edit = None if self._edit_pin is None else self._edit_pin.as_input().model_dump()
         done = {
             "clip": pin.as_input().model_dump(),
@@ -168,15 +168,18 @@ class _Editing:
     # -- where results go --
 
     def _require_newest(self, pin: PinnedInput) -> None:
-        """Raise `EditError` if the clip to replace has got a newer revision since the job was submitted."""
+        """Raise `EditError` if the clip to replace was changed, moved or renamed since the job was submitted."""
         now = self._context.item(Kind.CLIP, pin.item)
         if now.revision != pin.revision:
             raise EditError(
-                f"the edit is of revision {pin.revision} and would replace revision {now.revision}; edit that one",
+                f"the job edits revision {pin.revision}, but the clip now has revision {now.revision}; "
+                "submit the edit again",
                 code="clip-changed",
             )
         if (now.collection, now.name) != (pin.collection, pin.name):
-            raise EditError("it was moved or renamed while the job waited; try again", code="clip-changed")
+            raise EditError(
+                "the clip was moved or renamed while the job waited; submit the edit again", code="clip-changed"
+            )
 
     # -- messages --
 
@@ -206,10 +209,10 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):
-        raise JobRefused("which-source", "a source is given at two revisions")
+        raise JobRefused("which-source", "a source is given at two revisions; give each source once")
     missing = [item for item in edit.sources if item not in found]
     if missing:
-        raise JobRefused("source-missing", f"the commands name {', '.join(missing)}, which is not among the sources")
+        raise JobRefused("source-missing", f"the commands name {', '.join(missing)}, which the input sources lacks")
     return found
 
 

@@ -83,7 +83,7 @@ class _Exporting:
     def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:
         original = original_of_clip(pin.item, info)
         if original is None:
-            raise MotionError("it was not imported from a file", code="no-original")
+            raise MotionError("the clip was not imported from a file", code="no-original")
         ending = original.name.rpartition(".")[2] if "." in original.name else ""
         return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(original.digest))
 
@@ -102,7 +102,7 @@ def _place(pin: PinnedInput) -> str:
 
 
 def _free_name(pin: PinnedInput, name: str, taken: Collection[str]) -> str:
-    """Return the name of a file, or one with the item, or with item and revision, if an earlier file has it."""
+    """Return a file name that is not taken, if necessary with the item's id, or with its id and revision."""
     file = name.rpartition("/")[2]
     candidates = (name, f"{pin.item}-{file}", f"{pin.item}-{pin.revision}-{file}")
     return next(one for one in candidates if one not in taken)

@@ -61,7 +61,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
         raise JobRefused(
             "skeleton-mismatch",
             f"the clips in {', '.join([*strangers, *unusable])} cannot be mixed with those of the evaluation; "
-            "move them to its skeleton first, with marey retarget, or leave them out",
+            "move them to the skeleton of the evaluation first, with marey retarget, or leave them out",
         )
     for other in candidates.databases.values():
         database = joined(database, other)
@@ -69,7 +69,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 
 
 def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
-    """Return a simulation of the set. Known records are reused only if the database has no other clips."""
+    """Return a simulation of the set. It reuses the evaluation's records if the database contains no further clips."""
     alone = database is evaluated.clips.database
     return Resimulation(
         database,

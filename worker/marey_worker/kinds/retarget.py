@@ -95,7 +95,7 @@ class _Retargeting:
         )
 
     def _info(self, stored: dict[str, Any] | None, plan: RetargetPlan, checks: tuple[Check, ...]) -> ClipInfo:
-        """Return the part `info` of a result: the facts about the source that still hold, and its origin."""
+        """Return the part `info` of a result: its origin, and the facts about the source that are still true."""
         details = {
             "scale": plan.scale,
             "mapped": len(plan.pairs),

@@ -65,4 +65,4 @@ def _require_same_place(context: Context, pin: PinnedInput) -> None:
     """Raise `JobRefused` unless an output with the model's name becomes a revision of this model."""
     now = context.item(Kind.MODEL, pin.item)
     if (now.collection, now.name) != (pin.collection, pin.name):
-        raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; try again")
+        raise JobRefused("model-moved", f"{pin.path} was moved or renamed while the job waited; submit the job again")
