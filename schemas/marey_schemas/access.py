@@ -89,7 +89,11 @@ class TokenCreate(Request):
     name: DisplayName
     scopes: tuple[ScopeText, ...] = Field(("read", "write", "jobs"), min_length=1, max_length=32)
     expires_in_s: int | None = Field(
-        90 * 86400, ge=60, le=10 * 365 * 86400, description="Expiry of the token; null if it never expires."
+        90 * 86400,
+        ge=60,
+        le=10 * 365 * 86400,
+        description="Time until the token ends; null if it never does. A token cannot outlive the one that creates it; "
+        "by default it ends after 90 days, or with that one if that is sooner.",
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -80,7 +80,10 @@ def create_token(
         list[str] | None,
         typer.Option(help="Scope: read, write, jobs, work or admin; !project=NAME limits it to one project."),
     ] = None,
-    days: Annotated[int, typer.Option(min=0, help="Days until the token expires; 0: never.")] = 90,
+    days: Annotated[
+        int | None,
+        typer.Option(min=0, help="Days until the token ends, 0: never; default: 90, or with your own token if sooner."),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -92,8 +95,10 @@ def create_token(
     """Create a token. Its secret is shown only once."""
     from marey_schemas.access import TokenCreate
 
-    lasting = days * SECONDS_PER_DAY or None
-    wanted = TokenCreate(name=name, expires_in_s=lasting, **({"scopes": tuple(scope)} if scope else {}))
+    given: dict[str, Any] = {"scopes": tuple(scope)} if scope else {}
+    if days is not None:
+        given["expires_in_s"] = days * SECONDS_PER_DAY or None
+    wanted = TokenCreate(name=name, **given)
     with connect(context) as marey:
         made = marey.tokens.create(wanted) if output is None else _token_in_file(marey, wanted, output)
     if output is not None:

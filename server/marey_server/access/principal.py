@@ -22,6 +22,7 @@ class Principal:
     administrator: bool = False
     scopes: tuple[str, ...] = ()
     token_id: str | None = None
+    expires_us: int | None = None
     job_id: str | None = None
     fence: int | None = None
     project_id: str | None = None

@@ -66,7 +66,7 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
         raise _unknown()
     if row.expires_us is not None and row.expires_us <= tx.now_us:
         raise _unknown()
-    return Principal("user", row.user_id, row.name, row.administrator, tuple(row.scopes), row.id)
+    return Principal("user", row.user_id, row.name, row.administrator, tuple(row.scopes), row.id, row.expires_us)
 
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
@@ -96,20 +96,39 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 
 
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
-    """Create a token of the caller with at most the scopes of the current credential; its secret is shown once."""
+    """Create a token of the caller; its secret is shown once.
+
+    Raises `ForbiddenProblem` if it would have a scope that the current credential lacks, or outlive it.
+    """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
         raise ForbiddenProblem(f"Your own credential lacks the scope {beyond[0]!r}.", code="insufficient-scope")
     issued = issue_user_token()
-    lifetime_s = request.expires_in_s
     row = {
         "id": new_id("token"), "user_id": user_id, "name": request.name, "prefix": issued.prefix,
         "secret_hash": issued.secret_hash, "scopes": list(request.scopes), "created_us": tx.now_us,
-        "expires_us": None if lifetime_s is None else tx.now_us + lifetime_s * 1_000_000,
+        "expires_us": _end_of(tx, request),
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
     tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
     return NewToken(**_shown(made).model_dump(), secret=issued.text)
+
+
+def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
+    """Return when a token ends; a caller who asks for no time gets at most that of the current credential."""
+    own_us, lifetime_s = tx.principal.expires_us, request.expires_in_s
+    wanted_us = None if lifetime_s is None else tx.now_us + lifetime_s * 1_000_000
+    if own_us is None or (wanted_us is not None and wanted_us <= own_us):
+        return wanted_us
+    if "expires_in_s" in request.model_fields_set:
+        left_s = (own_us - tx.now_us) // 1_000_000
+        raise ForbiddenProblem(
+            f"Your own credential ends in {left_s} s, and a token cannot outlive the one that creates it; "
+            "ask for less, or sign in for a longer time.",
+            code="outlives-credential",
+            context={"left_s": left_s},
+        )
+    return own_us
 
 
 def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:

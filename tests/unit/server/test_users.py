@@ -142,6 +142,21 @@ def test_a_token_expires(database: Database, chief: Principal, clock: Adjustable
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
 
 
+def test_a_token_makes_none_that_outlives_it(database: Database, chief: Principal, clock: AdjustableClock) -> None:
+    hour = make_token(database, chief, expires_in_s=3600)
+    leaked = database.read(ANONYMOUS, tokens.resolve_token, hour.secret)
+    for lifetime_s in (None, 3601, 90 * 86400):
+        with pytest.raises(ForbiddenProblem, match="cannot outlive") as refused:
+            make_token(database, leaked, expires_in_s=lifetime_s)
+        assert refused.value.error_code == "outlives-credential"
+    assert make_token(database, leaked).expires_at == hour.expires_at
+    shorter = make_token(database, leaked, expires_in_s=600).expires_at
+    assert shorter is not None and hour.expires_at is not None and shorter < hour.expires_at
+    clock.advance(3300)
+    with pytest.raises(ForbiddenProblem, match="cannot outlive"):
+        make_token(database, leaked, expires_in_s=600)
+
+
 def test_tokens_of_a_disabled_user_are_worth_nothing(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann", "correct horse")
     made = make_token(database, ann)
