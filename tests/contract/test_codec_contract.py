@@ -69,7 +69,7 @@ class Codec:
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
     def decode(self, data: bytes, **limits: int) -> Any:
-        return decode_tree(data, self.media_type, **limits)
+        return decode_tree(data, self.media_type, keep_blocks=False, **limits)
 
     def refusal(self, tree: Any) -> CodecError:
         with pytest.raises(CodecError) as caught:

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import msgpack
 import numpy as np
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.rest_server import PATIENCE_S, Server, running
 
-from marey_schemas.encoding import codecs
+from marey_schemas.encoding import codecs, tiles
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem
 from marey_server.store.database.connections import Database
@@ -67,6 +69,33 @@ def attempt(server: Server, lease: Any) -> httpx.Client:
 def thing(name: str, value: Any = 1) -> dict[str, Any]:
     parts = {"study": {"schema": "marey/document@1", "value": value}}
     return {"name": name, "kind": "study", "item_name": name, "parts": parts}
+
+
+def test_staged_arrays_are_stored_as_they_came_if_their_blocks_are_predicted(
+    server: Server, owner: httpx.Client, worker: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    array = np.cumsum(np.arange(4000.0).reshape(1000, 4), axis=0)
+    compress = tiles._compress
+    with monkeypatch.context() as slower:
+        slower.setattr(tiles, "_compress", lambda sections, _level=1: compress(sections, 12))
+        small = EncodedArray.of(array)
+    unpredicted = EncodedArray.of(array + 1, predict=False)
+    assert small != EncodedArray.of(array)
+    submit(owner)
+    (lease,) = claim(worker)
+    mine = attempt(server, lease)
+    outputs = [thing("small", small), thing("unpredicted", unpredicted)]
+    body = codecs.encode_tree({"outputs": outputs}, "application/msgpack", arrays="blocks")
+    ok(mine.post("outputs", content=body, headers={"Content-Type": BLOCKS}))
+    kept, encoded_again = ok(mine.post("complete", json={"write_id": "the-only-one"}))["outputs"]
+
+    def stored(output: Any) -> bytes:
+        place = f"/projects/lab/studies/{output['item']}/parts/study"
+        leaf = msgpack.unpackb(owner.get(place, headers={"Accept": BLOCKS}).content)["value"]
+        return bytes(leaf["data"])
+
+    assert stored(kept) == small.data
+    assert stored(encoded_again) == EncodedArray.of(array + 1).data
 
 
 def test_a_job_goes_from_its_submission_to_its_outputs(

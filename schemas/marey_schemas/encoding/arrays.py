@@ -5,7 +5,7 @@ in MessagePack and BSON; `"encoding": "blocks"` means that the bytes are those o
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Annotated, Any
 
@@ -29,6 +29,7 @@ __all__ = [
     "is_leaf",
     "json_data",
     "nested_lists",
+    "with_blocks",
 ]
 
 LEAF_KEYS = frozenset({"dtype", "shape", "data"})
@@ -40,11 +41,13 @@ _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int
 
 @dataclass(frozen=True, slots=True)
 class EncodedArray:
-    """Block-encoded array that is passed on without being decoded."""
+    """Block-encoded array that is passed on as it is."""
 
     dtype: str
     shape: tuple[int, ...]
     data: bytes
+    decoded: NDArray[Any] | None = field(default=None, compare=False, repr=False)
+    """The array, if it was decoded and checked before."""
 
     @classmethod
     def of(cls, array: NDArray[Any], *, predict: bool = True) -> "EncodedArray":
@@ -61,6 +64,8 @@ class EncodedArray:
 
     def decode(self, *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
         """Return the decoded array. Raises `ArrayError` if the bytes are corrupt or do not match dtype and shape."""
+        if self.decoded is not None:
+            return self.decoded
         claimed = ArraySpec(self.dtype, self.shape)
         claimed.require(max_bytes)
         try:
@@ -97,6 +102,13 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
     else:
         array = _from_lists(data, spec)
     return require_finite(array)
+
+
+def with_blocks(leaf: Mapping[str, Any], array: NDArray[Any]) -> NDArray[Any] | EncodedArray:
+    """Return the decoded array of a leaf, together with the leaf's bytes if these may be stored as they are."""
+    if "encoding" in leaf and blocks.is_well_packed(leaf["data"]):
+        return EncodedArray(array.dtype.str, array.shape, leaf["data"], array)
+    return array
 
 
 def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:

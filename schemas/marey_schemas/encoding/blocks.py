@@ -85,10 +85,26 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
     Raises `ArrayError` for a dtype or shape that is not allowed.
     """
     array = little_endian(array)
-    spec = ArraySpec.of(array)
-    longer = NARROW_COLUMNS // max(math.prod(spec.shape[1:]), 1)
-    layout = _Layout(spec, BLOCK_FRAMES * max(longer, 1), GROUP_COLUMNS)
+    layout = _layout_of(ArraySpec.of(array))
     return _assembled(layout, _packed(layout, array, predict=predict))
+
+
+def is_well_packed(data: bytes) -> bool:
+    """Return whether valid bytes may be kept in place of those that `encode` would make of the same array.
+
+    Their layout is the one of `encode`, every tile is predicted, and all together are not larger than the plain array.
+    """
+    layout, starts = _read_head(data)
+    return (
+        layout == _layout_of(layout.spec)
+        and starts[-1] - starts[0] <= layout.spec.nbytes
+        and all(tiles.form_of(data[here:there]) != tiles.RAW for here, there in pairwise(starts))
+    )
+
+
+def _layout_of(spec: ArraySpec) -> _Layout:
+    longer = NARROW_COLUMNS // max(math.prod(spec.shape[1:]), 1)
+    return _Layout(spec, BLOCK_FRAMES * max(longer, 1), GROUP_COLUMNS)
 
 
 def cut_frames(data: bytes, start: int, stop: int) -> bytes:

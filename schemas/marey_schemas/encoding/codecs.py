@@ -18,7 +18,7 @@ import orjson
 from bson.raw_bson import RawBSONDocument
 from numpy.typing import NDArray
 
-from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, json_data
+from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, json_data, with_blocks
 from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, little_endian, require_finite
 
 JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
@@ -99,9 +99,11 @@ def decode_tree(
     max_bytes: int = MAX_BYTES,
     max_depth: int = MAX_DEPTH,
     max_array_bytes: int | None = None,
+    keep_blocks: bool = False,
 ) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
+    With `keep_blocks`, arrays whose bytes are such as `encode_tree` writes become `EncodedArray` that are also decoded.
     `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without it, they
     have the same limit as the input. The number of values is limited, too. Raises `CodecError`.
     """
@@ -111,6 +113,7 @@ def decode_tree(
     walk = _Walk(
         max_depth,
         array_bytes=max_bytes if max_array_bytes is None else min(max_bytes, max_array_bytes),
+        keep_blocks=keep_blocks,
         max_values=MAX_VALUES,
         max_copied=BSON_COPIES * max(len(data), MAX_LIST),
     )
@@ -221,12 +224,14 @@ class _Walk:
         *,
         on_array: Callable[[Any], dict[str, Any]] | None = None,
         array_bytes: int = 0,
+        keep_blocks: bool = False,
         max_values: int | None = None,
         max_copied: int = 0,
     ) -> None:
         self._max_depth = max_depth
         self._on_array = on_array
         self._array_bytes = array_bytes
+        self._keep_blocks = keep_blocks
         self._values_left = math.inf if max_values is None else max_values
         self._copies_left = max_copied
         self._path: list[str | int] = []
@@ -297,10 +302,10 @@ class _Walk:
         except ArrayError as error:
             raise self._error(error.code, error.detail) from error
 
-    def _take_leaf(self, leaf: Mapping[str, Any]) -> NDArray[Any]:
+    def _take_leaf(self, leaf: Mapping[str, Any]) -> NDArray[Any] | EncodedArray:
         array = array_from_leaf(leaf, max_bytes=self._array_bytes)
         self._array_bytes -= array.nbytes
-        return array
+        return with_blocks(leaf, array) if self._keep_blocks else array
 
     def _key(self, key: object) -> str:
         if not isinstance(key, str):

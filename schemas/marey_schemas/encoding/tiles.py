@@ -58,6 +58,11 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
     return _restore(np.frombuffer(content, np.uint8), dtype, frames, columns)
 
 
+def form_of(data: bytes) -> int:
+    """Return the form of a valid tile: `RAW`, `DIFFERENCES` or `QUATERNIONS`. Only its start is decompressed."""
+    return zstandard.ZstdDecompressor().stream_reader(data).read(1)[0]
+
+
 def _compress(sections: list[Bytes], level: int = 1) -> bytes:
     """Return one zstd frame in which every section ends a block, so that each has its own entropy tables."""
     size = sum(section.size for section in sections)

@@ -304,7 +304,7 @@ class Resource(Exchange):
         # Workers compute: their results may be still motion of any length, which takes next to no bytes.
         is_result = self.operation.access is Access.ATTEMPT
         max_array_bytes = body.max_bytes if is_result else min(body.max_bytes, unpacked_limit(len(data)))
-        read = partial(_decode, data, self.body_type, body.content, max_array_bytes)
+        read = partial(_decode, data, self.body_type, body.content, max_array_bytes, keep_blocks=is_result)
         inline = len(data) <= INLINE_BYTES and self.body_type == JSON  # a few bytes of blocks unpack to megabytes
         return read() if inline else await self.compute(read)
 
@@ -327,6 +327,6 @@ class Resource(Exchange):
         return f"sha256:{digest.hexdigest()}"
 
 
-def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int) -> Any:
-    tree = decode_body(data, media_type, max_array_bytes=max_array_bytes)
+def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int, *, keep_blocks: bool) -> Any:
+    tree = decode_body(data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks)
     return tree if content is Document else validate_body(content, tree)

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from marey_schemas.encoding import codecs
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.problems import FieldError
 from marey_server.errors import BadRequestProblem, InvalidProblem, TooLargeProblem
@@ -55,13 +56,13 @@ def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     return BadRequestProblem(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
 
 
-def decode_body(data: bytes, media_type: str, *, max_array_bytes: int) -> Any:
-    """Return the tree in a body, whose arrays may have `max_array_bytes`.
+def decode_body(data: bytes, media_type: str, *, max_array_bytes: int, keep_blocks: bool = False) -> Any:
+    """Return the tree in a body, whose arrays may have `max_array_bytes`; `keep_blocks` as in `codecs.decode_tree`.
 
     Raises `BadRequestProblem` if it cannot be decoded, and `InvalidProblem` if it contains values that are not allowed.
     """
     try:
-        return codecs.decode_tree(data, media_type, max_array_bytes=max_array_bytes)
+        return codecs.decode_tree(data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks)
     except codecs.CodecError as error:
         fault = FieldError(pointer=error.pointer, code=error.code, detail=error.detail)
         if error.code == "too-large":
@@ -97,4 +98,4 @@ def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:
     if isinstance(tree, str) and "\0" in tree:
         fault = FieldError(pointer=json_pointer(steps), code="bad-text", detail="A text may not contain NUL.")
         raise InvalidProblem(f"{fault.pointer}: {fault.detail}", code="bad-text", errors=[fault])
-    return isinstance(tree, np.ndarray)
+    return isinstance(tree, np.ndarray | EncodedArray)

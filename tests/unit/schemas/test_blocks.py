@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from tests.support.tiers import examples
 
-from marey_schemas.encoding import blocks
+from marey_schemas.encoding import blocks, tiles
 from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec
 from marey_schemas.encoding.blocks import BlockError
 
@@ -49,6 +50,37 @@ def with_checksum(head: bytes) -> bytes:
 @settings(max_examples=examples(300))
 def test_every_array_comes_back_to_the_bit(array: NDArray[Any]) -> None:
     assert same_bits(blocks.decode(blocks.encode(array)), array)
+
+
+def test_bytes_of_the_encoder_may_be_kept() -> None:
+    for array in (poses(300, 20), np.arange(5000), np.zeros((0, 7), np.float32)):
+        assert blocks.is_well_packed(blocks.encode(array))
+
+
+def test_bytes_without_prediction_and_those_of_another_layout_may_not_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    array = poses(600, 20)
+    assert not blocks.is_well_packed(blocks.encode(array, predict=False))
+    assert not blocks.is_well_packed(blocks.cut_frames(blocks.encode(array), 100, 300))
+    monkeypatch.setattr(blocks, "BLOCK_FRAMES", 100)
+    shorter = blocks.encode(array)
+    monkeypatch.undo()
+    assert same_bits(blocks.decode(shorter), array)
+    assert not blocks.is_well_packed(shorter)
+
+
+def test_bytes_that_empty_blocks_make_larger_than_the_array_may_not_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    array = poses(60, 20)
+
+    def bloated(sections: list[NDArray[np.uint8]]) -> bytes:
+        whole = b"".join(section.tobytes() for section in sections)
+        stream = zstandard.ZstdCompressor(level=1, write_checksum=True).compressobj(size=len(whole))
+        content = stream.compress(whole) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+        return content + bytes(3) * array.nbytes + stream.flush()
+
+    monkeypatch.setattr(tiles, "_compress", lambda sections, level=1: bloated(sections))
+    encoded = blocks.encode(array)
+    assert same_bits(blocks.decode(encoded), array)
+    assert not blocks.is_well_packed(encoded)
 
 
 def test_a_million_random_float32_bit_patterns_come_back_to_the_bit() -> None:

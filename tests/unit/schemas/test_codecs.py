@@ -8,8 +8,10 @@ import msgpack
 import numpy as np
 import pytest
 from bson import Binary, Code, Decimal128, Int64, ObjectId, Regex
+from numpy.typing import NDArray
 
 from marey_schemas.encoding import blocks, codecs
+from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import (
     BSON,
     BSON_COPIES,
@@ -28,9 +30,9 @@ from marey_schemas.encoding.codecs import (
 )
 
 
-def refusal(data: bytes, media_type: str, **limits: int) -> CodecError:
+def refusal(data: bytes, media_type: str, *, keep_blocks: bool = False, **limits: int) -> CodecError:
     with pytest.raises(CodecError) as caught:
-        decode_tree(data, media_type, **limits)
+        decode_tree(data, media_type, keep_blocks=keep_blocks, **limits)
     return caught.value
 
 
@@ -59,6 +61,33 @@ def test_blocks_travel_as_the_bytes_of_the_block_codec(media_type: str) -> None:
     data = encode_tree({"a": array}, media_type, arrays="blocks")
     document = msgpack.unpackb(data) if media_type == MSGPACK else bson.decode(data)
     assert document == {"a": {"dtype": "<f4", "shape": [300, 3], "encoding": "blocks", "data": blocks.encode(array)}}
+
+
+@pytest.mark.parametrize("media_type", [MSGPACK, BSON])
+def test_blocks_may_be_kept_beside_the_array_that_they_hold(media_type: str) -> None:
+    sent = {"kept": np.arange(2000), "plain": EncodedArray.of(np.arange(2000), predict=False)}
+    tree = decode_tree(encode_tree(sent, media_type, arrays="blocks"), media_type, keep_blocks=True)
+    assert tree["kept"] == EncodedArray.of(np.arange(2000))
+    np.testing.assert_array_equal(tree["kept"].decode(), np.arange(2000))
+    np.testing.assert_array_equal(tree["plain"], np.arange(2000))
+    plain = decode_tree(encode_tree({"a": np.arange(2000)}, media_type), media_type, keep_blocks=True)
+    np.testing.assert_array_equal(plain["a"], np.arange(2000))
+
+
+@pytest.mark.parametrize("media_type", [MSGPACK, BSON])
+def test_kept_blocks_are_checked_and_counted_as_others(media_type: str) -> None:
+    corrupt = bytearray(encode_tree({"a": np.arange(2000)}, media_type, arrays="blocks"))
+    corrupt[-10] ^= 1
+    assert refusal(bytes(corrupt), media_type, keep_blocks=True).code == "bad-array"
+    broken = write({"a": _leaf_of(np.array([1.0, np.nan] * 500))}, media_type)
+    assert refusal(broken, media_type, keep_blocks=True).code == "not-finite"
+    two = encode_tree({"a": np.arange(2000), "b": np.arange(2000)}, media_type, arrays="blocks")
+    assert refusal(two, media_type, keep_blocks=True, max_bytes=20_000).code == "too-large"
+
+
+def _leaf_of(array: NDArray[Any]) -> dict[str, Any]:
+    encoded = EncodedArray.of(array)
+    return {"dtype": encoded.dtype, "shape": list(encoded.shape), "encoding": "blocks", "data": encoded.data}
 
 
 def test_json_cannot_carry_blocks() -> None:
