@@ -129,7 +129,7 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
             _say(str(finding))
         _say(f"checked {', '.join(f'{count:,} {what}' for what, count in checked.items()) or 'nothing'}")
     if findings:
-        raise CommandFailed(f"{len(findings)} faults were found")
+        raise CommandFailed(f"{len(findings)} faults were found and are listed above")
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:

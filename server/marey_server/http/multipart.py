@@ -103,7 +103,7 @@ class MultipartReader:
 
     def _begin_part(self) -> None:
         if self._parts_left == 0:
-            raise TooLargeProblem("The request has too many parts.", code="too-many-parts")
+            raise TooLargeProblem("The request has too many parts; send several requests.", code="too-many-parts")
         self._parts_left -= 1
         self._head_bytes = 0
         self._disposition = None
