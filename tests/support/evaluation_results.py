@@ -130,7 +130,7 @@ def _stretches(ticks: int, clips: tuple[Any, ...], random: Generator) -> tuple[I
     return rows, np.array(entered, dtype=np.int64)
 
 
-def some_coverage(options: EvaluationOptions, clips: tuple[Any, ...], how: Any, random: Generator) -> Coverage:
+def some_coverage(options: EvaluationOptions, clips: tuple[Any, ...], how: Making, random: Generator) -> Coverage:
     """Return windows of clips with about one speed and turn rate each; a tenth of the clips goes backwards."""
     counts = [max(0, clip.frame_count - round(RATE_HZ)) for clip in clips]
     owner = np.repeat(np.arange(len(clips)), counts).astype(np.int32)

@@ -1,6 +1,6 @@
 """Aligned sets and models made up of generated gaits: small, exact, and odd where a test wants them so."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from marey_motion.motion import Motion
 FRAMES = 48
 
 
-def walks(count: int = 12, *, names: Any = None, frames: int = FRAMES, seed: int = 0) -> AlignedSet:
+def walks(count: int = 12, *, names: Sequence[str] | None = None, frames: int = FRAMES, seed: int = 0) -> AlignedSet:
     """Return walks of one duration whose speed rises from clip to clip, played at varying speed."""
     random = np.random.default_rng(seed)
     speeds = np.linspace(0.9, 1.7, count)

@@ -6,6 +6,7 @@ that makes a reader fail otherwise is kept in the current folder.
 
 from __future__ import annotations
 
+import functools
 import random
 import signal
 import sys
@@ -40,12 +41,13 @@ class TooSlow(BaseException):
     """A reader took longer than `LONGEST_S`; no reader's `except Exception` may swallow this."""
 
 
-def seeds() -> list[Seed]:
+@functools.cache
+def seeds() -> tuple[Seed, ...]:
     """(name, file, companion) of one good file per format and form."""
     clip = generate_gait(1.2, 0.0, 0.2, 30.0)
     skeleton = write_predecessor_skeleton(clip.skeleton)
     six = f"{POSITIONS} {ZXY}"
-    return [
+    return (
         ("walk.bvh", write_motion(clip, "bvh"), None),
         ("arm.bvh", bvh(["1 2 3 4 5 6 7 8 9"] * 3), None),
         ("six.bvh", bvh(["1 2 3 4 5 6 " * 3] * 2, hierarchy=nested(["a", "b", "c"], [six] * 3)), None),
@@ -57,7 +59,7 @@ def seeds() -> list[Seed]:
         ("rows.json", write_motion(clip, "predecessor", encoding="json"), skeleton),
         ("rows.bson", write_motion(clip, "predecessor", encoding="bson"), skeleton),
         ("frames.bz2", write_motion(clip, "predecessor", form="frames"), skeleton),
-    ]
+    )
 
 
 def broken(data: bytes, source: random.Random) -> bytes:

@@ -133,7 +133,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         reason = next((reason for reason, applies in reasons.items() if applies(item)), None)
         if reason is None:
             kept.append(item)
-            item.add_marker(pytest.mark.xdist_group(_group(item)))
+            if not item.get_closest_marker("xdist_group"):
+                item.add_marker(pytest.mark.xdist_group(_group(item)))
         else:
             gone.append(item)
             config.stash[LEFT_OUT][reason] += 1
@@ -144,6 +145,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def _group(item: pytest.Item) -> str:
     """Return the tests that run in one process: those of a file, which share fixtures; all ways over one database.
 
+    Files that share what takes long to make name a group themselves.
     Fault cases share nothing, take long and wait much, so each goes where there is room.
     """
     folder = _folder(item)

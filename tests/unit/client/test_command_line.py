@@ -1,5 +1,6 @@
 """The command line where no server is needed."""
 
+import contextlib
 import os
 import re
 import shlex
@@ -9,10 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
+from unittest import mock
 
 import httpx
 import pytest
 import typer
+from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.cli import accounts, files, with_global_options_first
@@ -39,6 +42,12 @@ def marey(
     return subprocess.run(
         command, capture_output=True, text=True, input=stdin, env={**os.environ, **(env or {})}, cwd=cwd
     )
+
+
+def marey_here(arguments: list[str], env: dict[str, str], cwd: Path) -> CompletedProcess[str]:
+    """Run a command in this process: to start one takes long."""
+    with mock.patch.dict(os.environ, env), contextlib.chdir(cwd):
+        return run_here(arguments)
 
 
 NO_OPTIONS = typer.Context(typer.main.get_command(app))
@@ -128,8 +137,8 @@ def test_a_reader_who_goes_away_is_no_news(arguments: list[str], nowhere: dict[s
 
 
 @pytest.mark.parametrize("arguments", [["nonsense"], ["ls", "--nonsense"], ["upload"], ["ls", "/"], ["job", "ls"]])
-def test_wrong_usage_exits_with_2(arguments: list[str], nowhere: dict[str, str]) -> None:
-    done = marey(*arguments, env=nowhere)
+def test_wrong_usage_exits_with_2(arguments: list[str], nowhere: dict[str, str], tmp_path: Path) -> None:
+    done = marey_here(arguments, nowhere, tmp_path)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
 
@@ -167,7 +176,7 @@ def test_what_makes_no_sense_is_told_in_one_line_with_exit_status_2(
 ) -> None:
     for name, data in GIVEN.items():
         (tmp_path / name).write_bytes(data)
-    done = marey(*arguments, env=nowhere, cwd=tmp_path)
+    done = marey_here(arguments, nowhere, tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert done.stderr.startswith("marey: ")
     assert told in done.stderr

@@ -8,12 +8,11 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.drawn_figures import is_sound, rows_of
-from tests.support.evaluation_results import SMALL, evaluated, some_coverage, synthetic_result, wandering
+from tests.support.evaluation_results import SMALL, Making, evaluated, some_coverage, synthetic_result, wandering
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.coverage import Windows, coverage_of
@@ -44,7 +43,7 @@ def other() -> EvaluationResult:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_drawn_of_one_result_and_of_two_with_the_same_bytes_each_time(
-    name: Any, result: EvaluationResult, other: Any
+    name: str, result: EvaluationResult, other: EvaluationResult
 ) -> None:
     for compared in (None, other):
         first, second = (is_sound(draw_figure(name, result, other=compared)) for _ in range(2))
@@ -371,12 +370,12 @@ def tiny(
     random = np.random.default_rng(seed)
     trials = suite_trials(options)
     records = tuple(wandering(trial, clips, 0.1, random) for trial in trials)
-    how = type("How", (), {"turns_deg_s": (-5.0, 5.0)})
+    how = Making(turns_deg_s=(-5.0, 5.0))
     coverage = some_coverage(options, clips if covered else (), how, random)
     return evaluated(options, clips, trials, records, coverage)
 
 
-def without_transitions(result: Any) -> Any:
+def without_transitions(result: EvaluationResult) -> EvaluationResult:
     records = tuple(
         replace(
             record,
@@ -424,7 +423,14 @@ def test_evaluations_of_little_are_drawn(little: str) -> None:
         is_sound(figure)
 
 
-@pytest.mark.parametrize("little", ["one clip", "no windows", "one speed", "unknown numbers"])
+@pytest.mark.parametrize(
+    "little",
+    [
+        "no windows",
+        "unknown numbers",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("one clip", "one speed")),
+    ],
+)
 def test_evaluations_of_little_are_compared(little: str, other: EvaluationResult) -> None:
     for figure in draw_figures(other, other=LITTLE[little]()).values():
         is_sound(figure)

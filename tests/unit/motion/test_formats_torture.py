@@ -31,7 +31,7 @@ CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
     ("make", "outcome"),
     [
         (big.short_lines, f"read {big.SIZE // 18}"),
-        (big.long_numbers, f"read {big.SIZE // 207}"),
+        pytest.param(big.long_numbers, f"read {big.SIZE // 207}", marks=pytest.mark.slow),
         (big.endless_hierarchy, "format-limit"),
         (big.one_line, "frame-width"),
         (big.rubbish, "not-bvh"),
@@ -40,7 +40,7 @@ CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
 def test_fifty_megabytes_need_less_than_a_gigabyte(make: Callable[[], bytes], outcome: str, tmp_path: Path) -> None:
     child = multiprocessing.get_context("spawn").Process(target=big.read_and_measure, args=(make, str(tmp_path)))
     child.start()
-    child.join(60)
+    child.join(240)
     found, used = (tmp_path / "result").read_text().split("\n")
     assert found == outcome
     assert int(used) < 850 * big.MEGABYTE

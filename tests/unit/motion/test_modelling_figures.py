@@ -2,18 +2,18 @@
 
 import subprocess
 import sys
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.support.drawn_figures import cut_off, is_sound, rows_of
+from tests.support.drawn_models import DRAWN_MODELS, QUICK, figures_of, figures_of_walks, model_of_walks, trained_on
 from tests.support.model_examples import FRAMES, walks
 
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.modelling.search.check import SearchCheck
-from marey_motion.modelling.training import train_primitive
 from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.drawn import DrawnFigure, finish
 from marey_reports.models.figures import (
@@ -29,39 +29,38 @@ from marey_reports.models.figures.latent_space import ellipse
 from marey_reports.models.figures.samples import reach_of
 from marey_schemas.options.modelling import ModelOptions
 
-QUICK = ModelOptions(report_samples=20, starts=1)
+pytestmark = DRAWN_MODELS
 
 
 def modelled(aligned: AlignedSet, options: ModelOptions = QUICK) -> ModelSubject:
-    trained = train_primitive(aligned, options, name="walk")
-    return ModelSubject(trained.primitive, aligned, trained.report, seed=3)
+    return trained_on(aligned, options)[1]
 
 
 @pytest.fixture(scope="module")
 def subject() -> ModelSubject:
-    return modelled(walks())
+    return model_of_walks()[1]
 
 
 @pytest.fixture(scope="module")
-def figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
-    return {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
+def figures() -> Mapping[str, DrawnFigure]:
+    return figures_of_walks()
 
 
-def test_every_figure_is_sound(figures: dict[str, DrawnFigure]) -> None:
+def test_every_figure_is_sound(figures: Mapping[str, DrawnFigure]) -> None:
     assert (set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"}) - set(figures) == {"search-errors"}
     for figure in figures.values():
         is_sound(figure)
 
 
 @pytest.mark.slow
-def test_the_same_model_gives_the_same_bytes(subject: Any, figures: dict[str, DrawnFigure]) -> None:
-    again = {**draw_alignment_figures(subject.examples), **draw_model_figures(replace(subject))}
+def test_the_same_model_gives_the_same_bytes(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
+    again = figures_of(replace(subject))
     assert {name: figure.files() for name, figure in again.items()} == {
         name: figure.files() for name, figure in figures.items()
     }
 
 
-def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
+def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     with ThreadPoolExecutor(3) as pool:
         drawn = list(pool.map(lambda _: draw_alignment_figures(subject.examples), range(3)))
     assert {each["time-warps"].svg for each in drawn} == {figures["time-warps"].svg}
@@ -76,7 +75,7 @@ def test_matplotlib_is_not_loaded_before_something_is_drawn() -> None:
 
 
 def test_time_warps_hold_the_time_functions_of_all_clips(
-    subject: ModelSubject, figures: dict[str, DrawnFigure]
+    subject: ModelSubject, figures: Mapping[str, DrawnFigure]
 ) -> None:
     rows = rows_of(figures["time-warps"], "time_functions")
     for clip in subject.examples.clips:
@@ -95,14 +94,14 @@ def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject: Mode
     assert "late one" in figure.svg
 
 
-def test_keyframes_are_marked_by_their_labels(figures: dict[str, DrawnFigure]) -> None:
+def test_keyframes_are_marked_by_their_labels(figures: Mapping[str, DrawnFigure]) -> None:
     assert "left foot down" in figures["time-warps"].svg
     assert "left foot down" in figures["mean"].svg
     assert "2 keyframes" in figures["time-warps"].caption
 
 
 def test_costs_show_the_worst_clip_and_a_typical_one_with_their_ways(
-    subject: ModelSubject, figures: dict[str, DrawnFigure]
+    subject: ModelSubject, figures: Mapping[str, DrawnFigure]
 ) -> None:
     rows = rows_of(figures["alignment-costs"], "paths")
     assert list(dict.fromkeys(row["clip"] for row in rows)) == ["walk006", "walk011"]
@@ -127,7 +126,7 @@ def test_a_clip_that_is_the_reference_played_at_half_speed_costs_nothing_along_i
 
 
 def test_a_sweep_goes_two_deviations_to_both_sides_of_the_mean(
-    subject: ModelSubject, figures: dict[str, DrawnFigure]
+    subject: ModelSubject, figures: Mapping[str, DrawnFigure]
 ) -> None:
     primitive = subject.primitive
     rows = rows_of(figures["component-1"], "positions")
@@ -149,7 +148,7 @@ def test_the_caption_of_a_component_tells_its_share_and_what_it_moves(subject: M
 
 
 def test_time_components_hold_the_durations_of_the_model(
-    subject: ModelSubject, figures: dict[str, DrawnFigure]
+    subject: ModelSubject, figures: Mapping[str, DrawnFigure]
 ) -> None:
     primitive = subject.primitive
     rows = rows_of(figures["time-components"], "time")
@@ -174,7 +173,7 @@ def test_motions_that_travel_are_seen_more_from_the_side(subject: ModelSubject) 
 # Examples and samples
 
 
-def test_examples_stand_beside_as_many_samples(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
+def test_examples_stand_beside_as_many_samples(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     rows = rows_of(figures["samples"], "positions")
     names = list(dict.fromkeys(row["row"] for row in rows))
     uids = [clip.uid for clip in subject.examples.clips]
@@ -184,7 +183,7 @@ def test_examples_stand_beside_as_many_samples(subject: ModelSubject, figures: d
     assert [first["x_m"], first["y_m"], first["z_m"]] == pytest.approx(subject.examples.poses[3, 0, :3].tolist())
 
 
-def test_paths_are_those_of_wrists_and_ankles(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
+def test_paths_are_those_of_wrists_and_ankles(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     rows = rows_of(figures["paths"], "paths")
     assert {row["joint"] for row in rows} == {"left wrist", "right wrist", "left ankle", "right ankle"}
     assert len({row["motion"] for row in rows}) == 2 * len(subject.examples.clips)
@@ -198,7 +197,7 @@ def test_the_reach_of_examples_is_where_their_joints_are(subject: ModelSubject) 
         assert np.abs(reach.samples_m - reach.examples_m).max() < 0.5
 
 
-def test_durations_are_shares_of_all_motions(figures: dict[str, DrawnFigure]) -> None:
+def test_durations_are_shares_of_all_motions(figures: Mapping[str, DrawnFigure]) -> None:
     rows = rows_of(figures["durations"], "durations")
     assert sum(row["examples_share"] for row in rows) == pytest.approx(1.0)
     assert sum(row["samples_share"] for row in rows) == pytest.approx(1.0)
@@ -208,7 +207,7 @@ def test_durations_are_shares_of_all_motions(figures: dict[str, DrawnFigure]) ->
 
 
 def test_variance_reconstruction_and_mixture_are_those_of_the_training_report(
-    subject: ModelSubject, figures: dict[str, DrawnFigure]
+    subject: ModelSubject, figures: Mapping[str, DrawnFigure]
 ) -> None:
     report = subject.report
     assert [row["share"] for row in rows_of(figures["variance"], "poses")] == report.spatial_energy.tolist()
@@ -220,7 +219,7 @@ def test_variance_reconstruction_and_mixture_are_those_of_the_training_report(
     assert [row["bic"] for row in rows_of(figures["mixture"], "candidates")] == [c.bic for c in report.candidates]
 
 
-def test_the_latent_space_holds_examples_and_samples(subject: ModelSubject, figures: dict[str, DrawnFigure]) -> None:
+def test_the_latent_space_holds_examples_and_samples(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     rows = rows_of(figures["latent-space"], "examples")
     assert [row["example"] for row in rows] == [clip.uid for clip in subject.examples.clips]
     assert [row["poses 1"] for row in rows] == pytest.approx(subject.latents[:, 0].tolist())
@@ -234,7 +233,7 @@ def test_an_outline_holds_two_standard_deviations() -> None:
 
 
 @pytest.mark.slow
-def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(subject: Any) -> None:
+def test_examples_stand_in_the_order_of_their_likelihood_and_odd_ones_are_named(subject: ModelSubject) -> None:
     examples = list(subject.report.examples)
     examples[4] = replace(examples[4], held_out_log_likelihood=-1e4, outlier=True, name="limping")
     clips = list(subject.examples.clips)
@@ -265,7 +264,7 @@ def test_search_errors_are_drawn_beside_each_other() -> None:
 # Odd models
 
 
-def headless(aligned: Any) -> Any:
+def headless(aligned: AlignedSet) -> AlignedSet:
     """The same motions of a skeleton that knows no joint by its name."""
     old = aligned.skeleton
     names = tuple(f"j{number}" for number in range(old.joint_count))
@@ -273,13 +272,13 @@ def headless(aligned: Any) -> Any:
     return replace(aligned, skeleton=bare)
 
 
-def alike(aligned: Any, count: Any) -> Any:
+def alike(aligned: AlignedSet, count: int) -> AlignedSet:
     first = aligned.clips[0]
     copies = tuple(replace(first, uid=f"copy{index}", name=f"copy {index}") for index in range(count))
     return replace(aligned, clips=copies, reference="copy0")
 
 
-def backwards(aligned: Any) -> Any:
+def backwards(aligned: AlignedSet) -> AlignedSet:
     """Motions that stay below the floor and go backwards."""
     clips = []
     for clip in aligned.clips:
@@ -324,7 +323,7 @@ def test_odd_models_are_drawn_and_nothing_is_cut_off(odd: str) -> None:
 @pytest.mark.slow
 def test_two_hundred_examples_are_drawn_as_twenty_are() -> None:
     subject = modelled(walks(200), QUICK.replace(leave_one_out=False, folds=0))
-    drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
+    drawn = figures_of(subject)
     assert len(rows_of(drawn["likelihood"], "examples")) == 200
     assert "170 likeliest are not shown" in drawn["likelihood"].caption
     for figure in drawn.values():
@@ -337,7 +336,7 @@ def test_the_figures_of_no_samples_of_the_search_say_so() -> None:
 
 
 @pytest.mark.slow
-def test_the_check_of_searches_is_drawn_where_there_is_one(subject: Any) -> None:
+def test_the_check_of_searches_is_drawn_where_there_is_one(subject: ModelSubject) -> None:
     found = SearchCheck(("walk001", "walk001"), ("left_wrist", "right_wrist"), (5, 9), np.array([2.0, 3.0]), np.ones(2))
     figure = draw_model_figures(replace(subject, check=found))["search-errors"]
     assert [row["joint"] for row in rows_of(figure, "errors")] == ["left_wrist", "right_wrist"]

@@ -1,19 +1,20 @@
 """Reports of models: one sound HTML file that says what was learned, whatever clips are called."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import pytest
+from tests.support.drawn_models import DRAWN_MODELS, figures_of, figures_of_walks, model_of_walks, trained_on
 from tests.support.model_examples import walks
 from tests.support.report_pages import HOSTILE, Page, is_sound
 
-from marey_motion.alignment.aligned import AlignedSet
-from marey_motion.modelling.training import TrainedPrimitive, train_primitive
+from marey_motion.modelling.training import TrainedPrimitive
 from marey_motion.modelling.training_warnings import Warned
 from marey_motion.modelling.verdict import verdict_of
 from marey_reports.drawing.drawn import DrawnFigure
-from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
+from marey_reports.models.figures import ModelSubject, draw_model_figures
 from marey_reports.models.page import render_model_report
 from marey_schemas.options.modelling import ModelOptions
 
@@ -25,36 +26,31 @@ ORIGIN = {
 }
 
 
-QUICK = ModelOptions(report_samples=20, starts=1)
-
-
-def made(aligned: AlignedSet, options: ModelOptions = QUICK) -> tuple[TrainedPrimitive, ModelSubject]:
-    trained = train_primitive(aligned, options, name="walk")
-    return trained, ModelSubject(trained.primitive, aligned, trained.report)
+pytestmark = DRAWN_MODELS
 
 
 def rendered(
-    trained: TrainedPrimitive, subject: ModelSubject, figures: dict[str, DrawnFigure] | None = None, **options: Any
+    trained: TrainedPrimitive, subject: ModelSubject, figures: Mapping[str, DrawnFigure] | None = None, **options: Any
 ) -> str:
     return render_model_report(trained, subject, figures or {}, **{"title": "Walk", "origin": ORIGIN, **options})
 
 
 @pytest.fixture(scope="module")
 def model() -> tuple[TrainedPrimitive, ModelSubject]:
-    return made(walks())
+    return model_of_walks()
 
 
 @pytest.fixture(scope="module")
-def figures(model: tuple[TrainedPrimitive, ModelSubject]) -> dict[str, DrawnFigure]:
-    return {**draw_alignment_figures(model[1].examples), **draw_model_figures(model[1])}
+def figures() -> Mapping[str, DrawnFigure]:
+    return figures_of_walks()
 
 
 @pytest.fixture(scope="module")
-def page(model: tuple[TrainedPrimitive, ModelSubject], figures: dict[str, DrawnFigure]) -> Page:
+def page(model: tuple[TrainedPrimitive, ModelSubject], figures: Mapping[str, DrawnFigure]) -> Page:
     return is_sound(rendered(model[0], model[1], figures))
 
 
-def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: dict[str, DrawnFigure]) -> None:
+def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: Mapping[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(figures)
     assert page.tags["h1"] == 1
     for figure in figures.values():
@@ -66,7 +62,7 @@ def test_the_page_opens_with_the_verdict(page: Page, model: tuple[TrainedPrimiti
 
 
 def test_the_same_model_gives_the_same_page(
-    model: tuple[TrainedPrimitive, ModelSubject], figures: dict[str, DrawnFigure]
+    model: tuple[TrainedPrimitive, ModelSubject], figures: Mapping[str, DrawnFigure]
 ) -> None:
     assert rendered(model[0], model[1], figures) == rendered(model[0], model[1], figures)
 
@@ -99,9 +95,8 @@ def test_it_says_what_the_model_was_made_of(page: Page) -> None:
 
 @pytest.mark.slow
 def test_names_and_titles_are_shown_and_never_run() -> None:
-    trained, subject = made(walks(6, names=(*HOSTILE, "plain")))
-    drawn = {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
-    page = is_sound(rendered(trained, subject, drawn, title=HOSTILE[1]))
+    trained, subject = trained_on(walks(6, names=(*HOSTILE, "plain")))
+    page = is_sound(rendered(trained, subject, figures_of(subject), title=HOSTILE[1]))
     assert HOSTILE[0] in page.text
     assert "alert" not in "".join(page.scripts)
 
@@ -114,7 +109,7 @@ def test_models_of_little_are_reported(odd: str) -> None:
         first = aligned.clips[0]
         aligned = replace(aligned, clips=tuple(replace(first, uid=f"walk00{n}") for n in range(3)), keyframes={})
     options = ModelOptions(leave_one_out=False, folds=0, report_samples=0, starts=1)
-    trained, subject = made(aligned, options)
+    trained, subject = trained_on(aligned, options)
     page = is_sound(rendered(trained, subject, draw_model_figures(subject), origin={}))
     assert "not measured" in page.text
     assert ("Nothing: all examples are the same motion" in page.text) is (odd == "copies")
