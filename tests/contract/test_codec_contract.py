@@ -43,7 +43,7 @@ values = st.recursive(
 objects = st.dictionaries(keys, values, max_size=5)
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: object, b: object) -> bool:
     """Equal to the type and to the bit."""
     if isinstance(a, np.ndarray):
         return isinstance(b, np.ndarray) and (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
@@ -65,13 +65,13 @@ class Codec:
     media_type: str
     arrays: ArrayForm = "plain"
 
-    def encode(self, tree: Any) -> bytes:
+    def encode(self, tree: object) -> bytes:
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
     def decode(self, data: bytes, **limits: int) -> Any:
         return decode_tree(data, self.media_type, keep_blocks=False, **limits)
 
-    def refusal(self, tree: Any) -> CodecError:
+    def refusal(self, tree: object) -> CodecError:
         with pytest.raises(CodecError) as caught:
             self.encode(tree)
         return caught.value
@@ -93,12 +93,12 @@ CODECS = [
 class TestEveryCodec:
     @given(tree=objects)
     @settings(max_examples=examples(150))
-    def test_what_is_written_reads_back_equal_to_the_bit(self, codec: Codec, tree: Any) -> None:
+    def test_what_is_written_reads_back_equal_to_the_bit(self, codec: Codec, tree: object) -> None:
         assert same(codec.decode(codec.encode(tree)), tree)
 
     @given(tree=objects)
     @settings(max_examples=examples(30))
-    def test_the_same_tree_always_gives_the_same_bytes(self, codec: Codec, tree: Any) -> None:
+    def test_the_same_tree_always_gives_the_same_bytes(self, codec: Codec, tree: object) -> None:
         assert codec.encode(tree) == codec.encode(tree)
 
     @given(data=st.binary(max_size=200))
@@ -110,7 +110,7 @@ class TestEveryCodec:
     @given(tree=objects, position=st.integers(0), value=st.integers(0, 255))
     @settings(max_examples=examples(300))
     def test_changed_bytes_are_read_or_refused_and_never_crash(
-        self, codec: Codec, tree: Any, position: int, value: int
+        self, codec: Codec, tree: object, position: int, value: int
     ) -> None:
         data = bytearray(codec.encode(tree))
         data[position % len(data)] = value
@@ -119,7 +119,7 @@ class TestEveryCodec:
 
     @given(tree=objects, cut=st.integers(0))
     @settings(max_examples=examples(100))
-    def test_truncated_bytes_are_refused(self, codec: Codec, tree: Any, cut: int) -> None:
+    def test_truncated_bytes_are_refused(self, codec: Codec, tree: object, cut: int) -> None:
         data = codec.encode(tree)
         with pytest.raises(CodecError):
             codec.decode(data[: cut % len(data)])
@@ -171,7 +171,7 @@ class TestEveryCodec:
         assert (error.code, error.pointer) == ("out-of-range", "/n/0")
 
     @pytest.mark.parametrize("key", [1, None, b"a", ("a",)])
-    def test_a_key_that_is_not_a_string_is_refused(self, codec: Codec, key: Any) -> None:
+    def test_a_key_that_is_not_a_string_is_refused(self, codec: Codec, key: object) -> None:
         error = codec.refusal({"in": {key: 1}})
         assert (error.code, error.pointer) == ("bad-key", "/in")
 
@@ -200,7 +200,7 @@ class TestEveryCodec:
         ],
         ids=lambda value: type(value).__name__,
     )
-    def test_a_value_that_some_format_could_not_carry_is_refused(self, codec: Codec, value: Any) -> None:
+    def test_a_value_that_some_format_could_not_carry_is_refused(self, codec: Codec, value: object) -> None:
         error = codec.refusal({"a": [value]})
         assert (error.code, error.pointer) == ("bad-type", "/a/0")
 
@@ -237,7 +237,7 @@ class TestEveryCodec:
 
 @given(tree=objects)
 @settings(max_examples=examples(150))
-def test_all_media_types_decode_to_the_same_tree(tree: Any) -> None:
+def test_all_media_types_decode_to_the_same_tree(tree: object) -> None:
     decoded = [decode_tree(encode_tree(tree, media_type), media_type) for media_type in codecs.MEDIA_TYPES]
     assert same(decoded[0], decoded[1])
     assert same(decoded[1], decoded[2])
@@ -245,12 +245,12 @@ def test_all_media_types_decode_to_the_same_tree(tree: Any) -> None:
 
 @given(tree=values.filter(lambda tree: not isinstance(tree, dict)))
 @settings(max_examples=examples(60))
-def test_lists_and_scalars_are_documents_in_json_and_messagepack(tree: Any) -> None:
+def test_lists_and_scalars_are_documents_in_json_and_messagepack(tree: object) -> None:
     for media_type in (codecs.JSON, codecs.MSGPACK):
         assert same(decode_tree(encode_tree(tree, media_type), media_type), tree)
 
 
 @pytest.mark.parametrize("tree", [[1, 2], "text", 1, None])
-def test_a_bson_document_must_be_an_object(tree: Any) -> None:
+def test_a_bson_document_must_be_an_object(tree: object) -> None:
     with pytest.raises(CodecError, match="must be an object"):
         encode_tree(tree, codecs.BSON)

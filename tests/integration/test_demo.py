@@ -5,14 +5,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.timeout(300)
 
 
-def demo(folder: Any, *arguments: Any) -> Any:
+def demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
     command = [sys.executable, "-m", "marey_client.cli", "demo", "--data", str(folder / "data"), *arguments]
     done = subprocess.run(command, env=surroundings, capture_output=True, text=True, cwd=folder, timeout=240)

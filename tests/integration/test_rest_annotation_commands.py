@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S
+from tests.support.rest_server import PATIENCE_S, Server
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
@@ -129,7 +129,7 @@ def test_more_commands_than_take_some_seconds_are_refused(
     assert segments(owner, annotation) == ["b 0:50"]
 
 
-def test_readers_may_not_command(owner: httpx.Client, annotation: str, server: Any) -> None:
+def test_readers_may_not_command(owner: httpx.Client, annotation: str, server: Server) -> None:
     stranger = server.client(server.make_user("stranger"))
     assert command(stranger, annotation, RELABEL).status_code == 404
 

@@ -60,13 +60,13 @@ def claim(worker: httpx.Client, **fields: Any) -> list[Any]:
     return list(ok(worker.post("/leases", json=wanted))["leases"])
 
 
-def attempt(server: Server, lease: Any) -> httpx.Client:
+def attempt(server: Server, lease: dict[str, Any]) -> httpx.Client:
     client = server.client(lease["attempt_token"])
     client.base_url = httpx.URL(f"{server.api}/jobs/{lease['job']}/attempts/{lease['fence']}/")
     return client
 
 
-def thing(name: str, value: Any = 1) -> dict[str, Any]:
+def thing(name: str, value: object = 1) -> dict[str, Any]:
     parts = {"study": {"schema": "marey/document@1", "value": value}}
     return {"name": name, "kind": "study", "item_name": name, "parts": parts}
 

@@ -46,7 +46,7 @@ def ok(response: httpx.Response, status: int = 200) -> Any:
     return response.json()
 
 
-def submit(owner: httpx.Client, wanted: Any = CHAIN, **headers: str) -> Any:
+def submit(owner: httpx.Client, wanted: object = CHAIN, **headers: str) -> Any:
     return ok(owner.post("/projects/lab/pipelines", json=wanted, headers=headers), 202)["jobs"]
 
 

@@ -25,7 +25,7 @@ AHEAD = {"type": "root_position", "at": "end", "target_m": [0, 1]}
 FEW = TreeOptions(samples=50, features="latent")
 
 
-def send(client: httpx.Client, method: str, url: str, tree: Any, status: int) -> dict[str, Any]:
+def send(client: httpx.Client, method: str, url: str, tree: object, status: int) -> dict[str, Any]:
     headers = {"Content-Type": MSGPACK, "Accept": "application/json", **({"If-Match": "*"} if method == "PUT" else {})}
     answer = client.request(method, url, content=encode_tree(tree, MSGPACK), headers=headers)
     assert answer.status_code == status, answer.text

@@ -113,7 +113,7 @@ class ItemsMachine(RuleBasedStateMachine):
                 self.world.items[item_id] = replace(model, history=(*model.history, text), rev=model.rev + 1)
 
     @rule(item_id=ids, name=NAMES, place=PLACES, tags=TAGS, expected=expectations)
-    def change(self, item_id: Any, name: Any, place: Any, tags: Any, expected: Any) -> None:
+    def change(self, item_id: str, name: Any, place: Any, tags: Any, expected: Any) -> None:
         request = ItemChange(name=name, collection=place, tags=tags)
         change = lambda rev: self.write(items.change_item, item_id, request, expected_rev=rev)  # noqa: E731
         if self.attempt(item_id, expected, change, blocked=self.world.occupied(name, place, item_id)):
@@ -128,7 +128,7 @@ class ItemsMachine(RuleBasedStateMachine):
             self.world.items[item_id] = replace(model, deleted=True, rev=model.rev + 1)
 
     @rule(item_id=ids)
-    def restore(self, item_id: Any) -> None:
+    def restore(self, item_id: str) -> None:
         model = self.world.items[item_id]
         blocked = self.world.occupied(model.name, model.place, item_id)
         try:

@@ -1,7 +1,7 @@
 """Project in memory for tests of the functions of job kinds, and a small evaluation."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,13 +40,13 @@ class ProjectInMemory(Context):
             raise NoSuchThing(f"{item} has no {part}", f"no-{kind}")
         return self.parts[item, revision, part]
 
-    def documents(self, pins: Any, part: str, *, required: bool = True) -> Iterator[tuple[Any, ...]]:
+    def documents(self, pins: Iterable[PinnedInput], part: str, *, required: bool = True) -> Iterator[tuple[Any, ...]]:
         for pin in pins:
             held = self.parts.get((pin.item, pin.revision, part))
             assert held is not None or not required
             yield pin, held
 
-    def documents_of_each(self, pins: Any, *parts: Any) -> Iterator[tuple[Any, ...]]:
+    def documents_of_each(self, pins: Iterable[PinnedInput], *parts: Any) -> Iterator[tuple[Any, ...]]:
         for pin in pins:
             yield pin, tuple(self.parts.get((pin.item, pin.revision, part)) for part in parts)
 

@@ -34,6 +34,7 @@ from marey_server.store.items.publishing import publish
 from marey_server.store.jobs import completion, queue, reading, staging, submission
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import reap_page
+from marey_server.store.transaction import Transaction
 
 
 class Params(Request):
@@ -142,7 +143,7 @@ class Desk:
     def publish(self, *drafts: Draft) -> list[Published]:
         """Publish drafts, as a person would."""
 
-        def act(tx: Any) -> list[Published]:
+        def act(tx: Transaction) -> list[Published]:
             return publish(tx, projects.require(tx, self.project), drafts, author_id=self.user.user_id)
 
         return self.database.write(self.user, act)

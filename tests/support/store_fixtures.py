@@ -1,5 +1,6 @@
 """A project with people in every role, and small documents to put into it."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
     return {"schema": "marey/skeleton@1", "joints": chain}
 
 
-def motion_tree(skeleton: Any, *, frames: int = 5, joints: int = 3, seed: int = 0) -> dict[str, Any]:
+def motion_tree(
+    skeleton: Mapping[str, object] | Item, *, frames: int = 5, joints: int = 3, seed: int = 0
+) -> dict[str, Any]:
     """Return a random motion of the chain; `skeleton` is an item, or a reference."""
     ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
     poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
@@ -46,7 +49,7 @@ READ = RequiredRole(Role.READER, "read")
 WRITE = RequiredRole(Role.CONTRIBUTOR, "write")
 
 
-def requiring(required: RequiredRole, function: Any) -> Any:
+def requiring(required: RequiredRole, function: Callable[..., Any]) -> Any:
     """Run `function` as a request whose operation declares `required`."""
 
     def run(tx: Transaction, *args: Any, **kwargs: Any) -> Any:
@@ -87,7 +90,7 @@ class Lab:
 
     def read(
         self,
-        function: Any,
+        function: Callable[..., Any],
         *args: Any,
         who: Principal | None = None,
         required: RequiredRole = READ,
@@ -98,7 +101,7 @@ class Lab:
 
     def write(
         self,
-        function: Any,
+        function: Callable[..., Any],
         *args: Any,
         who: Principal | None = None,
         required: RequiredRole = WRITE,
@@ -119,7 +122,7 @@ class Lab:
 
     def add_clip(
         self,
-        skeleton: Item,
+        skeleton: Mapping[str, object] | Item,
         name: str = "walk",
         *,
         collection: str = "",

@@ -1,7 +1,7 @@
 """Small suites over databases with known contents, for tests of suggestions."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from tests.support.synthetic_databases import Track, arc_track, mirrored_track, random_tracks, synthetic_database
@@ -55,7 +55,10 @@ def evaluated(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) 
 
 
 def same_to_the_bit(
-    database: MatchingDatabase, records: Any, other: MatchingDatabase, other_records: list[TrialRecord]
+    database: MatchingDatabase,
+    records: Sequence[TrialRecord],
+    other: MatchingDatabase,
+    other_records: Sequence[TrialRecord],
 ) -> bool:
     """Return whether two sets of trials are equal to the bit, with rows named by clip and frame."""
     return all(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -19,7 +20,7 @@ from marey_schemas.jobs import CollectionInput, Job, Progress
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
 
 
-def clip(name: str, *, skeleton: str = "skeleton_1", tags: Any = ()) -> dict[str, Any]:
+def clip(name: str, *, skeleton: str = "skeleton_1", tags: Sequence[str] = ()) -> dict[str, Any]:
     return {
         "id": f"clip_{name}", "kind": "clip", "name": name, "collection": "walks", "tags": list(tags), "revision": 1,
         "summary": {"skeleton": skeleton}, "created_at": NOW, "updated_at": NOW, "rev": 1,

@@ -132,6 +132,6 @@ def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> 
     ("option", "value"),
     [("window", 4), ("window", 63), ("cost", "best"), ("rate_hz", float("nan")), ("rate_hz", 0.0), ("slope_limit", -1)],
 )
-def test_options_out_of_range_are_refused_by_name(option: str, value: Any) -> None:
+def test_options_out_of_range_are_refused_by_name(option: str, value: object) -> None:
     with pytest.raises(ValidationError, match=option):
         AlignOptions(**{option: value})

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from marey_motion import quaternions
-from marey_motion.arrays import Ints
+from marey_motion.arrays import AnyFloats, Ints
 from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
@@ -105,7 +105,7 @@ def test_only_the_frames_shown_are_computed(walk: Clip, monkeypatch: pytest.Monk
 
     original = kinematics.forward_kinematics
 
-    def counted(skeleton: Any, poses: Any, **options: Any) -> Any:
+    def counted(skeleton: Skeleton, poses: AnyFloats, **options: Any) -> Any:
         computed.append(len(poses))
         return original(skeleton, poses, **options)
 

@@ -16,6 +16,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import FormatError, FormatLimit
 from marey_motion.formats import read_motion, write_motion, write_predecessor_skeleton
 from marey_motion.formats.predecessor import encoding as predecessor_encoding
+from marey_motion.formats.predecessor.skeleton import SkeletonForm
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton, same_hierarchy
 
@@ -98,7 +99,7 @@ def test_sign_flips_and_lengths_are_mended_with_a_warning() -> None:
 @pytest.mark.parametrize("form", ["poses", "frames"])
 @pytest.mark.parametrize("skeleton_form", ["database", "file"])
 def test_clips_survive_every_form_and_encoding(
-    body: Skeleton, tumbling: Callable[..., Clip], skeleton_form: Any, form: str, encoding: str
+    body: Skeleton, tumbling: Callable[..., Clip], skeleton_form: SkeletonForm, form: str, encoding: str
 ) -> None:
     turned = np.asarray(quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4))), np.float64)
     skeleton = Skeleton(body.joint_names, body.parents, body.offsets, turned, body.end_sites)
@@ -112,7 +113,7 @@ def test_clips_survive_every_form_and_encoding(
 
 
 @pytest.mark.parametrize("form", ["database", "file"])
-def test_skeletons_survive_both_forms(body: Skeleton, form: Any) -> None:
+def test_skeletons_survive_both_forms(body: Skeleton, form: SkeletonForm) -> None:
     imported = read_motion(write_predecessor_skeleton(body, form=form), "body.json")
     assert imported.clip is None
     assert same_hierarchy(imported.skeleton, body, tolerance_m=1e-9)
@@ -129,7 +130,7 @@ def described(document: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("form", ["database", "file"])
-def test_rest_rotations_survive_both_forms(body: Skeleton, form: Any) -> None:
+def test_rest_rotations_survive_both_forms(body: Skeleton, form: SkeletonForm) -> None:
     turned = np.asarray(quaternions.normalise(np.random.default_rng(8).normal(size=(body.joint_count, 4))), np.float64)
     skeleton = Skeleton(body.joint_names, body.parents, body.offsets, turned, body.end_sites)
     written = write_predecessor_skeleton(skeleton, form=form)

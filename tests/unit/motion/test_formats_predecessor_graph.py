@@ -74,7 +74,7 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing() -> No
         (["start_node"], ["idle", "99"], "there is no node"),
     ],
 )
-def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: Any, told: str) -> None:
+def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: object, told: str) -> None:
     document = copy.deepcopy(DOCUMENT)
     *above, last = path
     place: Any = document

@@ -211,7 +211,7 @@ def test_a_long_time_function_is_taken_over_without_a_coefficient_for_each_frame
     np.testing.assert_allclose(times, np.arange(6000), atol=1e-6)
 
 
-def changed(path: list[str], value: Any) -> dict[str, Any]:
+def changed(path: list[str], value: object) -> dict[str, Any]:
     document = copy.deepcopy(models.layout_3())
     *above, last = path
     place = document

@@ -69,7 +69,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
         (["root", "children", 0, "children", 0], 3, r"root\.0\.0: a node has a list"),
     ],
 )
-def test_damaged_trees_are_refused_by_the_node(path: list[Any], value: Any, told: str) -> None:
+def test_damaged_trees_are_refused_by_the_node(path: list[Any], value: object, told: str) -> None:
     document = copy.deepcopy(models.tree())
     *above, last = path
     place = document

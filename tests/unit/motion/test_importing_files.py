@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ def count(monkeypatch: pytest.MonkeyPatch) -> Count:
     """Counts the calls of functions of modules, by name."""
     calls: Counter[str] = Counter()
 
-    def watch(module: Any, name: str) -> Counter[str]:
+    def watch(module: ModuleType, name: str) -> Counter[str]:
         real = getattr(module, name)
 
         def counting(*args: Any, **kwargs: Any) -> Any:

@@ -31,7 +31,7 @@ def true_costs(rows: Floats, query: Floats, weights: Floats | None = None) -> Fl
 
 
 def true_nearest(
-    rows: Floats, selectable: Flags, query: Floats, weights: Floats | None = None, skip: Any = (0, 0)
+    rows: Floats, selectable: Flags, query: Floats, weights: Floats | None = None, skip: tuple[int, int] = (0, 0)
 ) -> tuple[int, float]:
     costs = true_costs(rows, query, weights)
     allowed = selectable.copy()

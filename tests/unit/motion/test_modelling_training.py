@@ -337,6 +337,6 @@ def test_examples_that_make_no_model_are_refused_by_name() -> None:
         ("temporal_weight", np.inf),
     ],
 )
-def test_options_out_of_range_are_refused_by_name(name: str, value: Any) -> None:
+def test_options_out_of_range_are_refused_by_name(name: str, value: object) -> None:
     with pytest.raises(ValidationError, match=name):
         ModelOptions(**{name: value})

@@ -44,7 +44,7 @@ class Actor:
         return self.skeleton.index_of(self.mapping.joints[standard])
 
 
-def plan_between(source: Any, target: Any, **options: Any) -> RetargetPlan:
+def plan_between(source: Actor | SimpleNamespace, target: Actor | SimpleNamespace, **options: Any) -> RetargetPlan:
     return plan_retarget(
         source.skeleton, source.mapping, source.axes, target.skeleton, target.mapping, target.axes, **options
     )
@@ -376,7 +376,7 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio: Actor,
     assert moved_bones(studio.clip, plan).warning is None
 
 
-def bones_followed_by_numpy(clip: Any, joints: Any) -> Any:
+def bones_followed_by_numpy(clip: Clip, joints: dict[str, int]) -> tuple[AnyFloats, dict[str, float]]:
     """Rotations (F, 4·J) and largest turns in degrees, by the formula in numpy, bone by bone."""
     still = replace(clip, translations=None, translated_joints=())
     rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))

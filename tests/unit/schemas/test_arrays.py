@@ -22,7 +22,7 @@ POSES = np.arange(21, dtype=np.float32).reshape(3, 7)
 LABELS = np.zeros(2, np.int32)
 
 
-def leaf(data: Any, dtype: str = "<f4", shape: list[int] | None = None, **more: Any) -> dict[str, Any]:
+def leaf(data: object, dtype: str = "<f4", shape: list[int] | None = None, **more: Any) -> dict[str, Any]:
     return {"dtype": dtype, "shape": [3] if shape is None else shape, "data": data, **more}
 
 
@@ -62,7 +62,7 @@ def test_a_model_dumped_to_python_keeps_its_arrays() -> None:
         (EncodedArray("<f4", (3, 7), b"rubbish"), "not a block-encoded array"),
     ],
 )
-def test_a_model_refuses_another_array_and_says_why(value: Any, words: str) -> None:
+def test_a_model_refuses_another_array_and_says_why(value: object, words: str) -> None:
     with pytest.raises(ValidationError, match=words) as caught:
         Take(poses=value, labels=LABELS)
     assert caught.value.errors()[0]["loc"] == ("poses",)
@@ -109,7 +109,7 @@ def test_a_leaf_whose_data_does_not_match_its_claim_is_refused(value: dict[str, 
 
 
 @pytest.mark.parametrize("data", [[], b"", blocks.encode(np.zeros((100_000, 30), np.float32))])
-def test_a_claim_beyond_the_limit_is_refused_before_the_data_is_looked_at(data: Any) -> None:
+def test_a_claim_beyond_the_limit_is_refused_before_the_data_is_looked_at(data: object) -> None:
     value = leaf(data, shape=[100_000, 30], **({"encoding": "blocks"} if data else {}))
     assert refusal(value, max_bytes=1_000_000).code == "too-large"
 
@@ -118,7 +118,7 @@ def test_a_claim_beyond_the_limit_is_refused_before_the_data_is_looked_at(data: 
     ("data", "dtype", "shape"),
     [(2.5, "<f4", []), ([], "<i2", [0]), ([[], []], "|b1", [2, 0]), ([2**64 - 1], "<u8", [1]), ([True], "|b1", [1])],
 )
-def test_scalars_empty_arrays_and_extremes_are_arrays(data: Any, dtype: str, shape: list[int]) -> None:
+def test_scalars_empty_arrays_and_extremes_are_arrays(data: object, dtype: str, shape: list[int]) -> None:
     array = array_from_leaf(leaf(data, dtype, shape))
     assert array.dtype.str == dtype
     assert array.tolist() == data

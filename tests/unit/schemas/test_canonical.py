@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import (
@@ -25,14 +26,14 @@ def test_an_array_is_named_by_its_dtype_shape_and_bytes() -> None:
 
 
 @pytest.mark.parametrize("same", [POSES.astype(">f4"), np.asfortranarray(POSES), EncodedArray.of(POSES)])
-def test_the_name_of_an_array_does_not_depend_on_how_it_is_stored(same: Any) -> None:
+def test_the_name_of_an_array_does_not_depend_on_how_it_is_stored(same: NDArray[Any] | EncodedArray) -> None:
     assert array_digest(same) == array_digest(POSES)
 
 
 @pytest.mark.parametrize(
     "other", [POSES.reshape(3, 2), POSES.view(np.int32), POSES + 1, -POSES, POSES.reshape(1, 2, 3)]
 )
-def test_other_arrays_have_other_names(other: Any) -> None:
+def test_other_arrays_have_other_names(other: NDArray[Any] | EncodedArray) -> None:
     assert array_digest(other) != array_digest(POSES)
 
 
@@ -50,12 +51,12 @@ def test_canonical_json_has_sorted_keys_no_spaces_and_utf_8() -> None:
 @pytest.mark.parametrize(
     ("a", "b"), [(1, 1.0), (0, -0.0), (10**17, 1e17), (10**22, 1e22), (-(2**63), -(2.0**63)), (100, 1e2)]
 )
-def test_equal_numbers_are_written_alike(a: Any, b: Any) -> None:
+def test_equal_numbers_are_written_alike(a: object, b: object) -> None:
     assert canonical_json(a) == canonical_json(b)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1, True), (0, False), (0, None), ("1", 1), (0.1, 0.1000001), (2**53, 2**53 + 1)])
-def test_other_values_are_written_differently(a: Any, b: Any) -> None:
+def test_other_values_are_written_differently(a: object, b: object) -> None:
     assert canonical_json(a) != canonical_json(b)
 
 

@@ -1,7 +1,5 @@
 """Scopes, roles, passwords and tokens, without a database."""
 
-from typing import Any
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,7 +39,7 @@ def test_what_does_not_exceed_allows_nothing_more(wanted: list[str], held: list[
                 assert scopes.allows(held, need, project) or not scopes.allows(wanted, need, project)
 
 
-def test_a_password_matches_its_own_hash_only(cheap_hashes: Any) -> None:
+def test_a_password_matches_its_own_hash_only(cheap_hashes: None) -> None:
     stored = passwords.hash_password("pässwörd 1\ud800")
     assert passwords.password_matches("pässwörd 1\ud800", stored)
     assert not passwords.password_matches("pässwörd 2", stored)
@@ -49,7 +47,7 @@ def test_a_password_matches_its_own_hash_only(cheap_hashes: Any) -> None:
     assert passwords.hash_password("same") != passwords.hash_password("same")
 
 
-def test_a_hash_keeps_working_when_new_ones_cost_more(cheap_hashes: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hash_keeps_working_when_new_ones_cost_more(cheap_hashes: None, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = passwords.hash_password("correct horse")
     monkeypatch.setattr(passwords, "LOG2_N", 5)
     assert passwords.password_matches("correct horse", stored)

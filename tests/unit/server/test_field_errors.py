@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from marey_schemas.editing.commands import Trim
 from marey_schemas.editing.edits import EditDocument
@@ -15,7 +15,7 @@ from marey_server.store import documents
 BACKWARDS = {"command": "trim", "start": 5, "stop": 2}
 
 
-def told(model: Any, tree: dict[str, Any]) -> list[FieldError]:
+def told(model: type[BaseModel], tree: dict[str, Any]) -> list[FieldError]:
     with pytest.raises(ValidationError) as refused:
         model.model_validate(tree)
     return field_errors(refused.value, tree)

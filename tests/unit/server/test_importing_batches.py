@@ -14,7 +14,7 @@ from marey_server.store import blobs, items
 from marey_server.store.items import Draft
 
 
-def read_file(name: Any, *, joints: Any = 3, seed: Any = 0) -> Any:
+def read_file(name: str, *, joints: int = 3, seed: int = 0) -> Any:
     """A file that was read: a skeleton and a clip on it; the clip has `joints` of the skeleton's three."""
     rig = f"{name}#skeleton"
     motion = motion_tree({"output": rig}, joints=joints, seed=seed)
@@ -25,7 +25,7 @@ def read_file(name: Any, *, joints: Any = 3, seed: Any = 0) -> Any:
     return PreparedImport(name, drafts=drafts, frames=5)
 
 
-def store(lab: Any, *files: Any) -> Any:
+def store(lab: Lab, *files: Any) -> Any:
     return lab.write(importing.publish, "lab", files)
 
 

@@ -1,6 +1,7 @@
 """Multipart bodies, cut as they stream."""
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ def head(field: str, file_name: str | None = None) -> bytes:
     return (text + (f'; filename="{file_name}"' if file_name is not None else "")).encode()
 
 
-def read(body: bytes, cuts: Any = (), max_parts: int = 100) -> list[tuple[PartHead, bytes]]:
+def read(body: bytes, cuts: Sequence[int] = (), max_parts: int = 100) -> list[tuple[PartHead, bytes]]:
     """(head, bytes) of every part, fed in pieces."""
     reader = MultipartReader(BOUNDARY, max_parts=max_parts)
     places = [0, *sorted(cuts), len(body)]

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sqlalchemy import event
+from sqlalchemy import Connection, event
 from tests.support.predecessor_models import imported
 from tests.support.store_fixtures import Lab, motion_tree, skeleton_tree
 from tests.support.tiers import examples
@@ -142,7 +142,7 @@ def statements(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Any:
     event.listen(lab.database.engine, "before_cursor_execute", lambda *given: run.append(given[2]))
     straight = prepared._run
 
-    def recorded(connection: Any, text: Any, *args: Any, **kwargs: Any) -> Any:
+    def recorded(connection: Connection, text: str, *args: Any, **kwargs: Any) -> Any:
         run.append(text)
         return straight(connection, text, *args, **kwargs)
 
@@ -150,7 +150,7 @@ def statements(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Any:
     return run
 
 
-def batch_of(count: Any, *, start: Any = 0, name: Any = "walk") -> Any:
+def batch_of(count: int, *, start: int = 0, name: str = "walk") -> list[Draft]:
     """Drafts of a skeleton, and of clips with a source each."""
     drafts = [replace(rig_draft(), item_name=f"rig of {name}")]
     for number in range(start, start + count):
@@ -158,13 +158,13 @@ def batch_of(count: Any, *, start: Any = 0, name: Any = "walk") -> Any:
     return drafts
 
 
-def count_statements(lab: Any, statements: Any, *drafts: Any, **kwargs: Any) -> Any:
+def count_statements(lab: Lab, statements: list[str], *drafts: Any, **kwargs: Any) -> Any:
     statements.clear()
     publish(lab, *drafts, **kwargs)
     return len([text for text in statements if "server_state" not in text])  # the clock is saved once a second
 
 
-def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab: Lab, statements: Any) -> None:
+def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab: Lab, statements: list[str]) -> None:
     publish(lab, *batch_of(1))
     few = count_statements(lab, statements, *batch_of(2, start=10))
     many = count_statements(lab, statements, *batch_of(60, start=20))
@@ -173,12 +173,12 @@ def test_a_large_batch_is_published_with_the_statements_of_a_small_one(lab: Lab,
 
 
 def test_staged_documents_of_a_large_batch_are_published_with_the_statements_of_a_small_one(
-    lab: Lab, statements: Any
+    lab: Lab, statements: list[str]
 ) -> None:
     rig, *_ = publish(lab, rig_draft())
 
-    def staged(start: Any, count: Any) -> Any:
-        def store(tx: Any) -> Any:
+    def staged(start: int, count: int) -> Any:
+        def store(tx: Transaction) -> Any:
             trees = [motion_tree({"output": "rig"}, seed=number) for number in range(start, start + count)]
             return [documents.store_document(tx, tree) for tree in trees]
 

@@ -1,7 +1,6 @@
 """The tables in the code and the tables that migrations make are the same, on both databases."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy
@@ -23,7 +22,7 @@ def test_migrations_make_exactly_the_tables_of_the_code(database: Database) -> N
         if len(index.columns) < len(index.expressions)
     }  # Alembic cannot compare these; the next test does
 
-    def comparable(_thing: Any, name: quoted_name, kind: str, _reflected: bool, _other: Any) -> bool:
+    def comparable(_thing: object, name: quoted_name, kind: str, _reflected: bool, _other: object) -> bool:
         return kind != "index" or name not in over_expressions
 
     with database.engine.connect() as connection:

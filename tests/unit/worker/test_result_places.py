@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel
 from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
@@ -129,7 +130,7 @@ def test_pieces_are_named_after_the_clips_that_are_given_at_any_revision(project
     ("run", "params"), [(annotate.run, STEPS), (align.run, AlignParams(suffix=" aligned"))], ids=["annotate", "align"]
 )
 def test_results_that_would_get_one_name_are_refused_before_any_is_computed(
-    project: ProjectInMemory, run: Callable[..., Any], params: Any
+    project: ProjectInMemory, run: Callable[..., Any], params: BaseModel
 ) -> None:
     again(project, 0, revision=2)
     with pytest.raises(JobRefused, match="2 results would have the path walks/left") as refused:
@@ -212,6 +213,6 @@ def test_an_archive_leaves_out_the_clip_whose_skeleton_was_deleted(project: Proj
 
 @pytest.mark.parametrize("params", [AlignParams, EditParams, RetargetParams])
 @pytest.mark.parametrize("suffix", ["/a", "\n", "x" * 65])
-def test_a_suffix_that_no_name_may_have_is_refused_before_the_job(params: Any, suffix: str) -> None:
+def test_a_suffix_that_no_name_may_have_is_refused_before_the_job(params: BaseModel, suffix: str) -> None:
     with pytest.raises(ValueError, match="suffix"):
         params.model_validate({"suffix": suffix})

@@ -12,6 +12,7 @@ from tests.support.command_line import CommandLine
 
 from marey_client.errors import Invalid, RequestFailed
 from marey_client.handles.models import ModelHandle
+from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document
 from marey_motion.formats import read_motion
@@ -186,11 +187,11 @@ def test_from_the_command_line(run: CommandLine, walk: ModelHandle, bare: ModelH
     assert "no keyframe 'never'" in run("search", "lab/models/walk", "--stand", "never=0,0", status=1).stderr
 
 
-def _skeleton_of(handle: Any) -> Any:
+def _skeleton_of(handle: SkeletonHandle) -> Any:
     from marey_motion.documents import skeleton_from_document
 
     return skeleton_from_document(handle.hierarchy())
 
 
-def _standard_joint(handle: Any, name: str) -> str:
+def _standard_joint(handle: SkeletonHandle, name: str) -> str:
     return str(handle.mapping().joints[name])
