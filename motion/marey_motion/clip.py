@@ -25,8 +25,8 @@ class Clip:
     poses : (F, 3 + 4·J) float32    absolute root translation in metres, which replaces the root's offset, then one
         unit local rotation (w, x, y, z) per joint in the skeleton's order
     translations : (F, k, 3) float32, optional    metres in the parent's frame; replace the offsets of
-        `translated_joints`. None where only the root moves.
-    translated_joints : tuple of int    increasing indices of those k joints, never the root
+        `translated_joints`. None if only the root is translated.
+    translated_joints : tuple of int    increasing indices of the k joints with translations, never the root
 
     Raises
     ------
@@ -57,14 +57,15 @@ class Clip:
         set_field = object.__setattr__
         if not (np.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):
             raise ClipError(
-                f"the frame rate is {self.frame_rate_hz}, a positive number is needed", where="frame_rate_hz"
+                f"the frame rate must be a positive number, not {self.frame_rate_hz}", where="frame_rate_hz"
             )
         set_field(self, "frame_rate_hz", float(self.frame_rate_hz))
         set_field(self, "poses", _frozen(self.poses, "poses", 2))
         width = 3 + 4 * self.skeleton.joint_count
         if self.poses.shape[1] != width:
             raise ClipError(
-                f"{self.poses.shape[1]} columns where 3 + 4 × {self.skeleton.joint_count} joints = {width} are needed",
+                f"the array has {self.poses.shape[1]} columns, but 3 + 4 × {self.skeleton.joint_count} joints = "
+                f"{width} are needed",
                 where="poses",
             )
         self._check_rotations()
@@ -79,8 +80,8 @@ class Clip:
         if wrong.any():
             frame, joint = (int(index) for index in np.argwhere(wrong)[0])
             raise ClipError(
-                f"frame {frame} has a rotation of length {np.sqrt(squares[frame, joint]):.6g}, "
-                "a unit quaternion (w, x, y, z) is needed",
+                f"the rotation in frame {frame} must be a unit quaternion (w, x, y, z), but has length "
+                f"{np.sqrt(squares[frame, joint]):.6g}",
                 where=f"poses, joint {self.skeleton.joint_names[joint]}",
             )
 
@@ -88,16 +89,19 @@ class Clip:
         joints, where = self.translated_joints, "translated_joints"
         if self.translations is None:
             if joints:
-                raise ClipError("joints are named but there are no translations for them", where=where)
+                raise ClipError("these joints need translations, but translations is None", where=where)
             return
         if self.translations.shape != (self.frame_count, len(joints), 3):
             needed = (self.frame_count, len(joints), 3)
-            raise ClipError(f"shape {self.translations.shape}; {needed} is needed", where="translations")
+            raise ClipError(f"the shape must be {needed}, not {self.translations.shape}", where="translations")
         if not joints:
-            raise ClipError("translations without joints; leave both out", where=where)
+            raise ClipError("translations are given, but no translated joints; give both or neither", where=where)
         in_order = all(a < b for a, b in pairwise(joints))
         if not in_order or joints[0] < 1 or joints[-1] >= self.skeleton.joint_count:
-            raise ClipError(f"indices must increase within 1 to {self.skeleton.joint_count - 1}", where=where)
+            raise ClipError(
+                f"joint indices must be increasing and from 1 to {self.skeleton.joint_count - 1}, not {joints}",
+                where=where,
+            )
 
     @property
     def frame_count(self) -> int:
@@ -106,7 +110,7 @@ class Clip:
 
     @property
     def duration_s(self) -> float:
-        """Duration in seconds when each frame lasts one period, so that consecutive slices add up."""
+        """Duration in seconds: the number of frames divided by the frame rate."""
         return self.frame_count / self.frame_rate_hz
 
     @property
@@ -144,15 +148,15 @@ class Clip:
 
 
 def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.float32]:
-    """Make a read-only float32 view of `values`; the caller's own array keeps its flags."""
+    """Make a read-only float32 view of `values`; the caller's array stays writable."""
     array = np.asarray(values)
     if array.ndim != ndim or array.shape[0] == 0:
-        raise ClipError(f"shape {array.shape}; {ndim} axes and at least one frame are needed", where=field)
+        raise ClipError(f"the array must have {ndim} axes and at least one frame, not shape {array.shape}", where=field)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise ClipError(f"numbers are needed, not {array.dtype}", where=field)
+        raise ClipError(f"the array must contain real numbers, not {array.dtype}", where=field)
     view = np.asarray(array, dtype=np.float32).view()
     finite = np.isfinite(view).reshape(len(view), -1).all(axis=1)
     if not finite.all():
-        raise ClipError(f"frame {int(np.argmin(finite))} has a number that is not finite", where=field)
+        raise ClipError(f"frame {int(np.argmin(finite))} contains a number that is not finite", where=field)
     view.setflags(write=False)
     return view

@@ -65,7 +65,7 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
 
     Raises
     ------
-    SkeletonError    if its numbers describe none
+    SkeletonError    if the document is not a valid skeleton
     """
     return Skeleton(
         joint_names=tuple(joint.name for joint in document.joints),
@@ -101,7 +101,7 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
 
 
 def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a clip to part `motion` as plain values and arrays; the store checks it against its schema.
+    """Convert a clip to its part `motion` as plain values and arrays, without validation.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
 
     Returns
     -------
-    dict    the same as `clip_to_document` gives, dumped
+    dict    the same content as the document of `clip_to_document`
     """
     names = clip.skeleton.joint_names
     tree = {
@@ -140,11 +140,11 @@ def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Cl
 
     Raises
     ------
-    ClipError    if the document belongs to another skeleton or its numbers are no motion
+    ClipError    if the document belongs to another skeleton or its numbers are not a valid motion
     """
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
-        raise ClipError(f"the motion's joints are not the skeleton's: {', '.join(odd[:5])}", where="joints")
+        raise ClipError(f"the joints of the motion and of the skeleton differ in: {', '.join(odd[:5])}", where="joints")
     if document.joints[0] != skeleton.joint_names[0]:
         raise ClipError(f"the first joint must be the root, {skeleton.joint_names[0]}", where="joints")
     poses, translations = document.poses, document.translations
@@ -203,7 +203,7 @@ def layer_from_document(document: annotation_documents.Annotation, frame_count: 
 
     Raises
     ------
-    AnnotationError    if it exceeds the clip
+    AnnotationError    if a segment or keyframe is outside the clip
     """
     return Layer(
         frame_count,
@@ -239,7 +239,7 @@ def mapping_from_document(
 ) -> tuple[JointMapping, dict[str, JointAxes]]:
     """Convert a `mapping` part, which people may have edited, to a mapping and its axes.
 
-    Axes are brought to unit length and the swing made perpendicular to the twist.
+    Axes are normalised, and the swing axis is made perpendicular to the twist axis.
 
     Parameters
     ----------
@@ -274,12 +274,12 @@ def _orthonormal(joint: str, axes: skeletons.JointAxesDocument) -> JointAxes:
     twist, swing = np.array(axes.twist), np.array(axes.swing)
     length = float(np.linalg.norm(twist))
     if not 0.0 < length < np.inf:
-        raise MappingError("the twist axis has no direction", where=f"axes.{joint}")
+        raise MappingError("the twist axis must be finite and not zero", where=f"axes.{joint}")
     twist = twist / length
     across = swing - (swing @ twist) * twist
     reach = float(np.linalg.norm(across))
     if not 1e-6 * float(np.linalg.norm(swing)) < reach < np.inf:
-        raise MappingError("the swing axis must point across the twist axis", where=f"axes.{joint}")
+        raise MappingError("the swing axis must not be parallel to the twist axis", where=f"axes.{joint}")
     across /= reach
     return JointAxes(_triple(twist), _triple(across))
 

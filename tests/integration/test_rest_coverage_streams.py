@@ -251,7 +251,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(
     far = np.zeros((2, 3))
     far[1, 0] = 1e9
     wrong: list[tuple[dict[str, Any], dict[str, Any], str]] = [
-        (stream, {"poses": long}, "frame 3 has a rotation of length 2"),
+        (stream, {"poses": long}, "the rotation in frame 3 must be a unit quaternion"),
         (stream, {"poses": poses[:, :-4]}, "columns"),
         (stream, {"poses": poses.astype(np.float64) * 1e300}, "only finite numbers"),
         (stream, {"poses": poses.astype(np.int32)}, "<f4 or <f8"),

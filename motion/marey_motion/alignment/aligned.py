@@ -16,13 +16,13 @@ from marey_motion.skeleton import Skeleton
 class Placement:
     """Position and heading at the start of a clip, which the move to the canonical frame removed.
 
-    A point p of the canonical frame was at R(heading) p + (x, y, z), R rotating about the vertical.
+    A point p of the canonical frame was at R(heading) p + (x, y, z) in the source; R rotates about the vertical axis.
 
     Parameters
     ----------
     heading_rad : float    heading in the first frame, 0 along +z, positive to the left
     x, z : float    position of `joint` in the first frame, metres
-    y : float    metres removed from all heights; 0 where heights are kept, as by default
+    y : float    metres subtracted from all heights; 0 if heights are kept, which is the default
     joint : int    the joint that carries the body (`MatchingBody.carrier`): the root, or, below a root that is a
         static reference on the floor, mostly the hips
     """
@@ -41,13 +41,13 @@ class AlignedClip:
     Parameters
     ----------
     uid : str    unique among the clips
-    name : str    for people; orders the clips, before the uid
-    motion : Motion    N frames in the canonical frame: the body begins at x = z = 0 and faces +z. Joints between a
-        static root and the one that carries the body are not translated.
+    name : str    name shown to people; clips are ordered by name, then uid
+    motion : Motion    N frames in the canonical frame: the body begins at x = z = 0 and faces +z. If the root is
+        static, joints between the root and the joint that carries the body are not translated.
     time_function : (N,) float64    fractional frame of the source (at the set's rate) at each canonical frame;
         strictly increasing from 0 to the last frame of the source
     placement : Placement    start of the source on the ground
-    cost : float    mean cost per frame of the path behind the time function, square metres
+    cost : float    mean cost per cell of the alignment path from which the time function was made, square metres
     source_frames : int    frames of the source at the set's rate
     """
 
@@ -66,8 +66,8 @@ class AlignedSet:
 
     Parameters
     ----------
-    skeleton : Skeleton    of all of them
-    frame_rate_hz : float    canonical frames per second, those of the reference
+    skeleton : Skeleton    skeleton of all clips
+    frame_rate_hz : float    canonical frames per second
     clips : tuple of AlignedClip    ordered by name, then uid
     reference : str    uid of the clip whose time is the canonical time
     keyframes : mapping of str to int    canonical frame by label

@@ -27,7 +27,7 @@ class StoredExample(NamedTuple):
 
     Parameters
     ----------
-    uid : str    names the example where its tree does not
+    uid : str    uid of the example if its tree contains none
     clip : Clip    its canonical frames
     info : mapping    the tree made by `example_to_tree`
     """
@@ -105,8 +105,8 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
     Raises
     ------
-    MotionError    if there are no examples; otherwise names the first one that belongs to another set, has another
-        skeleton, or is repeated
+    MotionError    if there are no examples, or if an example belongs to another set, has another skeleton or is
+        repeated; the error names the example
     """
     if not examples:
         raise MotionError("there are no aligned clips", code="too-few-clips")
@@ -116,7 +116,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
         _require_same_set(first, one)
     for before, after in pairwise(clips):
         if before.uid == after.uid:
-            raise MotionError("it is among the aligned clips twice", code="sets-differ", where=after.name)
+            raise MotionError("the set contains this clip twice; remove one", code="sets-differ", where=after.name)
     reference = first.info.get("reference")
     return AlignedSet(
         skeleton=first.clip.skeleton,
@@ -141,7 +141,7 @@ def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
 
     Raises
     ------
-    MotionError    if the two do not belong together
+    MotionError    if frame count or frame rate of the clip differ from those in `info`
     """
     example = _example(StoredExample("", clip, info))
     return restore(example, clip.skeleton).as_clip(clip.skeleton, clip.frame_rate_hz)
@@ -153,8 +153,8 @@ def _example(stored: StoredExample) -> AlignedClip:
     times = np.asarray(info["time_function"], dtype=np.float64)
     if len(times) != clip.frame_count or info["frame_rate_hz"] != clip.frame_rate_hz:
         raise MotionError(
-            f"{clip.frame_count} frames at {clip.frame_rate_hz:g} Hz, but a time function of {len(times)} at "
-            f"{info['frame_rate_hz']:g} Hz",
+            f"the clip has {clip.frame_count} frames at {clip.frame_rate_hz:g} Hz, but its time function has "
+            f"{len(times)} at {info['frame_rate_hz']:g} Hz; align the clips again",
             code="alignment-invalid",
             where=name,
         )
@@ -180,11 +180,15 @@ def _example(stored: StoredExample) -> AlignedClip:
 def _require_same_set(first: StoredExample, one: StoredExample) -> None:
     name = str(one.info.get("name") or one.uid)
     if one.clip.skeleton.joint_names != first.clip.skeleton.joint_names:
-        raise MotionError("its skeleton is not that of the other clips", code="skeleton-mismatch", where=name)
+        raise MotionError(
+            "the clip has another skeleton than the other clips; retarget it first",
+            code="skeleton-mismatch",
+            where=name,
+        )
     same_frames = (one.clip.frame_count, one.clip.frame_rate_hz) == (first.clip.frame_count, first.clip.frame_rate_hz)
     if not same_frames or any(one.info.get(key) != first.info.get(key) for key in SHARED):
         raise MotionError(
-            "it was not aligned together with the other clips; align all of them in one go",
+            "the clip was not aligned together with the other clips; align all of them in one job",
             code="sets-differ",
             where=name,
         )

@@ -55,7 +55,7 @@ class SourceExample:
     Parameters
     ----------
     uid : str    stable name of the example
-    name : str    for people; ties go to the lower one, then to the lower uid
+    name : str    name shown to people; of equally good references, the first by name, then uid, is chosen
     clip : Clip    the motion
     cuts : tuple of Cut    frames of the clip that all examples have under the same labels, in the order of time
         (`segments.cuts_of`)
@@ -124,8 +124,8 @@ def align_clips(
     options : AlignOptions, optional    options; their reference may be the uid of an example
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
-    on_refusal : callable, optional    called with each example that does not fit and its error, and the example is
-        left out; without it the first one raises
+    on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned;
+        the example is left out. If None, the first such error is raised.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def align_clips(
 
     Raises
     ------
-    MotionError    for options that do not fit the clips, or if fewer than two examples are left
+    MotionError    if the options do not fit the clips, or if fewer than two examples can be aligned
     """
     run = _Aligning(body, options or AlignOptions(), threads, progress or (lambda _done, _total, _note: None))
     run.on_refusal = on_refusal
@@ -180,10 +180,10 @@ class _Aligning:
     def _require_options(self, clips: Sequence[SourceExample]) -> None:
         repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]
         if repeated:
-            raise MotionError("two examples have this uid", where=repeated[0])
+            raise MotionError("two examples have this uid; uids must be unique", where=repeated[0])
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
-            raise MotionError("the reference is not one of the clips", code="unknown-reference", where=wanted)
+            raise MotionError("the reference is not one of the clips to align", code="unknown-reference", where=wanted)
 
     def _require_size(self, clips: Sequence[SourceExample], rate_hz: float) -> None:
         frames = sum(one.clip.frame_count / one.clip.frame_rate_hz * rate_hz for one in clips)
@@ -191,8 +191,8 @@ class _Aligning:
         if size > MOST_JOINT_FRAMES:
             raise MotionError(
                 f"{len(clips)} clips with {frames:,.0f} frames of {self._body.skeleton.joint_count} joints at "
-                f"{rate_hz:g} Hz are too much to align at once, {size / MOST_JOINT_FRAMES:.1f} times what is possible; "
-                "take fewer clips or a lower rate",
+                f"{rate_hz:g} Hz are too much to align at once: {size / MOST_JOINT_FRAMES:.1f} times the limit; "
+                "use fewer clips or a lower rate",
                 code="too-much",
             )
 
@@ -213,7 +213,7 @@ class _Aligning:
         kept = [made for made in tries if not isinstance(made, MotionError)]
         if len(kept) < LEAST_CLIPS:
             raise MotionError(
-                f"{len(kept)} of {len(examples)} clips are left, but {LEAST_CLIPS} are needed to align any",
+                f"only {len(kept)} of {len(examples)} clips can be aligned; at least {LEAST_CLIPS} are needed",
                 code="too-few-clips",
             )
         return kept
@@ -232,18 +232,22 @@ class _Aligning:
     def _prepare(self, example: SourceExample, rate_hz: float) -> _Prepared:
         clip, skeleton = example.clip, self._body.skeleton
         if not same_hierarchy(clip.skeleton, skeleton, tolerance_m=SAME_OFFSET_M):
-            raise MotionError("it moves another skeleton than the others; retarget it first", code="skeleton-mismatch")
+            raise MotionError(
+                "the clip has another skeleton than the other clips; retarget it first", code="skeleton-mismatch"
+            )
         for cut in example.cuts:
             if not 0 <= cut.frame < clip.frame_count:
                 shown = ", ".join(cut.labels)
                 raise MotionError(
-                    f"it has the frames 0:{clip.frame_count}", code="outside-clip", where=f"{shown}, frame {cut.frame}"
+                    f"the frame is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
+                    code="outside-clip",
+                    where=f"{shown}, frame {cut.frame}",
                 )
         motion = resample_motion(Motion.of(clip), clip.frame_rate_hz, rate_hz)
         frames = motion.frame_count
         if not LEAST_FRAMES <= frames <= MOST_FRAMES:
             raise MotionError(
-                f"it has {frames} frames at {rate_hz:g} Hz; {LEAST_FRAMES} to {MOST_FRAMES} can be aligned",
+                f"the clip has {frames} frames at {rate_hz:g} Hz; {LEAST_FRAMES} to {MOST_FRAMES} can be aligned",
                 code="too-short" if frames < LEAST_FRAMES else "too-long",
             )
         sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)
@@ -311,11 +315,12 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
     Returns
     -------
-    (J,) float64    the given weights; of other joints 1 for the carrier and the joints below it, else 0
+    (J,) float64    the given weight of each joint; without one, 1 for the joint that carries the body and its
+        descendants, and 0 for all others
 
     Raises
     ------
-    MotionError    for a name that no joint has
+    MotionError    if no joint has a given name
     """
     paths = (body.skeleton.path_to_root(joint) for joint in range(body.skeleton.joint_count))
     weights = np.array([float(body.carrier in path) for path in paths])
@@ -328,14 +333,14 @@ def joint_weights(body: MatchingBody, given: Mapping[str, float]) -> Floats:
 
 
 def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
-    """Flip signs of quaternions, per joint over the whole clip, to the side of the reference."""
+    """Change the signs of a joint's quaternions in all frames if they are mostly opposite to the reference's."""
     return motion._replace(rotations=consistent_signs(motion.rotations[None], reference.rotations)[0])
 
 
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
     """Undo `align_clips` for one clip.
 
-    Exact where the time function is the identity; elsewhere poses between those of canonical frames are interpolated.
+    Exact if the time function is the identity; otherwise the poses are interpolated between canonical frames.
 
     Parameters
     ----------

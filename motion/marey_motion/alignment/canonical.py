@@ -17,16 +17,16 @@ from marey_motion.skeleton import Skeleton
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
     """Rotate and move a motion as a whole so that its first frame is at x = z = 0 and faces +z.
 
-    The joint that carries the body is placed there: the root, except where that is a static reference on the floor.
-    Such a reference keeps its rotations and is moved along; translations of joints between the two are merged into
-    those of the root. The facing direction comes from hips and shoulders; where it is undefined in the first frame, the
-    first frame with a direction counts.
+    The joint that is placed there carries the body: the root, unless the root is a static reference on the floor.
+    Such a root keeps its rotations and moves with the body; translations of the joints between the root and the
+    carrying joint are merged into the root's. The facing direction is computed from hips and shoulders, in the first
+    frame in which it is defined.
 
     Parameters
     ----------
     motion : Motion    F frames
     body : MatchingBody    body of its skeleton
-    keep_height : bool    leave heights above the floor as they are; else the body begins at y = 0, too
+    keep_height : bool    whether heights above the floor stay; if False, the body also begins at y = 0
 
     Returns
     -------
@@ -35,7 +35,7 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
     Raises
     ------
-    MotionError    when no frame has a facing direction
+    MotionError    if no frame has a facing direction
     """
     positions = motion.positions(body.skeleton)
     directions = forward_directions(positions, body.lefts, body.rights)
@@ -48,7 +48,7 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
 
 def placed(motion: Motion, placement: Placement, skeleton: Skeleton) -> Motion:
-    """Move a motion of the canonical frame to its original place: the inverse of `to_canonical`.
+    """Move a motion from the canonical frame to its original place: the inverse of `to_canonical`.
 
     Parameters
     ----------
@@ -71,11 +71,11 @@ def _origin(placement: Placement) -> Floats:
 
 
 def _turn(angle_rad: float) -> Floats:
-    """Make the rotation by an angle to the left about the vertical."""
+    """Make the rotation by an angle about the vertical axis, positive to the left."""
     return np.asarray(quaternions.from_axis_angle((0.0, 1.0, 0.0), angle_rad), dtype=np.float64)
 
 
 def _carried(motion: Motion, skeleton: Skeleton, carrier: int, turn: Floats, places: AnyFloats) -> Motion:
-    """Place the joint `carrier` of a motion at `places` (F, 3), turned in the world by `turn`."""
+    """Move the joint `carrier` of a motion to `places` (F, 3) and rotate it in the world by `turn`."""
     spins = quaternions.multiply(turn, spins_of(motion, skeleton, carrier))
     return carried_at(motion, skeleton, carrier, np.asarray(places, np.float64), np.asarray(spins, np.float64))

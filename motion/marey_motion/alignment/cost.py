@@ -13,17 +13,16 @@ from marey_schemas.options.alignment import CostOptions
 
 
 class CostPoints(NamedTuple):
-    """The points of one motion of n frames, prepared for comparison with others.
+    """The points of one motion of n frames, prepared for comparison with other motions.
 
-    F is n, or with a window of W frames n + W - 1.
+    F = n without a window, and n + W - 1 with a window of W frames.
 
     Parameters
     ----------
-    rows : (F, P, 3) float64    positions, weighted by the square root of each point's share
+    rows : (F, P, 3) float64    positions, times the square root of each point's share of the total weight
     columns : (P, 3, F) float64    the same, transposed
-    energies : (n,) float64    weighted squares on the ground, about their centre, summed over each frame's window
-    centres : (n, 2) float64    weighted centre on the ground of each frame's window; zero where frames are centred one
-        by one
+    energies : (n,) float64    weighted sum of squared horizontal distances from the centre, over each frame's window
+    centres : (n, 2) float64    horizontal weighted centre of each frame's window; zero if each frame is centred alone
     """
 
     rows: Floats
@@ -35,14 +34,15 @@ class CostPoints(NamedTuple):
 def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weights: ArrayLike | None = None) -> Floats:
     """Compute the cost of each pair of frames of two motions.
 
-    The cost is the weighted mean of the points' squared distances, also over the frames of the window if there is one.
+    The cost is the weighted mean of the squared distances between corresponding points, over all frames of the window
+    if there is one.
 
     Parameters
     ----------
     a : (n, P, 3) float64    points in metres, Y up
     b : (m, P, 3) float64    the same points
     options : CostOptions, optional    options
-    weights : (P,), optional    not negative, of the points; equal ones when None. Their sum does not matter.
+    weights : (P,), optional    non-negative weights of the points, of any sum; all equal if None
 
     Returns
     -------
@@ -50,7 +50,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
 
     Raises
     ------
-    MotionError    for points that do not match or are not finite, and for invalid weights
+    MotionError    if the shapes of the points do not match, a position is not finite or the weights are invalid
 
     Notes
     -----
@@ -64,7 +64,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     options = options or CostOptions()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"points must be (frames, points, 3), of the same points in both, not {a.shape} and {b.shape}"
+            f"both motions need shape (frames, points, 3) with equally many points, not {a.shape} and {b.shape}"
         )
     return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 
@@ -142,5 +142,5 @@ def _shares(weights: ArrayLike | None, count: int) -> Floats:
 
 
 def _boxed(values: Floats, window: int) -> Floats:
-    """Compute the sums over each run of `window` values along the last axis."""
+    """Compute the moving sums of `window` consecutive values along the last axis."""
     return np.asarray(np.lib.stride_tricks.sliding_window_view(values, window, axis=-1).sum(axis=-1))

@@ -12,7 +12,10 @@ from marey_motion.kernels import compiled
 
 @compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
-    """Fill sums over points (P, 3) for each frame of others (P, 3, m): of z·z̄ on the ground, of squared rises."""
+    """Sum over the points, for each frame of `others` (P, 3, m): horizontal products z·z̄', squared height differences.
+
+    z = x + i·z are horizontal positions as complex numbers.
+    """
     real[:] = 0.0
     imaginary[:] = 0.0
     heights[:] = 0.0
@@ -28,7 +31,10 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
 
 @compiled
 def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (n, m); rows (n, P, 3) and columns (P, 3, m) are centred in each frame."""
+    """Fill `costs` (n, m), each after the best rotation about the vertical; the points are centred in each frame.
+
+    rows (n, P, 3) and columns (P, 3, m) are the points of the two motions.
+    """
     n, m = costs.shape
     real, imaginary, heights = np.empty(m), np.empty(m), np.empty(m)
     for i in range(n):
@@ -40,7 +46,7 @@ def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-u
 
 @compiled
 def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (n, m) of windows: the terms of single frames, summed along diagonals."""
+    """Fill `costs` (n, m) like `turned`, but with one rotation and shift for all frames of a window."""
     n, m = costs.shape
     width = m + window - 1
     sums = np.zeros((3, m))
@@ -63,7 +69,7 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
-    """Fill sums (c, m) with those over the window of rows that ends at `row`, along diagonals."""
+    """Fill `sums` (c, m) with sums along diagonals of the pair matrix, over the `window` rows that end at `row`."""
     sums[:] = 0.0
     for step in range(window):
         past = history[(row - window + 1 + step) % window]
@@ -86,14 +92,14 @@ def _squares(points, others, row):  # type: ignore[no-untyped-def]
 
 @compiled
 def plain(rows, columns, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (n, m) with squared distances as they are."""
+    """Fill `costs` (n, m) with weighted squared distances, without rotation or shift."""
     for i in range(costs.shape[0]):
         _squares(rows[i], columns, costs[i])
 
 
 @compiled
 def plain_windows(rows, columns, window, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (n, m) like `plain`, as means over windows."""
+    """Fill `costs` (n, m) like `plain`, averaged over the frames of a window."""
     n, m = costs.shape
     sums = np.zeros((1, m))
     history = np.empty((window, 1, m + window - 1))

@@ -26,7 +26,7 @@ class Alignment:
     Parameters
     ----------
     path : (L, 2) int32    frame of the first and of the second motion, from (0, 0) to (n - 1, m - 1)
-    total : float    sum of the costs along it
+    total : float    sum of the costs along the path
     """
 
     path: NDArray[np.int32]
@@ -40,9 +40,9 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
     Parameters
     ----------
-    costs : (n, m) float    finite
-    max_run : int, optional    at most so many steps 1-0, or 0-1, in a row (the slope limit of Kovar and Gleicher
-        2003); None for any
+    costs : (n, m) float    finite costs of each pair of frames
+    max_run : int, optional    largest number of consecutive steps 1-0, or 0-1 (the slope limit of Kovar and Gleicher
+        2003); unlimited if None
 
     Returns
     -------
@@ -50,7 +50,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
     Raises
     ------
-    MotionError    for costs that are not finite, or if no path keeps the limit
+    MotionError    if a cost is not finite, or if no path satisfies `max_run`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -62,7 +62,8 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
         total, length = kernels.align_limited(matrix, max_run, longest)
     if not np.isfinite(total):
         raise MotionError(
-            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} by at most {max_run} equal steps in a row",
+            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if at most {max_run} consecutive "
+            "steps may advance only one motion; allow more",
             code="alignment-impossible",
             where="max_run",
         )
@@ -70,7 +71,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
-    """Compute only the total of `align`.
+    """Compute the total cost of the path that `align` finds, without the path.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 
     Returns
     -------
-    float    in the unit of the costs; infinite if no path keeps the limit
+    float    in the unit of the costs; infinite if no path satisfies `max_run`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -90,17 +91,17 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
     matrix = np.ascontiguousarray(costs, dtype=np.float64)
     if matrix.ndim != 2 or not matrix.size:
-        raise MotionError(f"costs must be a matrix of at least one frame each, not of shape {matrix.shape}")
+        raise MotionError(f"costs must be a matrix with at least one row and column, not of shape {matrix.shape}")
     # Least and greatest are found without a matrix of answers, which would take longer than the alignment.
     if not (np.isfinite(matrix.min()) and np.isfinite(matrix.max())):
         raise MotionError("costs must be finite", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}")
     if max_run is not None and not 0 <= max_run <= 60:
-        raise MotionError("the number of equal steps in a row must be in 0 to 60", where="max_run")
+        raise MotionError(f"the number of consecutive steps must be 0 to 60, not {max_run}", where="max_run")
     return matrix
 
 
 def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
-    """Compute the mean distance of the points of each pair of frames.
+    """Compute the mean distance between corresponding points, for each pair of frames of two motions.
 
     Parameters
     ----------
@@ -121,17 +122,17 @@ def distances(a: NDArray[np.floating], b: NDArray[np.floating]) -> Floats:
 def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: float = np.inf) -> float:
     """Compute the total of the cheapest path through `distances(a, b)`, divided by the frames of the longer motion.
 
-    Memory grows with the frames, not with their product.
+    Memory is O(n + m), not O(n·m).
 
     Parameters
     ----------
     a : (n, P, 3)    metres
     b : (m, P, 3)    metres
-    limit : float    stop as soon as the result is certain to exceed it
+    limit : float    metres; the computation stops as soon as the result is certain to exceed this limit
 
     Returns
     -------
-    float    metres; infinite if it exceeds `limit`
+    float    metres; infinite if the result exceeds `limit`
     """
     from marey_motion.alignment import dtw_kernels as kernels
 
@@ -145,11 +146,11 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
 
 
 def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_per_box: int = FRAMES_PER_BOX) -> float:
-    """Compute a lower bound of `warped_distance(a, b)`, much faster.
+    """Compute a lower bound of `warped_distance(a, b)` in much less time.
 
-    Every frame of either motion lies on the path at least once, and costs no less than its distance from the nearest of
-    the boxes about `frames_per_box` consecutive frames of the other motion. The first and the last cell are on every
-    path.
+    The other motion is divided into runs of `frames_per_box` frames, each enclosed in a bounding box per point. Every
+    frame is on the path at least once and costs at least its distance from the nearest box. The first and the last cell
+    of the matrix are on every path.
 
     Parameters
     ----------
@@ -168,7 +169,7 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
 
 class RangeBounds:
-    """Lower bounds of the warped distances between one motion and many others, with one box about each motion.
+    """Lower bounds of the warped distances between one motion and many others, from one bounding box per motion.
 
     Parameters
     ----------
@@ -187,9 +188,9 @@ class RangeBounds:
 
         Parameters
         ----------
-        one : int    number of the motion
-        others : (K,) int64    numbers of the others
-        limit : float    bounds above it are not refined
+        one : int    index of the motion
+        others : (K,) int64    indices of the other motions
+        limit : float    metres; a bound that exceeds this limit is not improved further
 
         Returns
         -------
@@ -205,7 +206,7 @@ class RangeBounds:
 
 
 def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Floats:
-    """Compute the mean distance (n,) of the points of each frame of `a` from the nearest box about frames of `b`."""
+    """Compute the mean distance (n,) of the points of each frame of `a` from the nearest bounding box of `b`."""
     from marey_motion.alignment import dtw_kernels as kernels
 
     starts = np.arange(0, len(b), frames_per_box)
@@ -222,6 +223,6 @@ def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, F
     """Lay out the points of two motions with frames as the first axis of one and the last axis of the other."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"points must be (frames, points, 3), of the same points in both, not {a.shape} and {b.shape}"
+            f"both motions need shape (frames, points, 3) with equally many points, not {a.shape} and {b.shape}"
         )
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

@@ -13,7 +13,7 @@ LANES = 4
 
 @compiled
 def align(costs, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards from the end; return the least total and the number of cells."""
+    """Fill `path` with the cheapest path, last cell first; return its total cost and its number of cells."""
     n, m = costs.shape
     steps = np.empty((n, m), np.uint8)
     # The row before a block and those of the block, with a border from which no path comes, except into the first cell.
@@ -31,7 +31,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals and its step, without branches that the processor could not predict."""
+    """Find the least of three totals and its step, without branches, which the processor could not predict."""
     least = min(both, first, second)
     alone = least < both
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
@@ -39,7 +39,7 @@ def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cells(costs, before, totals, steps, start, stop):  # type: ignore[no-untyped-def]
-    """Fill columns [start, stop) of one row; totals are one column further right than costs and steps."""
+    """Fill columns [start, stop) of one row of totals and steps; column j of costs is column j + 1 of totals."""
     for j in range(start, stop):
         least, steps[j] = _cheapest(before[j], before[j + 1], totals[j])
         totals[j + 1] = least + costs[j]
@@ -68,7 +68,7 @@ def _four_rows(costs, totals, steps):  # type: ignore[no-untyped-def]
 
 @compiled
 def _walk_back(steps, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards from the end; return the number of cells."""
+    """Fill `path` from the stored steps, last cell first; return the number of cells."""
     i, j, length = steps.shape[0] - 1, steps.shape[1] - 1, 0
     while True:
         path[length, 0], path[length, 1] = i, j
@@ -84,7 +84,7 @@ def _walk_back(steps, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total(costs):  # type: ignore[no-untyped-def]
-    """Compute only the least total, with memory for one row."""
+    """Compute the total cost of the cheapest path in O(m) memory."""
     n, m = costs.shape
     totals = np.empty(m)
     for i in range(n):
@@ -99,7 +99,7 @@ def total(costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
-    """Do as `align`, with at most `max_run` steps 1-0, or 0-1, in a row."""
+    """Fill `path` like `align`, with at most `max_run` consecutive steps 1-0, or 0-1."""
     n, m = costs.shape
     # Least totals of the paths to each cell whose last step is not in the first alone, and not in the second alone.
     not_first, not_second = np.empty((n, m)), np.empty((n, m))
@@ -113,7 +113,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
-    """Compute only the least total, with memory for a few rows; infinite if no path keeps the limit."""
+    """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite without a path."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
@@ -125,10 +125,10 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill a row of totals from the row before it; runs (max_run, m) are totals after 1, 2, ... steps 1-0 in a row.
+    """Fill a row of totals from the row before; row r of `runs` (max_run, m): totals after r + 1 consecutive steps 1-0.
 
-    A step 0-1 begins a run only where none goes on, and those totals depend on the row before alone: nothing has to
-    wait for its left neighbour, and every loop runs over whole vectors.
+    A run of steps 0-1 starts from totals that depend only on the row before. No cell therefore waits for its left
+    neighbour, and every loop runs over whole vectors.
     """
     m, max_run = costs.shape[0], runs.shape[0]
     if i == 0:
@@ -160,7 +160,10 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 
 @compiled
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
-    """Fill `path` backwards: at each cell the first of the cheapest paths to it, a run of steps at a time."""
+    """Fill `path`, last cell first, one run of equal steps at a time; return the number of cells.
+
+    Among equally cheap steps a step 1-1 is preferred to 1-0, and 1-0 to 0-1.
+    """
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
     barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind
     while i > 0 or j > 0:
@@ -193,7 +196,7 @@ def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ig
 
 @compiled
 def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
-    """Fill row (m,) with the mean distance of points (P, 3) from each frame of others (P, 3, m)."""
+    """Fill `row` (m,) with the mean distance between `points` (P, 3) and each frame of `others` (P, 3, m)."""
     count = points.shape[0]
     row[:] = 0.0
     for p in range(count):
@@ -207,7 +210,7 @@ def _distances_of_frame(points, others, row):  # type: ignore[no-untyped-def]
 
 @compiled
 def distances(a, b, out):  # type: ignore[no-untyped-def]
-    """Fill out (n, m); a (n, P, 3), b (P, 3, m)."""
+    """Fill `out` (n, m) with the mean distance between the points of a (n, P, 3) and b (P, 3, m)."""
     for i in range(a.shape[0]):
         _distances_of_frame(a[i], b, out[i])
 
@@ -216,8 +219,8 @@ def distances(a, b, out):  # type: ignore[no-untyped-def]
 def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
     """Compute the least total of a path through the distances of a (n, P, 3) and b (P, 3, m); infinite above `limit`.
 
-    rest (n,): lower bound of the cost of the rows after each row. Every path passes every row, and totals never fall
-    along it: once the least total of a row plus the rest is above the limit, so is the total at the end.
+    rest (n,) is a lower bound of the cost of all rows after each row. Every path crosses every row, and its total never
+    falls: once the least total of a row plus `rest` exceeds the limit, the final total does, too.
     """
     n, m = a.shape[0], b.shape[2]
     costs = np.empty(m)
@@ -241,7 +244,7 @@ def total_within(a, b, rest, limit):  # type: ignore[no-untyped-def]
 def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
     """Fill out (n,) with the mean distance of the points of each frame of a (n, P, 3) from the nearest of B boxes.
 
-    low, high (P, 3, B).
+    low, high (P, 3, B) are the corners of the boxes.
     """
     points, boxes = low.shape[0], low.shape[2]
     costs = np.empty(boxes)
@@ -262,10 +265,10 @@ def box_costs(a, low, high, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def range_bounds(points, starts, stops, low, high, one, others, limit, out):  # type: ignore[no-untyped-def]
-    """Fill out (K,) with lower bounds of the costs of aligning a range with K others, unrefined above `limit`.
+    """Fill `out` (K,) with lower bounds of the costs of aligning range `one` with K other ranges of frames.
 
-    points (N, P, 3); range r is [starts[r], stops[r]); low, high (R, P, 3) are the boxes about the frames of each;
-    costs are means per frame of the longer range.
+    points (N, P, 3); range r is [starts[r], stops[r]) and has the bounding box low[r], high[r] (P, 3). Costs are
+    divided by the frames of the longer range. A bound that exceeds `limit` is not improved further.
     """
     for k in range(others.shape[0]):
         other = others[k]
@@ -291,7 +294,7 @@ def _mean_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
-    """Sum the mean distances of the points of frames from a box; stop when the sum exceeds `most`."""
+    """Sum over frames the mean distance of the points from a bounding box; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):
         cost = 0.0

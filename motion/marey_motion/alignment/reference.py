@@ -35,9 +35,9 @@ def nearest_mean_length(frame_counts: Sequence[int]) -> int:
 
 
 def medoid(totals: Floats) -> int:
-    """Choose the motion with the least sum of costs of aligning it with each.
+    """Choose the motion with the least sum of alignment costs to all motions.
 
-    Motions that cannot be aligned with some others (infinite costs) come after those that can with more.
+    A motion that can be aligned with more of the others (finite costs) is preferred, whatever the sum.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def pairwise_totals(
     Parameters
     ----------
     points : sequence of CostPoints    points of each motion
-    bounds : sequence of sequences of int    bounds of each motion's sections, equally many
+    bounds : sequence of sequences of int    bounds of each motion's sections; all motions have equally many
     options : CostOptions    options of the cost
     max_run : int or None    slope limit of `dtw.align`
     threads : int    threads to use

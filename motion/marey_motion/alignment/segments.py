@@ -35,9 +35,9 @@ class Sections(NamedTuple):
 
     Parameters
     ----------
-    bounds : tuple of int    increasing frames, the first 0 and the last one the motion's last: neighbours bound a
-        section and belong to both sections beside them
-    labels : tuple of tuples of str    the labels of each bound, none where only the motion begins or ends there
+    bounds : tuple of int    increasing frames from 0 to the last frame of the motion. Each section lasts from one bound
+        to the next, both included.
+    labels : tuple of tuples of str    the labels of each bound; empty for a first or last frame without a cut
     """
 
     bounds: tuple[int, ...]
@@ -45,15 +45,15 @@ class Sections(NamedTuple):
 
     @property
     def keyframes(self) -> dict[str, int]:
-        """Frame by label."""
+        """Frame of each bound, by its label."""
         return {label: frame for frame, labels in zip(self.bounds, self.labels, strict=True) for label in labels}
 
 
 def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     """List the cuts that an annotation makes: keyframes, and starts and ends of segments.
 
-    A segment begins under its own label. It ends as `end of <label>` unless another segment begins there or the clip
-    ends with it. A label that is repeated is numbered: `step`, `step 2`, `step 3`.
+    The cut at the start of a segment has the segment's label. The cut at its end has the label `end of <label>`; there
+    is none if another segment begins there or the clip ends. A repeated label is numbered: `step`, `step 2`, `step 3`.
 
     Parameters
     ----------
@@ -75,7 +75,9 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "two labels get this name when repeated labels are numbered", code="label-repeats", where=repeated[0]
+            "numbering repeated labels gives two labels this name; rename one of them",
+            code="label-repeats",
+            where=repeated[0],
         )
     return cuts
 
@@ -103,7 +105,7 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
         frame = min(round(cut.frame * rate_ratio), last)
         if bounds.get(frame):
             raise AnnotationError(
-                f"it falls on the same frame as {', '.join(bounds[frame])}; a section needs two frames",
+                f"the cut is on the same frame as {', '.join(bounds[frame])}; a section needs two frames",
                 code="section-too-short",
                 where=", ".join(cut.labels),
             )
@@ -113,7 +115,7 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
 
 
 def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tuple[tuple[str, ...], ...]:
-    """Find the labels of bounds that most examples have.
+    """Find the most frequent list of labels among the examples.
 
     Parameters
     ----------
@@ -121,7 +123,7 @@ def common_labels(all_labels: Mapping[str, tuple[tuple[str, ...], ...]]) -> tupl
 
     Returns
     -------
-    tuple of tuples of str    of several, those of the first example
+    tuple of tuples of str    labels of each bound; among equally frequent lists, the first
     """
     counts = Counter(all_labels.values())
     most = max(counts.values())
@@ -133,7 +135,7 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
 
     Parameters
     ----------
-    own, common : tuple of tuples of str    labels of its bounds and of the others'
+    own, common : tuple of tuples of str    labels of the bounds, of this example and of the others
 
     Raises
     ------
@@ -141,7 +143,8 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
     """
     if own != common:
         raise AnnotationError(
-            f"it has the cuts {_shown(own)}, the others have {_shown(common)}: all need the same labels in one order",
+            f"the clip has the cuts {_shown(own)}, the others have {_shown(common)}: all clips need the same labels "
+            "in the same order",
             code="labels-differ",
         )
 
@@ -159,12 +162,13 @@ def _shown(labels: tuple[tuple[str, ...], ...]) -> str:
 
 
 class SectionedAlignment(NamedTuple):
-    """Alignments of all sections, put together.
+    """Alignment of two whole motions, joined from the alignments of their sections.
 
     Parameters
     ----------
-    path : (L, 2) int32    from the first to the last frames of both motions, through each pair of bounds once
-    total : float    sum of the costs along it, square metres
+    path : (L, 2) int32    matched frames of reference and source, from the first to the last frame of both; contains
+        each pair of bounds once
+    total : float    sum of the costs along the path, square metres
     times : (N,) float64    source frame at each frame of the reference
     """
 
@@ -189,7 +193,7 @@ def align_sections(
     Parameters
     ----------
     costs : (N, M) float64    costs of reference and source frames
-    reference, source : sequence of int    equally many bounds of each, from 0 to N - 1 and to M - 1
+    reference, source : sequence of int    equally many bounds of each motion, from 0 to N - 1 and from 0 to M - 1
     align : callable    finds the path through the costs of one section
 
     Returns

@@ -1,4 +1,4 @@
-"""Signs of quaternions: q and -q are one rotation, but two points for the mathematics of functions."""
+"""Signs of quaternions: q and -q are the same rotation, but averages and interpolations need a consistent sign."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from marey_motion.arrays import Floats
 
 
 def consistent_signs(rotations: Floats, reference: Floats) -> Floats:
-    """Choose signs of the rotations of aligned clips under which they can be averaged.
+    """Choose the signs of quaternions so that the rotations of aligned clips can be averaged.
 
-    Each joint is made continuous in time first; then all its signs are changed where its mean dot product with that of
-    the reference is negative. Deciding frame by frame instead would cut the course of a joint that turns by more than
-    half a turn.
+    The quaternions of each joint are first made continuous in time. Then the signs of all its frames are changed if
+    the mean dot product with the reference is negative. Choosing signs frame by frame would make the quaternions of a
+    joint discontinuous where it turns by more than half a turn.
 
     Parameters
     ----------

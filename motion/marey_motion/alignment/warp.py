@@ -1,4 +1,4 @@
-"""Time functions: the moment of one motion for each frame of another.
+"""Time functions, which map each frame of one motion to a time in another.
 
 A time function gives a fractional frame of the source for each canonical frame. It is strictly increasing, begins at 0
 and ends at the source's last frame; between canonical frames it is linear.
@@ -21,15 +21,16 @@ _WHOLE = 1e-9
 
 
 def time_function(path: NDArray[np.integer]) -> Floats:
-    """Compute the time function of a path through the frames of a reference and of a source.
+    """Compute the time function of an alignment path between a reference and a source.
 
-    Each canonical frame belongs to the mean of the source frames that it is matched with. Source frames that are
-    matched with several canonical frames belong to the middle of those, and time passes evenly in between. Both ends
-    are pinned. Slopes below `LEAST_SLOPE` are raised to it by the least change, in the sense of squares, of all slopes.
+    A canonical frame that is matched with several source frames is mapped to their mean. A source frame that is matched
+    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. First
+    frames and last frames correspond exactly. If a slope is below `LEAST_SLOPE`, the slopes are replaced by the
+    nearest ones, in least squares, that are not.
 
     Parameters
     ----------
-    path : (L, 2) int    N reference frames and those of the source
+    path : (L, 2) int    matched frames of the reference (N frames) and of the source
 
     Returns
     -------
@@ -47,7 +48,7 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
 
 def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
-    """Find the middle of every run of cells that share a frame of a motion; for the first and last run, the ends."""
+    """Find the mean cell of each run of cells that share a frame; the first and last knot are the ends of the path."""
     steps = np.diff(path, axis=0)
     side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
     before = np.concatenate(([0], side[:-1]))
@@ -59,14 +60,15 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Find the nearest times in least squares of their steps, with the same ends and no step below the least slope."""
+    """Find the times with the same ends and no step below the least slope whose steps are nearest in least squares."""
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:
         return times
     spare = times[-1] - times[0] - least * len(steps)
     if spare < 0:
         raise MotionError(
-            f"{len(times)} frames cannot pass in {times[-1] - times[0]:g} frames of the source",
+            f"{len(times)} frames cannot be aligned with {times[-1] - times[0]:g} frames of the source: the time "
+            f"function would be flatter than {LEAST_SLOPE:g}; use a longer source",
             code="alignment-impossible",
         )
     # Projection onto the simplex of steps above the least one (Held, Wolfe and Crowder 1974).
@@ -93,7 +95,7 @@ def inverse(times: Floats) -> Floats:
 
 
 def warped(motion: Motion, times: ArrayLike) -> Motion:
-    """Sample a motion at fractional frames: positions linear, rotations by slerp between neighbouring frames.
+    """Sample a motion at fractional frames: positions are interpolated linearly, rotations by slerp.
 
     Parameters
     ----------
@@ -106,12 +108,12 @@ def warped(motion: Motion, times: ArrayLike) -> Motion:
 
     Raises
     ------
-    MotionError    for times outside the motion
+    MotionError    if a time is outside the motion
     """
     places = np.asarray(times, dtype=np.float64)
     last = motion.frame_count - 1
     if places.size and not (places.min() >= -_WHOLE and places.max() <= last + _WHOLE):
-        raise MotionError(f"the motion has the frames 0 to {last}", where="times")
+        raise MotionError(f"a time is outside the motion, whose frames are 0 to {last}", where="times")
     places = np.clip(places, 0.0, last)
     whole = np.round(places)
     places = np.where(np.abs(places - whole) <= _WHOLE, whole, places)

@@ -163,7 +163,7 @@ def test_labels_follow_a_reference_that_is_named() -> None:
     labelled[0] = replace(labelled[0], cuts=(Cut(("start",), 20),))
     error = raised(labelled, TO_FIRST)
     assert "walk b" in str(error)
-    assert "it has the cuts contact, the others have start" in str(error)
+    assert "the clip has the cuts contact, the others have start" in str(error)
 
 
 def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_reference_or_the_one_asked_for() -> None:
@@ -236,24 +236,24 @@ def short(frames: int) -> SourceExample:
 @pytest.mark.parametrize(
     ("odd", "options", "code", "said"),
     [
-        (short(3), None, "too-short", "short: it has 3 frames at 60 Hz; 4 to 4000 can be aligned"),
+        (short(3), None, "too-short", "short: the clip has 3 frames at 60 Hz; 4 to 4000 can be aligned"),
         (
             SourceExample("long@1", "long", generate_gait(1.3, 0.2, 67.0)),
             None,
             "too-long",
-            "long: it has 4020 frames at 60 Hz",
+            "long: the clip has 4020 frames at 60 Hz",
         ),
         (
             SourceExample("bones@1", "bones", generate_gait(1.3, 0.2, 1.0, stature_m=1.5)),
             None,
             "skeleton-mismatch",
-            "bones: it moves another skeleton than the others; retarget it first",
+            "bones: the clip has another skeleton than the other clips; retarget it first",
         ),
         (
             SourceExample("cut@1", "cut", walk(), (Cut(("contact",), 60),)),
             None,
             "outside-clip",
-            "cut: contact, frame 60: it has the frames 0:60",
+            "cut: contact, frame 60: the frame is outside the clip, whose frames are 0 to 59",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
         (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is not one"),
@@ -275,14 +275,14 @@ def test_fewer_than_two_examples_cannot_be_aligned() -> None:
     assert raised(examples[:1]).code == "too-few-clips"
     assert raised([]).code == "too-few-clips"
     refused = []
-    with pytest.raises(MotionError, match="1 of 2 clips are left"):
+    with pytest.raises(MotionError, match="only 1 of 2 clips can be aligned"):
         align_clips([examples[0], short(2)], BODY, on_refusal=lambda *one: refused.append(one))
     assert len(refused) == 1
 
 
 def test_a_reference_that_does_not_fit_is_not_left_out_silently() -> None:
     examples, _ = warped_walks(3)
-    with pytest.raises(MotionError, match="short: it has 3 frames"):
+    with pytest.raises(MotionError, match="short: the clip has 3 frames"):
         align_clips([*examples, short(3)], BODY, AlignOptions(reference="short@1"), on_refusal=lambda *_: None)
 
 

@@ -48,7 +48,7 @@ def test_labels_that_repeat_are_numbered_in_the_order_of_time() -> None:
     layer = Layer(60, (Segment("left", 0, 20), Segment("right", 20, 40), Segment("left", 40, 60)))
     assert [cut.labels for cut in cuts_of(layer)] == [("left",), ("right",), ("left 2",)]
     clash = Layer(60, (Segment("left", 0, 20), Segment("left", 20, 40), Segment("left 2", 40, 60)))
-    with pytest.raises(AnnotationError, match="left 2: two labels get this name"):
+    with pytest.raises(AnnotationError, match="left 2: numbering repeated labels gives two labels this name"):
         cuts_of(clash)
 
 
@@ -66,7 +66,7 @@ def test_a_cut_on_the_first_or_last_frame_labels_that_end() -> None:
 
 
 def test_cuts_that_fall_on_one_frame_leave_no_section_and_are_refused() -> None:
-    with pytest.raises(AnnotationError, match=r"hold: it falls on the same frame as contact"):
+    with pytest.raises(AnnotationError, match=r"hold: the cut is on the same frame as contact"):
         sections_of((Cut(("contact",), 20), Cut(("hold",), 21)), 30, rate_ratio=0.4)
 
 
@@ -75,11 +75,11 @@ def test_the_labels_that_most_examples_have_are_the_common_ones() -> None:
     assert common_labels({"2": usual, "1": odd, "3": usual}) == usual
     assert common_labels({"2": usual, "1": other}) == usual
     require_labels(usual, usual)
-    with pytest.raises(AnnotationError, match="it has the cuts b, a, the others have a, b"):
+    with pytest.raises(AnnotationError, match="the clip has the cuts b, a, the others have a, b"):
         require_labels(other, usual)
-    with pytest.raises(AnnotationError, match="it has the cuts none, the others have a"):
+    with pytest.raises(AnnotationError, match="the clip has the cuts none, the others have a"):
         require_labels(((), ()), odd)
-    with pytest.raises(AnnotationError, match=r"it has the cuts a \(first frame\), the others have a:"):
+    with pytest.raises(AnnotationError, match=r"the clip has the cuts a \(first frame\), the others have a:"):
         require_labels((("a",), ()), odd)
 
 

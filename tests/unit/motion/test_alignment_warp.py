@@ -82,7 +82,7 @@ def test_slopes_that_are_too_small_are_raised_and_the_others_give_way_alike() ->
 
 def test_a_source_without_the_time_for_the_least_slopes_is_refused() -> None:
     path = np.array([*((frame, 0) for frame in range(300)), (300, 1)])
-    with pytest.raises(MotionError, match="cannot pass in 1 frames"):
+    with pytest.raises(MotionError, match="cannot be aligned with 1 frames of the source"):
         time_function(path)
     with pytest.raises(MotionError, match="two frames in both"):
         time_function(np.array([(0, 0), (1, 0)]))
@@ -124,7 +124,7 @@ def test_translations_of_joints_are_played_along() -> None:
 
 
 def test_times_that_the_motion_does_not_have_are_refused() -> None:
-    with pytest.raises(MotionError, match="the frames 0 to 59"):
+    with pytest.raises(MotionError, match="whose frames are 0 to 59"):
         warped(Motion.of(walk()), [0.0, 59.5])
 
 
