@@ -1,4 +1,4 @@
-"""Weights of frames for a change of a range: full inside, with smooth transitions at the borders."""
+"""Weights of the frames of a range for a change: 1 inside, with smooth transitions at the borders."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from marey_motion.editing.take import Take
 def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: float) -> tuple[slice, Floats]:
     """Compute the weight of each frame of a range.
 
-    Borders lie within the range and take up to half of it each. Where the range begins or ends with the motion there is
-    no border.
+    Each border is inside the range and at most half as long. There is no border at an end of the range that is also an
+    end of the motion.
 
     Parameters
     ----------
     take : Take    F frames
-    frames : (int, int or None) or None    half-open range, all frames when None
+    frames : (int, int or None) or None    half-open range; all frames if None
     border_s : float    seconds of each border
 
     Returns
@@ -43,7 +43,7 @@ def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: f
 
 
 def smooth_step(places: Floats) -> Floats:
-    """Ease from 0 to 1, without velocity at both ends.
+    """Ease from 0 to 1 with zero velocity at both ends.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def smooth_step(places: Floats) -> Floats:
 
 
 def blended(a: Floats, b: Floats, shares: Floats) -> Floats:
-    """Blend rotations; both ends are exact.
+    """Interpolate between rotations; shares of 0 and 1 give the inputs exactly.
 
     Parameters
     ----------

@@ -41,8 +41,11 @@ class ComputeBudget:
 
         Raises
         ------
-        EditError    if less is left
+        EditError    if less work than this is left
         """
         self.left -= work
         if self.left < 0.0:
-            raise EditError("the edit takes more computing time than allowed", code="edit-too-long")
+            raise EditError(
+                "the edit takes more computing time than allowed; use fewer frames or constraints",
+                code="edit-too-long",
+            )

@@ -1,6 +1,7 @@
 """Constraints on ranges of frames, met by inverse kinematics and blended into their surroundings.
 
-Constraints that move the same joints, or joints that carry each other's, are solved together; others separately.
+Two constraints are solved together if one of them turns a joint that the other turns or depends on; otherwise
+separately.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ _LIMIT_PASSES = 4
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """A target that counts in the frames [start, stop).
+    """A target of inverse kinematics for the frames [start, stop).
 
     Parameters
     ----------
-    target : its values are for all of these frames, or one for each
-    joints : indices of the joints that may turn for it
-    limb : the limb among these joints that ends at the target, if any; it is tried alone before other joints turn
+    target : the target, with one value for all of these frames or one value per frame
+    joints : indices of the joints that may turn to meet the target
+    limb : the limb that ends at the target's joint, if any; it is solved alone before other joints turn
     """
 
     target: Target
@@ -63,7 +64,7 @@ class ConstrainedMotion:
     Parameters
     ----------
     motion : the whole motion
-    residuals_before, residuals_after : error of each constraint in each of its frames: metres, or radians
+    residuals_before, residuals_after : error of each constraint in each of its frames, in metres or radians
     """
 
     motion: Motion
@@ -89,10 +90,11 @@ def constrain_motion(
     skeleton : Skeleton    J joints
     motion : Motion    F frames
     constraints : sequence of Constraint    C constraints
-    blend_frames : int    frames before the first and after the last constrained one that may change; 0 for none
+    blend_frames : int    number of frames that may change before the first and after the last constrained frame
     freedom : Freedom, optional    limits, stiffness and whether the root moves; the constraints name the joints that
         may turn
-    solver : str    "auto" takes the two-bone solver for limbs and least squares for everything else
+    solver : str    "auto", "ccd", "two_bone" or "least_squares"; "auto" uses the two-bone solver for limbs and least
+        squares for everything else
     options : SolverOptions, optional    tolerances and iterations
     budget : budget, optional    remaining work; reduced by the work of this call
 
@@ -117,7 +119,7 @@ def constrain_motion(
 
 
 def current_values(skeleton: Skeleton, motion: Motion, target: PositionTarget | OrientationTarget) -> Floats:
-    """Compute the target values that the motion meets as it is.
+    """Compute the values that a target would need so that the unchanged motion meets it exactly.
 
     Parameters
     ----------
@@ -140,13 +142,15 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
     start, stop = constraint.start, constraint.stop
     if not 0 <= start < stop <= frames:
         raise EditError(
-            f"the frames {start}:{stop} are outside the clip, which has {frames}",
+            f"the frames {start}:{stop} are not a range within the clip's {frames} frames",
             code="frames-missing",
             where=f"constraints[{number}]",
         )
     if len(constraint.target.values) not in (1, stop - start):
         raise EditError(
-            f"{len(constraint.target.values)} values for {stop - start} frames", where=f"constraints[{number}]"
+            f"the target has {len(constraint.target.values)} values for {stop - start} frames; one value, or one per "
+            "frame, is needed",
+            where=f"constraints[{number}]",
         )
 
 
@@ -158,7 +162,7 @@ def _residuals(skeleton: Skeleton, motion: Motion, constraint: Constraint) -> Fl
 def _clusters(
     skeleton: Skeleton, constraints: Sequence[Constraint], together: bool
 ) -> tuple[tuple[Constraint, ...], ...]:
-    """Group the constraints that must be solved together, because one turns a joint that affects another."""
+    """Group the constraints that must be solved together because one of them turns a joint that affects another."""
     clusters: list[tuple[set[int], set[int], list[Constraint]]] = []
     for constraint in constraints:
         turning = set(constraint.joints)
@@ -176,7 +180,7 @@ def _clusters(
 
 @dataclass(frozen=True, eq=False)
 class _Cluster:
-    """Constraints that are solved together, and how."""
+    """Constraints that are solved together, with their solver and options."""
 
     skeleton: Skeleton
     constraints: Sequence[Constraint]
@@ -265,13 +269,13 @@ def solving_work(
     limited: bool = False,
     options: SolverOptions | None = None,
 ) -> float:
-    """Estimate the work of inverse kinematics whose targets are out of reach, in nanoseconds of one thread.
+    """Estimate the work of inverse kinematics with unreachable targets, in nanoseconds of one thread.
 
     Parameters
     ----------
     frames, joints, targets : int    numbers of each
     method : str    "ccd", "two_bone" or "least_squares"
-    limited : bool    whether joints have limits, which take steps of their own
+    limited : bool    whether joints have limits, which need additional steps
     options : SolverOptions, optional    iterations
 
     Returns

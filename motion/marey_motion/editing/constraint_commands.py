@@ -88,7 +88,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : PlantFeet    contacts, detected by speed if None, and the blending around them
+    command : PlantFeet    contacts (detected by speed if None), and the blending around them
 
     Returns
     -------
@@ -96,7 +96,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
 
     Raises
     ------
-    MappingError    if legs are not known
+    MappingError    if the mapping does not define both legs
     EditError    if the frames do not exist
     """
     take.budget.spend(PER_RIG + PER_PLANTED_NUMBER * take.size)
@@ -127,7 +127,7 @@ class _Rig:
 
     @property
     def axes(self) -> dict[str, JointAxes]:
-        """Axes of the mapped joints by name; where the rest pose does not define those of a limb, from the motion."""
+        """Axes of the mapped joints by name; if the rest pose does not define the axes of a limb, the motion does."""
         if self._axes is None:
             take = self.take
             clip = take.motion.as_clip(take.skeleton, take.frame_rate_hz)
@@ -150,7 +150,7 @@ class _Rig:
 
 
 def _named(number: int, make: Any, *arguments: Any) -> Any:
-    """Call `make`; its errors name the constraint."""
+    """Call `make`, and prefix the place of its errors with the constraint."""
     try:
         return make(*arguments)
     except MotionError as error:
@@ -193,11 +193,11 @@ def _target(rig: _Rig, joint: int, asked: AnyConstraint, start: int, stop: int) 
 
 
 def _looking_axis(rig: _Rig, joint: int) -> NDArray[np.float64]:
-    """Choose the axis of gaze in the joint's frame: the front of head and trunk, the direction of other bones."""
+    """Choose the look-at axis in the joint's frame: the front of head or trunk, or the direction of another bone."""
     try:
         axes = rig.axes_of(joint)
     except MappingError as error:
-        raise MappingError(f"{error.message}; or say which axis looks", where="axis") from error
+        raise MappingError(f"{error.message}; complete the mapping or set the axis", where="axis") from error
     mapping = rig.take.body.mapping.joints
     name = rig.take.skeleton.joint_names[joint]
     looks = any(mapping.get(standard) == name for standard in _LOOKING)
@@ -234,7 +234,9 @@ def _foot(rig: _Rig, side: str) -> Foot:
     *_, ankle = mapping.indices(skeleton, (f"{side}_hip", f"{side}_knee", f"{side}_ankle"))
     leg = limb_ending_at(skeleton, mapping, ankle, rig.axes_if_known())
     if leg is None:
-        raise MappingError("hip, knee and ankle do not form one leg", where=f"{side}_ankle")
+        raise MappingError(
+            "the mapped hip, knee and ankle are not one chain of joints; correct the mapping", where=f"{side}_ankle"
+        )
     toe = f"{side}_toe"
     return Foot(leg, mapping.indices(skeleton, (toe,))[0] if toe in mapping.joints else ankle)
 

@@ -1,10 +1,11 @@
 """Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
 
-A displacement is a rotation vector for each local rotation, q·exp(d), and a shift of the root (Lee and Shin 1999). Its
-control points lie on the frames. The curve of least bending passes through values that are smoothed along consecutive
-given frames: without smoothing, it would continue the slope of the last two frames, which is mostly noise, far into the
-surroundings. A second curve under high tension adds the rest of each given frame and hardly extends beyond them. Near a
-smooth end of the window the control points are zero, so that value, slope and curvature are exactly zero there.
+A displacement is a rotation vector d for each local rotation q, which becomes q·exp(d), and a shift of the root (Lee
+and Shin 1999). There is one control point per frame. The displacement is the sum of two curves. The first, of least
+bending, passes through the changes of the given frames after smoothing: without smoothing, it would continue the slope
+of the last two frames, which is mostly noise, far into the surroundings. The second, under high tension, passes through
+the remaining differences and hardly extends beyond the given frames. Near a smooth end of a window the control points
+are zero, so that value, slope and curvature are exactly zero there.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ MISSED_SHARE = 1e-13
 class Window(NamedTuple):
     """Frames [start, stop) that may change, and whether the change ends smoothly at each of their ends.
 
-    An end that is not smooth, such as one that is an end of the clip, may change as much as its neighbours.
+    A frame at an end that is not smooth, such as the end of the clip, may change as much as its neighbours.
     """
 
     start: int
@@ -46,7 +47,7 @@ class Window(NamedTuple):
 
 
 def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tuple[Window, ...]:
-    """Make windows that blend given frames in and out; those that would overlap become one.
+    """Make windows around given frames, in which their change is blended in and out; overlapping windows are merged.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
     Returns
     -------
-    tuple of Window    apart from each other
+    tuple of Window    windows that do not overlap
     """
     groups: list[list[int]] = []
     for frame in frames.tolist():
@@ -72,14 +73,14 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
 
 def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence[Window]) -> Motion:
-    """Change some frames and spread the change over windows; frames outside the windows keep their bits.
+    """Change some frames and spread the change over windows; frames outside the windows stay identical to the bit.
 
     Parameters
     ----------
     motion : Motion    F frames
     frames : (n,) int    increasing indices of the given frames, each inside a window
     changed : Motion    those n frames after the change
-    windows : sequence of Window    apart from each other
+    windows : sequence of Window    windows that do not overlap
 
     Returns
     -------
@@ -87,7 +88,7 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 
     Raises
     ------
-    EditError    if a frame is not inside a window, or a window holds none
+    EditError    if a given frame is not inside a window, or a window contains no given frame
     """
     _check_windows(frames, windows)
     rotations, roots = motion.rotations.copy(), motion.root_translations.copy()
@@ -108,23 +109,23 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
 
 
 def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
-    """Check that each window holds frames, and that each frame is inside a window, not at its smooth ends."""
+    """Check that each window contains a given frame, and each given frame is in a window but not at a smooth end."""
     inside = np.zeros(len(frames), dtype=np.bool_)
     for window in windows:
         start, stop = window.start + window.smooth_start, window.stop - window.smooth_stop
         held = (frames >= start) & (frames < stop)
         if not held.any():
-            raise EditError(f"the window {window.start}:{window.stop} holds no given frame", where="windows")
+            raise EditError(f"the window {window.start}:{window.stop} contains no changed frame", where="windows")
         inside |= held
     if not inside.all():
-        raise EditError(f"frame {int(frames[~inside][0])} is not inside any window", where="windows")
+        raise EditError(f"the changed frame {int(frames[~inside][0])} is not inside any window", where="windows")
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:
     """Compute the displacement curve of a window through values at some frames.
 
-    It is the curve of least bending through values that are smoothed along consecutive frames, and a tense one through
-    the rest.
+    The curve is a sum: the curve of least bending through the smoothed values, and a curve under high tension through
+    the differences between the values and their smoothed version.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Flo
 
 
 def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
-    """Smooth values (n, c) along frames (n,) in a row; constant ones stay, and slopes at the ends are reduced."""
+    """Smooth values (n, c) along consecutive frames (n,); constant values stay, and slopes at the ends decrease."""
     from scipy.ndimage import gaussian_filter1d
 
     rows = np.split(values, np.flatnonzero(np.diff(frames) > 1) + 1)
@@ -156,7 +157,7 @@ def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
 def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Floats:
     """Compute the curve (stop - start, c) of least bending through `values` (n, c) at `frames` (n,).
 
-    Tension keeps it from swinging beyond them over more than about `swing` frames.
+    Tension keeps the curve from overshooting the values for more than about `swing` frames.
     """
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -189,9 +190,9 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:
-    """Lower diagonals (4, count) of the form that measures bending and tension of control points (count,).
+    """Lower diagonals (4, count) of the quadratic form that measures bending and tension of `count` control points.
 
-    Beyond a smooth end all control points are zero, beyond another there are none.
+    Beyond a smooth end all control points are zero; beyond an end that is not smooth there are no control points.
     """
     bands = np.zeros((4, count))
     tension = swing**-2
@@ -211,7 +212,7 @@ def _rotation_vectors(before: Floats, after: Floats) -> Floats:
 
 
 def _continued(values: Floats, joints: int) -> Floats:
-    """Continue rotation vectors (n, 3·joints + 3) beyond half a turn where their neighbours are beyond it."""
+    """Let rotation vectors (n, 3·joints + 3) exceed half a turn where this makes them continuous."""
     vectors = values[:, : 3 * joints].reshape(len(values), joints, 3)
     if np.linalg.norm(vectors, axis=-1).max(initial=0.0) < 0.5 * np.pi:
         return values

@@ -25,7 +25,7 @@ class FinishedMotion:
     ----------
     motion : the whole motion
     residual_before, residual_after : (C,) largest error of each constraint in its frames: metres, or radians
-    far : (C,) positions that were missed by more than `FAR_M` before
+    far : (C,) whether each constraint is a position that was missed by more than `FAR_M` before
     """
 
     motion: Motion

@@ -1,9 +1,9 @@
 """Foot plants: planted feet are fixed to the ground.
 
-A contact of the toe fixes the toe's position; one of the heel fixes the ankle, so that a foot with both is still and
-one with a toe alone rolls about it. The corrections are blended in and out with B-splines. Legs follow in closed form,
-their knees damped near straight; where a leg is too short, the root is lowered a little (Kovar, Schreiner and Gleicher
-2002, Footskate cleanup for motion capture editing).
+A toe contact fixes the position of the toe, and a heel contact fixes the ankle: a foot with both contacts is still, a
+foot with only a toe contact rolls about the toe. The corrections are blended in and out with B-splines. Legs are solved
+in closed form, with damping near straight knees; if a leg is too short, the root is lowered a little (Kovar, Schreiner
+and Gleicher 2002, Footskate cleanup for motion capture editing).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SHORTEST_LOWERING_M = 1e-9
 
 @dataclass(frozen=True)
 class Foot:
-    """One foot: its leg and its toe joint, which is the ankle where there is none."""
+    """One foot: its leg and its toe joint, or the ankle if the skeleton has no toe joint."""
 
     leg: TwoBoneLimb
     toe: int
@@ -52,13 +52,13 @@ class FootContacts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlantedMotion:
-    """A motion whose feet stay where they stand.
+    """A motion whose planted feet do not slide.
 
     Parameters
     ----------
     motion : the whole motion
     contacts : of each foot
-    slide_before_m, slide_after_m : ground that toes cover per contact, mean over contacts; 0 without contacts
+    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 without contacts
     lowered_m : largest distance by which the root is lowered
     """
 
@@ -94,7 +94,7 @@ def plant_feet(
     motion : Motion    F frames
     frame_rate_hz : float    frames per second
     feet : sequence of Foot    leg and toe of each foot
-    contacts : sequence of FootContacts, optional    of each foot; detected by speed when None
+    contacts : sequence of FootContacts, optional    contacts of each foot; detected by speed if None
     options : PlantOptions, optional    limits and transitions
 
     Returns
@@ -111,7 +111,9 @@ def plant_feet(
     for one in contacts:
         if len(one.toe) != motion.frame_count or len(one.heel) != motion.frame_count:
             raise EditError(
-                f"there are flags for {len(one.toe)} frames, the motion has {motion.frame_count}", where="contacts"
+                f"the contacts have {len(one.toe)} and {len(one.heel)} flags (toe, heel), but the motion has "
+                f"{motion.frame_count} frames",
+                where="contacts",
             )
     blend = max(1, round(options.blend_s * frame_rate_hz))
     spins = np.asarray(kinematics.as_global_rotations(skeleton, motion.rotations), dtype=np.float64)
@@ -201,10 +203,10 @@ def _plan(positions: Floats, spins: Floats, foot: Foot, contacts: FootContacts, 
 
 
 def _standing_heels(contacts: FootContacts, blend: int) -> Flags:
-    """Find the frames (F,) in which a heel stays in place, up to the last one before its toe takes a new place.
+    """Find the frames (F,) in which a heel is planted; release it shortly before each new contact of its toe.
 
-    The ankle follows the toe, so that each contact of the toe gives it another place. A heel that stays planted over
-    several contacts of its toe would otherwise jump from one place to the next.
+    The ankle follows the toe, so each toe contact moves the ankle. A heel that is planted over several toe contacts
+    would otherwise jump from one position to the next.
     """
     heel = contacts.heel.copy()
     for (_, lifted), (landed, _) in pairwise(runs(contacts.toe)):
@@ -268,7 +270,7 @@ def _enveloped(values: Floats, blend: int) -> Floats:
 def _with_leg(
     skeleton: Skeleton, planted: Motion, motion: Motion, foot: Foot, plan: _Plan, lowering: Floats, zone: float
 ) -> Motion:
-    """Pose the leg by its plan in the frames in which the plan or the root differs from the motion."""
+    """Move the leg to its planned targets in the frames in which these targets or the root differ from the motion."""
     ankle = foot.leg.end
     now = motion.positions(skeleton)[:, ankle]
     frames = np.flatnonzero((np.abs(plan.ankle - now).max(axis=1) > 0.0) | (lowering > 0.0))

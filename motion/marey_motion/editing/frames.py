@@ -1,4 +1,4 @@
-"""Commands that change the frames of a take: cut, joined, resampled or retimed."""
+"""Commands that cut, join, resample or retime a take."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def trim(take: Take, command: Trim) -> Take:
 
     Raises
     ------
-    EditError    if they do not exist
+    EditError    if the frames do not exist
     """
     first, last = take.frames((command.start, command.stop))
     return take.moved(take.motion.sliced(first, last))
@@ -75,7 +75,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
 def concatenate(take: Take, command: Concatenate) -> Take:
     """Append a clip of the same skeleton, at this motion's frame rate.
 
-    Where hips are translated under a root that is a static reference, their travel is merged into that of the root.
+    If the root is a static reference and the hips below it are translated, their travel is merged into the root's.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
 
     Raises
     ------
-    EditError    for an unknown source, another skeleton, and a result that is too long
+    EditError    if the source is unknown or has another skeleton, or if the result is too long
     MotionError    if the body has no facing direction at the seam
     """
     added = _same_rate(take, command.source)
@@ -111,7 +111,7 @@ def _same_rate(take: Take, source: str) -> Take:
     clip = take.source(source)
     if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
         raise EditError(
-            f"the clip {source} moves another skeleton; retarget it first", code="other-skeleton", where="source"
+            f"the clip {source} has another skeleton; retarget it first", code="other-skeleton", where="source"
         )
     count = count_samples(clip.frame_count, clip.frame_rate_hz, take.frame_rate_hz)
     take.require_room(take.frame_count + count)
@@ -119,7 +119,7 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """Find the move on the ground by which one clip continues the other; in an overlap their middles meet."""
+    """Find the turn and shift on the ground that attach one clip to the other; overlaps are matched at the middle."""
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2
         (target,), (wanted,) = body_track(before, there, there + 1)
@@ -134,7 +134,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 
 
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
-    """Join two motions, blended over `count` frames that overlap or not; 0 for a hard cut."""
+    """Join two motions, blended over `count` frames, with or without overlap; 0 makes a hard cut."""
     if overlap:
         return _faded_over(first, second, overlap)
     return _in_a_row(first, _inertialised(first, second, count, frame_rate_hz) if count else second)
@@ -158,7 +158,7 @@ def _in_a_row(first: Motion, second: Motion) -> Motion:
 
 
 def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
-    """Join two motions; the last frames of the one fade into the first frames of the other."""
+    """Join two motions; the last frames of the first fade into the first frames of the second."""
     share = smooth_step(np.arange(1, overlap + 1) / (overlap + 1))
     end, start = slice(first.frame_count - overlap, None), slice(None, overlap)
     middle = first._replace(
@@ -173,7 +173,7 @@ def _faded_over(first: Motion, second: Motion, overlap: int) -> Motion:
 
 
 def resample(take: Take, command: Resample) -> Take:
-    """Sample the motion at another rate, first frames coinciding.
+    """Sample the motion at another frame rate; the first frame stays the same.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def resample(take: Take, command: Resample) -> Take:
 
     Raises
     ------
-    EditError    if it becomes too long
+    EditError    if the result is too long
     """
     rate_hz = command.frame_rate_hz
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, rate_hz))
@@ -208,7 +208,7 @@ def retime(take: Take, command: Retime) -> Take:
 
     Raises
     ------
-    EditError    if it becomes too long
+    EditError    if the result is too long
     """
     slowed_hz = take.frame_rate_hz / command.speed
     take.require_room(count_samples(take.frame_count, take.frame_rate_hz, slowed_hz))

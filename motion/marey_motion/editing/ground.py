@@ -25,9 +25,9 @@ class Ground(NamedTuple):
 
     Parameters
     ----------
-    height_m : metres
-    standing_frames : number of frames with a foot in stance, from which the height is estimated; with 0, the height is
-        that of the feet in the lowest frames
+    height_m : height of the ground, metres
+    standing_frames : number of frames with a foot in stance, from which the height is estimated; if 0, the height is
+        estimated from the feet in the lowest frames
     """
 
     height_m: float
@@ -40,7 +40,7 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : MoveToGround    height of the ground, which is estimated and recorded where it is None
+    command : MoveToGround    height of the ground; if None, it is estimated and recorded
 
     Returns
     -------
@@ -111,9 +111,9 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 
 
 def estimate_ground(take: Take) -> Ground:
-    """Estimate the ground as the median height of the lower foot's sole over the frames in which that foot is planted.
+    """Estimate the height of the ground as the median height of the lower sole while that foot is planted.
 
-    Neither a foot below the floor for some frames nor a kick that is held changes it.
+    The median is robust against a foot that is below the floor for some frames and against a kick that is held.
 
     Parameters
     ----------

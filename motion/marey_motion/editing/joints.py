@@ -1,4 +1,4 @@
-"""Commands on single joints: rotated, or replaced by those of another clip."""
+"""Commands that rotate single joints or replace their motion by that of another clip."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def paste(take: Take, command: Paste) -> Take:
     Raises
     ------
     UnknownJoint    naming a joint that does not exist
-    EditError    for an unknown source, frames that do not exist, and joints whose axes differ in the two skeletons
+    EditError    if the source or the frames do not exist, or if the axes of a joint differ in the two skeletons
     """
     clip = take.source(command.source)
     targets = sorted({take.joint(name) for name in command.joints})
@@ -66,7 +66,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
     odd = np.flatnonzero(apart > SAME_AXES_RAD)
     if odd.size:
         raise EditError(
-            "the joint has another orientation in the rest pose of the source's skeleton; retarget the source first",
+            "the joint's orientation in the rest pose differs between the two skeletons; retarget the source first",
             code="other-axes",
             where=f"joint {target.joint_names[joints[int(odd[0])]]}",
         )
@@ -74,7 +74,7 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
 
 
 def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, count: int) -> Motion:
-    """Take a range of frames of a clip, stretched to `count` of them. Raises `EditError` where the clip lacks them."""
+    """Resample a range of a clip to `count` frames. Raises `EditError` if the clip lacks the frames."""
     try:
         start, stop = take.moved(motion_of(clip)).frames(frames)
     except EditError as error:
@@ -85,21 +85,21 @@ def _stretched(take: Take, clip: Clip, frames: tuple[int, int | None] | None, co
 
 
 def _with_more_translations(take: Take, targets: Sequence[int], origins: Sequence[int], copied: Motion) -> Motion:
-    """Add translations for joints that have none here, but have some in the source."""
+    """Add translations for joints that are translated in the source only."""
     added = (target for target, origin in zip(targets, origins, strict=True) if origin in copied.translated_joints)
     joints = tuple(sorted({*take.motion.translated_joints, *added}))
     return translated(take.motion, take.skeleton, joints)
 
 
 def _translations_of(motion: Motion, joint: int, offset: Floats) -> Floats:
-    """Return translations (n, 3) of a joint, or its offset (3,) where it has none."""
+    """Return the translations (n, 3) of a joint, or its offset (3,) if it has none."""
     if joint not in motion.translated_joints:
         return offset
     return motion.translations[:, motion.translated_joints.index(joint)]
 
 
 def rotate_joint(take: Take, command: RotateJoint) -> Take:
-    """Rotate a joint by an angle, growing over the borders.
+    """Rotate a joint by an angle that is blended in and out over the borders of the range.
 
     Parameters
     ----------

@@ -18,16 +18,16 @@ FEWEST_FRAMES = 4
 
 
 def close_loop(take: Take, command: CloseLoop) -> Take:
-    """Make the last frame lead into the first one, elsewhere on the ground where the clip travels.
+    """Make the last frame lead into the first frame, which may be elsewhere on the ground if the clip travels.
 
-    Where hips are translated under a root that is a static reference, their travel is merged into that of the root. The
-    difference between the end and the start, in pose and velocity, is shared: half decays from the start onwards, half
-    from the end backwards.
+    The difference in pose and velocity between end and start is distributed: half of it decays from the start onwards,
+    half from the end backwards. If the root is a static reference and the hips below it are translated, their travel is
+    merged into the root's.
 
     Parameters
     ----------
     take : Take    F frames
-    command : CloseLoop    whether to remove travel and turn of the round first, the same share per frame, and the
+    command : CloseLoop    whether to first remove the travel and turn of one cycle, evenly over its frames, and the
         duration of the blend
 
     Returns
@@ -36,12 +36,14 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
 
     Raises
     ------
-    EditError    for fewer than four frames
+    EditError    if there are fewer than four frames
     MotionError    if the body never has a facing direction
     """
     frames = take.frame_count
     if frames < FEWEST_FRAMES:
-        raise EditError(f"a loop needs at least {FEWEST_FRAMES} frames, there are {frames}", code="frames-missing")
+        raise EditError(
+            f"a loop needs at least {FEWEST_FRAMES} frames, but the clip has {frames}", code="frames-missing"
+        )
     places, headings = body_track(take, 0, frames)
     seam = loop_seam(places[:, [0, 2]], headings)
     body, carrier = take.skeleton, take.body.carrier
@@ -58,7 +60,7 @@ def close_loop(take: Take, command: CloseLoop) -> Take:
 
 
 def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
-    """Remove travel and turn of a round, given pelvis positions (F, 3); each frame turns about its own position."""
+    """Remove travel and turn of one cycle, given pelvis positions (F, 3); each frame turns about its own position."""
     shares = np.arange(motion.frame_count) / motion.frame_count
     start = places[0, [0, 2]]
     travel = rotated(start, seam.turn_rad) + seam.shift_m - start

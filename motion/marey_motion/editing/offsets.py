@@ -1,8 +1,8 @@
 """Offsets between poses that decay over time: blending by inertialisation.
 
-An offset x with velocity v decays to nothing over T frames as the quintics that begin with position x, velocity v and
-no acceleration, and end without any of them (after Bollo 2018, "Inertialization", there with the acceleration of the
-source). With s = t/T they are x·(1-s)³·(1+3s+6s²) and v·t·(1-s)³·(1+3s).
+An offset x with velocity v decays to zero over T frames. The decay is the quintic with position x, velocity v and
+acceleration 0 at the start, and with all three 0 at the end: x·(1-s)³·(1+3s+6s²) + v·t·(1-s)³·(1+3s) with s = t/T. This
+follows Bollo (2018), "Inertialization", who also uses the acceleration of the source.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PoseOffset(NamedTuple):
     Parameters
     ----------
     root : (..., 3) float64    metres
-    turns : (..., J, 3) float64    rotation vectors in the parents' axes, radians
+    turns : (..., J, 3) float64    rotation vectors in the axes of each joint's parent, radians
     translations : (..., k, 3) float64    metres
     """
 
@@ -62,7 +62,7 @@ class PoseOffset(NamedTuple):
         return PoseOffset(self.root - other.root, self.turns - other.turns, self.translations - other.translations)
 
     def turned(self, angle_rad: float) -> PoseOffset:
-        """Rotate the offset with the world about the vertical: only the root's part is given in the world's axes.
+        """Rotate the offset about the vertical; this changes only the root's part, which is in world axes.
 
         Parameters
         ----------
@@ -80,13 +80,13 @@ class PoseOffset(NamedTuple):
 
 
 def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> PoseOffset:
-    """Compute the offset from a frame of a motion to a frame of another one of the same joints.
+    """Compute the offset from a frame of a motion to a frame of another motion of the same joints.
 
     Parameters
     ----------
     motion : Motion    the motion
     frame : int    its frame
-    other : Motion    the other one
+    other : Motion    the other motion
     other_frame : int    its frame
 
     Returns
@@ -118,10 +118,10 @@ def step_of(motion: Motion, frame: int) -> PoseOffset:
 
 
 def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
-    """Compute the offset that continues a motion in the start of another, and its change per frame.
+    """Compute the offset that, added to the start of a motion, continues another one, and its change per frame.
 
-    The step over the seam is in neither motion: it is taken as the mean of its neighbours, half of whose difference is
-    left to the frames that follow.
+    The step across the seam belongs to neither motion. It is estimated as the mean of the last step before and the
+    first step after the seam.
 
     Parameters
     ----------
@@ -163,14 +163,14 @@ def add_offset(motion: Motion, frames: NDArray[np.int64], offset: PoseOffset) ->
 
 
 def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: float, velocity_life: float) -> PoseOffset:
-    """Compute the decay of an offset and of its velocity.
+    """Compute an offset that decays over time, from its initial value and velocity.
 
     Parameters
     ----------
     offset : PoseOffset    of one pose
     velocity : PoseOffset    per frame
     ages : (n,) float64    frames since the start
-    life, velocity_life : float    frames after which nothing is left of either
+    life, velocity_life : float    frames after which the part of the initial value, and that of the velocity, is zero
 
     Returns
     -------

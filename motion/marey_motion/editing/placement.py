@@ -1,4 +1,4 @@
-"""Commands that move, rotate, scale or mirror the whole body, and spread a correction of its path over frames."""
+"""Commands that move, rotate, scale or mirror the whole body, or spread a correction of its path over frames."""
 
 from __future__ import annotations
 
@@ -99,9 +99,9 @@ def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
 
 
 def scale(take: Take, command: Scale) -> Take:
-    """Scale the path of the body about the origin, heights too.
+    """Scale the positions of the body's path about the origin, including heights.
 
-    The skeleton is another item and does not change, so that the strides of a scaled path fit another body's legs.
+    The skeleton does not change, so a scaled path can fit the strides of a larger or smaller body.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def scale(take: Take, command: Scale) -> Take:
 def flip_axes(take: Take, command: FlipAxes) -> Take:
     """Rotate the world so that one axis becomes +y and another +z.
 
-    Only rotations: a world of the other hand is a mirror image, which `mirror` makes.
+    Only rotations are possible; a change of handedness is a reflection, see `mirror`.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def _direction(axis: SignedAxis) -> Floats:
 
 
 def mirror(take: Take, _command: Mirror) -> Take:
-    """Reflect the motion in x, by the skeleton's own pairs of joints, whatever their names and axes.
+    """Reflect the motion in x and exchange the joints of left and right; names and axes of joints do not matter.
 
     Parameters
     ----------
@@ -280,9 +280,9 @@ def mirror(take: Take, _command: Mirror) -> Take:
 
 
 def fix_drift(take: Take, command: FixDrift) -> Take:
-    """Spread a shift and a turn about the vertical over a range: none of it in its first frame, all in its last.
+    """Spread a shift and a turn about the vertical over a range, from none in its first to all in its last frame.
 
-    Within the range each frame turns about its own pelvis; the frames after it follow the last one rigidly.
+    Within the range, each frame turns about its own pelvis. The frames after the range move rigidly with its last one.
 
     Parameters
     ----------
@@ -295,12 +295,12 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
 
     Raises
     ------
-    EditError    if the frames do not exist or are only one
+    EditError    if the frames do not exist or the range is a single frame
     """
     start, stop = take.frames(command.frames)
     if stop - start < 2:
         raise EditError(
-            f"drift is spread over at least 2 frames; {start}:{stop} is one",
+            f"the range must have at least 2 frames to spread the drift over, but {start}:{stop} has one",
             code="frames-missing",
             where="frames",
         )

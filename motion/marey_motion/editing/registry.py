@@ -1,7 +1,7 @@
 """Every command by its name, and lists of commands applied to clips.
 
-A command is a model of `marey_schemas.editing`, which declares its parameters. The function of its name takes a take
-and the command, and returns one take or several. It is pure: the same take and command give the same bytes.
+A command is a model of `marey_schemas.editing`, which declares its parameters. The function of the same name receives a
+take and the command, and returns one or more takes. It is pure: the same take and command give the same bytes.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class EditedClip:
     Parameters
     ----------
     clip : the motion
-    pieces : which piece it is, from 1, of each split it went through
-    findings : what commands found out
+    pieces : number of its piece, from 1, in each split that was applied
+    findings : findings of the commands
     """
 
     clip: Clip
@@ -85,7 +85,7 @@ def edit_clip(
 ) -> tuple[EditedClip, ...]:
     """Apply commands to a clip.
 
-    Computed in double precision throughout and rounded once, at the end.
+    The computation is in double precision and rounded to single precision once, at the end.
 
     Parameters
     ----------
@@ -93,12 +93,12 @@ def edit_clip(
     commands : sequence of commands    in order; after a split, the rest applies to each piece
     body : EditedBody, optional    joints of the skeleton; by default inferred from names and build
     sources : mapping of str to Clip, optional    other clips by the names that the commands use
-    most_numbers : int    largest size of the motion
+    most_numbers : int    largest number of values that the motion may have
     most_work : float    largest work of all commands together, in nanoseconds of one thread (`compute_budget`)
 
     Returns
     -------
-    tuple of EditedClip    one, or several if it was split
+    tuple of EditedClip    one, or several if the clip was split
 
     Raises
     ------
@@ -113,7 +113,8 @@ def edit_clip(
     for number, command in enumerate(commands):
         if not isinstance(command, NamedCommand):
             raise EditError(
-                f"a {type(command).__name__} is not a command; `EditDocument.model_validate` makes one of a document",
+                f"an object of type {type(command).__name__} is not a command; read documents with "
+                "`EditDocument.model_validate`",
                 code="command-invalid",
                 where=f"commands[{number}]",
             )
@@ -129,7 +130,7 @@ def edit_clip(
 
 
 def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip:
-    """Apply commands that return a single clip, as `edit_clip`.
+    """Apply commands to a clip like `edit_clip`, and return the only result.
 
     Parameters
     ----------
@@ -143,11 +144,11 @@ def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip
 
     Raises
     ------
-    EditError    if there are several
+    EditError    if the commands make several clips
     """
     edited = edit_clip(clip, commands, **given)
     if len(edited) > 1:
-        raise EditError(f"the commands make {len(edited)} clips of one", code="several-clips")
+        raise EditError(f"the commands return {len(edited)} clips instead of one; use edit_clip", code="several-clips")
     return edited[0].clip
 
 
@@ -165,7 +166,7 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
 
     Raises
     ------
-    MotionError    if it cannot be applied
+    MotionError    if the command cannot be applied
     """
     take.budget.spend(PER_COMMAND + PER_NUMBER * _size_for(take, command))
     made = COMMANDS[command.command](take, command)
@@ -173,13 +174,13 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
 
 
 def _size_for(take: Take, command: AnyCommand) -> int:
-    """Count the numbers that a command works on: of the take, and of the clip that it names."""
+    """Count the values that a command processes: those of the take and of the clip that the command names."""
     other = take.sources.get(command.source) if isinstance(command, Concatenate | Paste) else None
     return take.size + (0 if other is None else other.poses.size)
 
 
 def _settled(take: Take, before: Motion) -> Take:
-    """Normalise rotations to unit length and continuous sign; frames that the command left alone are so already."""
+    """Check that changed numbers are finite, and normalise changed rotations to unit length and continuous sign."""
     motion = take.motion
     if motion.root_translations is not before.root_translations:
         require_finite(motion.root_translations)

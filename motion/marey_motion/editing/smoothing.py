@@ -24,11 +24,11 @@ LEAST_LENGTH = 0.1
 
 
 def smooth(take: Take, command: Smooth) -> Take:
-    """Average the joints' rotations and translations and the root's path over time, with weights.
+    """Replace the joints' rotations and translations and the root's path by weighted averages over time.
 
-    No frame is lost: beyond its ends a motion continues as its own reflection through its end poses, which leaves the
-    first and the last frame, and straight paths, exactly as they are. Rotations are averaged as quaternions of
-    continuous sign and brought back to unit length.
+    No frame is lost: beyond its ends, the motion is continued by its point reflection through the end poses, so that
+    the first and the last frame, and straight paths, do not change. Rotations are averaged as quaternions of continuous
+    sign and normalised.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
 
 
 def _reflected(end: Floats, rotations: Floats) -> Floats:
-    """Reflect rotations (n, J, 4) at those of an end frame (J, 4): the same angle in the opposite direction."""
+    """Reflect rotations (n, J, 4) through those of an end frame (J, 4): the same angle in the opposite direction."""
     back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
     return np.asarray(back, dtype=np.float64)
 

@@ -43,12 +43,12 @@ class EditedBody:
 
     @cached_property
     def mapping(self) -> JointMapping:
-        """Joint by standard name."""
+        """Joint name by standard name."""
         return self.find_mapping(self.skeleton)
 
     @cached_property
     def partners(self) -> NDArray[np.int32]:
-        """Index (J,) of each joint's partner on the other side; its own index for joints of the centre."""
+        """Index (J,) of each joint's partner on the other side of the body; joints in the middle have their own."""
         return symmetric_joints(self.skeleton, self.mapping)
 
     @cached_property
@@ -58,7 +58,7 @@ class EditedBody:
 
     @cached_property
     def carrier(self) -> int:
-        """The joint that carries all of the body (`MatchingBody.carrier`); the root where the body is not known."""
+        """The joint that carries the whole body (`MatchingBody.carrier`); the root if no joints are mapped."""
         try:
             return self.matching.carrier
         except MappingError:
@@ -92,11 +92,11 @@ class Take:
     ----------
     motion : the frames
     frame_rate_hz : frames per second
-    body : what moves
-    sources : other clips that commands name
-    findings : what commands found out so far
-    pieces : for each split that this take went through, which of its pieces it is, from 1
-    most_numbers : numbers that its motion may grow to
+    body : the skeleton and its standard joints
+    sources : other clips, by the names that commands use
+    findings : findings of the commands so far
+    pieces : number of its piece, from 1, in each split that was applied
+    most_numbers : largest number of values that the motion may have
     budget : remaining work of the whole edit
     """
 
@@ -121,7 +121,7 @@ class Take:
 
     @property
     def size(self) -> int:
-        """Numbers of the motion."""
+        """Number of values in the motion's arrays."""
         motion = self.motion
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
@@ -168,7 +168,7 @@ class Take:
         """
         if name not in self.sources:
             known = ", ".join(sorted(self.sources)) or "none"
-            raise EditError(f"no source is called {name!r}; there is {known}", code="source-missing", where="source")
+            raise EditError(f"no source is called {name!r}; known are: {known}", code="source-missing", where="source")
         return self.sources[name]
 
     def frames(self, bounds: tuple[int, int | None] | None) -> tuple[int, int]:
@@ -190,7 +190,8 @@ class Take:
         stop = self.frame_count if stop is None else stop
         if not 0 <= start < stop <= self.frame_count:
             raise EditError(
-                f"the frames {start}:{stop} are outside the clip, which has {self.frame_count}", code="frames-missing"
+                f"the frames {start}:{stop} are not a range within the clip's {self.frame_count} frames",
+                code="frames-missing",
             )
         return start, stop
 
@@ -239,7 +240,7 @@ class Take:
         most = self.most_numbers // width
         if frames > most:
             raise EditError(
-                f"the result would have {frames:,} frames; with this skeleton {most:,} are possible",
+                f"the result would have {frames:,} frames; the limit for this skeleton is {most:,}",
                 code="edit-too-large",
             )
         self.budget.spend(PER_NUMBER * width * frames)
@@ -282,7 +283,7 @@ def settled(motion: Motion) -> Motion:
 
     Raises
     ------
-    EditError    for rotations that are not finite
+    EditError    if a rotation is not finite
     """
     rotations = motion.rotations
     squares = np.einsum("fjc,fjc->fj", rotations, rotations)
@@ -306,8 +307,8 @@ def require_finite(numbers: Floats) -> None:
 
     Raises
     ------
-    EditError    naming the first frame with another one
+    EditError    naming the first frame with a number that is not finite
     """
     if not np.isfinite(numbers).all():
         frame = int(np.argmin(np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)))
-        raise EditError(f"frame {frame} gets a number that is not finite", code="edit-not-finite")
+        raise EditError(f"the result contains a number in frame {frame} that is not finite", code="edit-not-finite")

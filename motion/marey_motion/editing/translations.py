@@ -9,7 +9,7 @@ from marey_motion.skeleton import Skeleton
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:
-    """Add translations for more joints, from their offsets.
+    """Add translations for more joints, equal to their offsets.
 
     Parameters
     ----------

@@ -114,7 +114,7 @@ def test_keyframes_of_annotations_are_matched_and_become_those_of_the_set(lab: P
 
 def test_the_command_tells_costs_slopes_and_refusals(lab: ProjectHandle, run: CommandLine) -> None:
     told = run("align", "lab/walks", "--into", "aligned", "--reference", "lab/walks/walk c", status=1)
-    assert "walks/blink: it has 3 frames" in told.stderr
+    assert "walks/blink: the clip has 3 frames" in told.stderr
     assert "reference" in next(line for line in told.stdout.splitlines() if "walk c" in line)
     assert "5 clips of" in told.stdout
 

@@ -92,9 +92,9 @@ def test_turns_through_half_a_turn_go_on_and_do_not_swing_back() -> None:
 
 def test_windows_that_do_not_hold_the_frames_are_refused(walk: Motion) -> None:
     wanted = walk.at_frames(np.array([20]))
-    with pytest.raises(EditError, match="holds no given frame"):
+    with pytest.raises(EditError, match="contains no changed frame"):
         displace(walk, np.array([20]), wanted, (Window(30, 40),))
-    with pytest.raises(EditError, match="holds no given frame"):
+    with pytest.raises(EditError, match="contains no changed frame"):
         displace(walk, np.array([20]), wanted, (Window(20, 30),))
     two = walk.at_frames(np.array([20, 50]))
     with pytest.raises(EditError, match="frame 50"):

@@ -36,13 +36,13 @@ def test_splitting_a_segment_keeps_every_frame_of_it_the_last_one_too() -> None:
 
 
 def test_a_segment_is_not_split_before_its_first_frame() -> None:
-    with pytest.raises(AnnotationError, match=r"segment 'right' 10:18: it starts at frame 10") as refused:
+    with pytest.raises(AnnotationError, match=r"segment 'right' 10:18: the segment starts at frame 10") as refused:
         annotations.split_segment(WALK, 10, None)
     assert refused.value.code == "empty-segment"
 
 
 def test_a_new_segment_over_others_is_refused_by_the_name_of_the_first_in_the_way() -> None:
-    with pytest.raises(AnnotationError, match=r"'turn' 16:24: segment 'right' 10:18 overlaps it"):
+    with pytest.raises(AnnotationError, match=r"'turn' 16:24: the new segment overlaps segment 'right' 10:18"):
         annotations.create_segment(WALK, "turn", 16, 24, overwrite=False)
 
 
@@ -66,7 +66,7 @@ def test_merging_takes_the_gap_along_and_the_label_of_the_one_that_was_named() -
     assert annotations.merge_segment(WALK, 12, "previous").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 12, "nearest").segments[0] == Segment("right", 5, 18)
     assert annotations.merge_segment(WALK, 29, "nearest").segments[-1] == Segment("stand", 10, 30)
-    with pytest.raises(AnnotationError, match="'left' 5:10: it has no previous segment") as refused:
+    with pytest.raises(AnnotationError, match="'left' 5:10: the segment has no previous neighbour") as refused:
         annotations.merge_segment(WALK, 5, "previous")
     assert refused.value.code == "no-neighbour"
 
@@ -97,7 +97,7 @@ def test_a_neighbour_across_a_gap_gives_way_only_where_it_must() -> None:
 
 
 def test_a_boundary_does_not_pass_the_other_end_of_its_segment() -> None:
-    with pytest.raises(AnnotationError, match="with its start at 18 it would have no frames"):
+    with pytest.raises(AnnotationError, match="with its start at frame 18, the segment would have no frames"):
         annotations.move_boundary(WALK, 15, "start", 18)
 
 
@@ -138,7 +138,7 @@ def test_what_was_cleared_is_empty() -> None:
 
 
 def test_a_layer_cannot_hold_overlapping_segments() -> None:
-    with pytest.raises(AnnotationError, match=r"'b' 4:6: segment 'a' 0:5 overlaps it") as refused:
+    with pytest.raises(AnnotationError, match=r"'b' 4:6: the segment overlaps segment 'a' 0:5") as refused:
         Layer(FRAMES, (Segment("b", 4, 6), Segment("a", 0, 5)))
     assert refused.value.code == "segments-overlap"
 
@@ -146,7 +146,7 @@ def test_a_layer_cannot_hold_overlapping_segments() -> None:
 def test_a_piece_knows_its_own_segment_and_the_keyframes_within_it() -> None:
     piece = piece_of(WALK, WALK.segments[1], 6, 20)
     assert piece == Layer(14, (Segment("right", 4, 12),), (Keyframe("lift", 7), Keyframe("strike", 7)))
-    with pytest.raises(AnnotationError, match="the frames 11:20 of 30 do not contain it"):
+    with pytest.raises(AnnotationError, match="the frames 11:20 of the clip's 30 do not contain this segment"):
         piece_of(WALK, WALK.segments[1], 11, 20)
 
 

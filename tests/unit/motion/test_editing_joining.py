@@ -107,12 +107,12 @@ def test_a_pose_can_be_appended_to_a_pose() -> None:
 def test_clips_of_other_skeletons_are_refused() -> None:
     stranger = game_skeleton()
     pose = np.concatenate((stranger.offsets[0], stranger.rest_rotations.ravel())).astype(np.float32)
-    with pytest.raises(EditError, match="moves another skeleton; retarget it first"):
+    with pytest.raises(EditError, match="has another skeleton; retarget it first"):
         join(make_walk(), Clip(stranger, 60.0, pose[None]))
 
 
 def test_unknown_sources_are_told_with_those_that_there_are() -> None:
-    with pytest.raises(EditError, match=r"no source is called 'third'; there is second"):
+    with pytest.raises(EditError, match=r"no source is called 'third'; known are: second"):
         apply_edit(make_walk(), [Concatenate(source="third")], sources={"second": make_walk()})
 
 

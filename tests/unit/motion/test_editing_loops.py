@@ -72,7 +72,7 @@ def test_what_loops_already_hardly_changes() -> None:
 
 
 def test_a_loop_needs_some_frames() -> None:
-    with pytest.raises(EditError, match="at least 4 frames, there are 3"):
+    with pytest.raises(EditError, match="at least 4 frames, but the clip has 3"):
         apply_edit(make_walk().sliced(0, 3), [CloseLoop()])
     assert apply_edit(make_walk().sliced(0, 4), [CloseLoop()]).frame_count == 4
 

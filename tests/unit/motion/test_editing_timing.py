@@ -46,7 +46,7 @@ def test_there_and_back_is_nearly_the_motion() -> None:
 @pytest.mark.parametrize("command", [Resample(frame_rate_hz=100_000.0), Retime(speed=0.01)])
 def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: Resample | Retime) -> None:
     walk = make_walk()
-    with pytest.raises(EditError, match="frames; with this skeleton") as refused:
+    with pytest.raises(EditError, match="frames; the limit for this skeleton") as refused:
         apply_edit(walk, [command], most_numbers=10 * walk.poses.size)
     assert refused.value.code == "edit-too-large"
 

@@ -68,21 +68,21 @@ def test_sections_that_stand_as_text_are_read_all_the_same() -> None:
 
 def test_sections_that_share_their_ends_are_refused_with_a_hint() -> None:
     document = {"sections": [{"start_idx": 0, "end_idx": 10}, {"start_idx": 10, "end_idx": 20}]}
-    with pytest.raises(FormatError, match=r"'section 2' 10:21: segment 'section 1' 0:11.*exclusive"):
+    with pytest.raises(FormatError, match=r"'section 2' 10:21: the segment overlaps .*exclusive"):
         read(document)
     assert len(read(document, end_index="exclusive").segments) == 2
 
 
 def test_sections_that_share_more_than_their_ends_are_refused_without_the_hint() -> None:
     document = {"sections": [{"start_idx": 0, "end_idx": 10}, {"start_idx": 9, "end_idx": 20}]}
-    with pytest.raises(FormatError, match="overlaps it") as refused:
+    with pytest.raises(FormatError, match="the segment overlaps") as refused:
         read(document)
     assert "exclusive" not in str(refused.value)
 
 
 def test_labels_that_overlap_can_be_read_one_by_one() -> None:
     document = {"semantic_annotation": {"left": [1, 2, 3], "both": [3, 4]}}
-    with pytest.raises(FormatError, match="overlaps it") as refused:
+    with pytest.raises(FormatError, match="the segment overlaps") as refused:
         read(document)
     assert refused.value.code == "segments-overlap"
     assert read(document, labels=["both"]).segments == (Segment("both", 3, 5),)
@@ -96,12 +96,12 @@ def test_labels_that_overlap_can_be_read_one_by_one() -> None:
         ({"sections": [{"start_idx": 1}]}, "'end_idx' must be int"),
         ({"sections": {"a": {"start_idx": 1}}}, "'a' must be list"),
         ({"sections": "{"}, "'sections' cannot be read"),
-        ({"sections": [{"start_idx": 1, "end_idx": 99}]}, "the clip has the frames 0:40"),
-        ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "its end must be after its start"),
+        ({"sections": [{"start_idx": 1, "end_idx": 99}]}, "within the clip's frames 0:40"),
+        ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "the end of a segment must be after its start"),
         ({"semantic_annotation": {"a": [1.5]}}, "whole numbers"),
         ({"semantic_annotation": {"a": ["x"]}}, "'a'"),
         ({"semantic_annotation": {"a": [True]}}, "list of frames"),
-        ({"semantic_annotation": {"a": [-3]}}, "the clip has the frames 0:40"),
+        ({"semantic_annotation": {"a": [-3]}}, "within the clip's frames 0:40"),
         ({"semantic_annotation": {"a": [10**400]}}, "'a'"),
         ({"sections": [], "keyframes": [3]}, "'keyframes' must be dict"),
     ],

@@ -229,7 +229,7 @@ def test_a_job_that_is_left_with_one_clip_says_why_the_others_do_not_fit(project
     project.inputs["clips"] = project.inputs["clips"][4:]
     refused = refusal(project)
     assert refused.code == "too-few-clips"
-    assert "1 of 4 clips are left" in refused.detail
+    assert "only 1 of 4 clips can be aligned" in refused.detail
 
 
 def test_clips_of_which_none_is_annotated_are_refused_with_the_first_reason(project: Project) -> None:

@@ -46,10 +46,10 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 
 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
-    """Compute the speed of the slowest of a foot's points, without outliers.
+    """Compute the speed of the slowest point of a foot, without outliers.
 
-    While a foot rolls, its heel turns about the planted point and its toe is still, or the other way round: the slower
-    of ankle and toe stays slow from the strike of the heel until the toe leaves the ground.
+    While a foot rolls, either its heel or its toe is still. The slower of ankle and toe therefore stays slow from heel
+    strike to toe off.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ def _with_hysteresis(values: Floats, low: float, high: float) -> NDArray[np.bool
 
 
 def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool_]:
-    """Remove short runs; those at the ends may continue outside, and stay.
+    """Remove short runs of equal states. Runs at either end are kept, since they may continue outside the clip.
 
     Parameters
     ----------
     states : (F,) bool    states
-    shortest : float    frames; shorter runs are inverted
+    shortest : float    frames; runs shorter than this are inverted
 
     Returns
     -------
@@ -98,7 +98,7 @@ def without_short(states: NDArray[np.bool_], shortest: float) -> NDArray[np.bool
 
 
 def runs(states: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """List the ranges in which states are true.
+    """List the ranges of frames in which `states` is true.
 
     Parameters
     ----------

@@ -41,9 +41,9 @@ class Keyframe(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """Segments in the order of time and without overlap, and keyframes in the order of time, of a clip of F frames.
+    """Segments, which do not overlap, and keyframes of a clip, both sorted by time.
 
-    Two keyframes may share a frame under different labels. Segments and keyframes given in another order are sorted.
+    Two keyframes may share a frame if their labels differ. Segments and keyframes may be given in any order.
 
     Raises
     ------
@@ -58,7 +58,7 @@ class Layer:
         object.__setattr__(self, "segments", tuple(sorted(self.segments, key=lambda one: (one.start, one.end))))
         object.__setattr__(self, "keyframes", tuple(sorted(self.keyframes, key=lambda one: (one.frame, one.label))))
         if self.frame_count < 1:
-            raise AnnotationError("a clip without frames has nothing to annotate", code="no-frames")
+            raise AnnotationError("a clip without frames cannot be annotated", code="no-frames")
         _require_segments(self.segments, self.frame_count)
         _require_keyframes(self.keyframes, self.frame_count)
 
@@ -69,7 +69,7 @@ class Layer:
         return index
 
     def _among(self, start: int, end: int) -> tuple[int, int]:
-        """Find the range of the segments that share frames with [start, end), or the place to insert one."""
+        """Find the indices of the segments that overlap [start, end); an empty range is where to insert a new one."""
         first = bisect_right(self.segments, start, key=_end)
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
@@ -81,7 +81,7 @@ class Layer:
         return self._changed((*self.segments[:first], *segments, *self.segments[stop:]), self.keyframes)
 
     def _place_of(self, keyframe: Keyframe) -> int:
-        """Find the place of a keyframe in order."""
+        """Find the index at which a keyframe is, or would be inserted, in the order of time."""
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def _with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
@@ -110,7 +110,7 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     layer : Layer    the layer
     label : str    its label
     start, end : int    its frames
-    overwrite : bool    shorten or remove existing segments in its place, else they are an error
+    overwrite : bool    whether to shorten or remove segments that overlap; if False, an overlap is an error
 
     Returns
     -------
@@ -124,7 +124,11 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     first, stop = layer._among(start, end)
     covered = layer.segments[first:stop]
     if covered and not overwrite:
-        raise _wrong(made, "segments-overlap", f"{covered[0]} overlaps it; set overwrite, or move that segment first")
+        raise _wrong(
+            made,
+            "segments-overlap",
+            f"the new segment overlaps {covered[0]}; set overwrite, or move that segment first",
+        )
     _require_segments((made,), layer.frame_count)  # what is no segment must not cut others
     before = [one._replace(end=start) for one in covered if one.start < start]
     after = [one._replace(start=end) for one in covered if one.end > end]
@@ -152,13 +156,13 @@ def remove_segment(layer: Layer, at: int) -> Layer:
 
 
 def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
-    """Cut the segment that holds a frame in two, of which the second starts there.
+    """Cut a segment in two at a frame, which becomes the first frame of the second part.
 
     Parameters
     ----------
     layer : Layer    the layer
     at : int    first frame of the second part
-    label : str or None    label of the second part; the same when None
+    label : str or None    label of the second part; None keeps the segment's label
 
     Returns
     -------
@@ -171,15 +175,15 @@ def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
     index = layer._index_at(at)
     segment = layer.segments[index]
     if at == segment.start:
-        raise _wrong(segment, "empty-segment", f"it starts at frame {at}; split it at a later frame")
+        raise _wrong(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
     rest = Segment(segment.label if label is None else label, at, segment.end)
     return layer._with(index, index + 1, segment._replace(end=at), rest)
 
 
 def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"]) -> Layer:
-    """Merge the segment that holds a frame with a neighbour, under its own label and with the gap between.
+    """Merge a segment with a neighbour: the result keeps the segment's label and includes the gap between them.
 
-    The nearest neighbour is the one with the smaller gap, the next one where both are equal.
+    The nearest neighbour is the one with the smaller gap; if both gaps are equal, the next one.
 
     Parameters
     ----------
@@ -205,7 +209,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
         neighbour = "previous" if previous else "next"
     other = previous if neighbour == "previous" else following
     if other is None:
-        raise _wrong(segment, "no-neighbour", f"it has no {neighbour} segment to merge with")
+        raise _wrong(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
     merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
     first = index if neighbour == "next" else index - 1
     return layer._with(first, first + 2, merged)
@@ -214,7 +218,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
 def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
     """Move the start or the end of the segment that holds a frame.
 
-    An adjacent segment follows this edge, and one in its place is shortened, but neither disappears.
+    An adjacent segment stays adjacent, and an overlapped one is shortened. Neither may become empty.
 
     Parameters
     ----------
@@ -235,7 +239,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
     segment = layer.segments[index]
     moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
     if moved.end <= moved.start:
-        raise _wrong(segment, "empty-segment", f"with its {edge} at {to} it would have no frames")
+        raise _wrong(segment, "empty-segment", f"with its {edge} at frame {to}, the segment would have no frames")
     beside = index - 1 if edge == "start" else index + 1
     if not 0 <= beside < len(layer.segments):
         return layer._with(index, index + 1, moved)
@@ -246,7 +250,9 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
         changed = other._replace(start=to)
     if changed.end <= changed.start:
         raise _wrong(
-            other, "neighbour-in-the-way", f"moving the {edge} of {segment} to {to} would leave it without frames"
+            other,
+            "neighbour-in-the-way",
+            f"moving the {edge} of {segment} to {to} would leave this neighbour without frames",
         )
     first = min(index, beside)
     return layer._with(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))
@@ -376,20 +382,24 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
-    """Cut the layer of one segment, for a clip of the frames [start, end) that hold it.
+    """Make the layer for the part [start, end) of a clip, with one segment and the keyframes inside it.
 
     Parameters
     ----------
     layer : Layer    the layer
     segment : Segment    one of its segments
-    start, end : int    frames of the clip
+    start, end : int    frames of the part, which contains the segment
 
     Returns
     -------
-    Layer    with frames counted from `start`
+    Layer    the layer, with frames counted from `start`
     """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
-        raise _wrong(segment, "outside-clip", f"the frames {start}:{end} of {layer.frame_count} do not contain it")
+        raise _wrong(
+            segment,
+            "outside-clip",
+            f"the frames {start}:{end} of the clip's {layer.frame_count} do not contain this segment",
+        )
     return Layer(
         end - start,
         (Segment(segment.label, segment.start - start, segment.end - start),),
@@ -414,32 +424,32 @@ def _moment(keyframe: Keyframe) -> tuple[int, str]:
 
 
 def _require_segments(segments: Sequence[Segment], frame_count: int) -> None:
-    """Raise `AnnotationError` for segments that do not fit the clip, and for neighbours that overlap."""
+    """Raise `AnnotationError` if a segment is empty or outside the clip, or if neighbours overlap."""
     for segment in segments:
         _require_label(segment.label, str(segment))
         if segment.end <= segment.start:
-            raise _wrong(segment, "empty-segment", "its end must be after its start")
+            raise _wrong(segment, "empty-segment", "the end of a segment must be after its start")
         if segment.start < 0 or segment.end > frame_count:
-            raise _wrong(segment, "outside-clip", f"the clip has the frames 0:{frame_count}")
+            raise _wrong(segment, "outside-clip", f"the segment must be within the clip's frames 0:{frame_count}")
     for before, after in pairwise(segments):
         if after.start < before.end:
-            raise _wrong(after, "segments-overlap", f"{before} overlaps it")
+            raise _wrong(after, "segments-overlap", f"the segment overlaps {before}")
 
 
 def _require_keyframes(keyframes: Sequence[Keyframe], frame_count: int) -> None:
-    """Raise `AnnotationError` for keyframes that do not fit the clip, and for repeated ones."""
+    """Raise `AnnotationError` if a keyframe is outside the clip or repeated."""
     for keyframe in keyframes:
         _require_label(keyframe.label, str(keyframe))
         if not 0 <= keyframe.frame < frame_count:
-            raise _wrong(keyframe, "outside-clip", f"the clip has the frames 0:{frame_count}")
+            raise _wrong(keyframe, "outside-clip", f"the keyframe must be within the clip's frames 0:{frame_count}")
     for earlier, later in pairwise(keyframes):
         if earlier == later:
-            raise _wrong(later, "keyframe-exists", "the layer has it already")
+            raise _wrong(later, "keyframe-exists", "the layer already has this keyframe")
 
 
 def _require_label(label: str, place: str) -> None:
     if not 0 < len(label) <= MAX_LABEL_LENGTH:
-        raise AnnotationError(f"a label has 1 to {MAX_LABEL_LENGTH} characters", code="bad-label", where=place)
+        raise AnnotationError(f"a label must have 1 to {MAX_LABEL_LENGTH} characters", code="bad-label", where=place)
 
 
 def _wrong(what: Segment | Keyframe, code: str, reason: str) -> AnnotationError:

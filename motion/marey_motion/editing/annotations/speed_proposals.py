@@ -29,12 +29,12 @@ REST_S = 0.1
 def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMinimaProposal | None = None) -> Layer:
     """Propose a keyframe `pause` at each minimum of the joints' mean speed, and segments `movement` between them.
 
-    The first segment starts and the last ends with the clip.
+    The first segment starts at the start of the clip, and the last segment ends at its end.
 
     Parameters
     ----------
     clip : Clip    F frames
-    joints : sequence of int    indices of the joints; all when empty
+    joints : sequence of int    indices of the joints; all joints if empty
     options : VelocityMinimaProposal, optional    limits
 
     Returns
@@ -64,9 +64,10 @@ def propose_pauses(clip: Clip, joints: Sequence[int] = (), options: VelocityMini
 def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposal | None = None) -> Layer:
     """Propose a segment `reach_left` or `reach_right` each time a wrist leaves its rest position and returns.
 
-    The rest position is that of the wrist at the start of the clip, in the frame of the hips and the body's heading,
-    with height above the ground. A segment lasts from the nearest frame to rest before to the nearest one after. The
-    keyframe `contact` marks the frame at which the hand arrives at its far place, `release` the last one there.
+    The rest position is the position of the wrist at the start of the clip: horizontally relative to the hips and the
+    body's heading, vertically the height above the ground. A segment begins and ends where the distance of the wrist
+    from rest has a minimum. The keyframe `contact` marks the first frame in which the hand is at its far position,
+    `release` the last.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
     """Compute the distance (F,) of a wrist from its position at the start of the clip, in metres."""
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
-        raise MappingError("the skeleton's mapping has no such joint", where=f"{side}_wrist")
+        raise MappingError("the skeleton's mapping lacks this standard joint; add it", where=f"{side}_wrist")
     positions = kinematics.global_positions(clip).astype(np.float64)
     forward = kinematics.forward_directions(positions, body.lefts, body.rights)
     x, z = (positions[:, wrist] - positions[:, body.hips])[:, (0, 2)].T
@@ -121,7 +122,7 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
 
 
 def _downhill(values: Floats, frame: int, step: Literal[-1, 1], last: int) -> int:
-    """Find the frame from `frame` to `last` at which the values stop falling."""
+    """Find the first frame, going from `frame` to `last`, after which the values stop falling."""
     way = values[last : frame + 1][::-1] if step == -1 else values[frame : last + 1]
     rising = np.diff(way) >= 0.0
     return frame + step * (int(np.argmax(rising)) if rising.any() else len(way) - 1)

@@ -23,13 +23,14 @@ SHORTEST_FLIGHT_S = 0.04
 
 
 def propose_steps(clip: Clip, body: MatchingBody, options: StepsProposal | None = None) -> Layer:
-    """Propose segments from the contact of one foot to the next contact of the other, named after the foot that swings.
+    """Propose a segment for each step: from the contact of one foot to the next contact of the other.
 
-    `step_left` and `step_right` are steps of a walk, `run_left` and `run_right` those in which no foot touches the
-    ground for a time. A step out of standing is a `start_`, which begins where the foot leaves the ground, one into
-    standing a `stop_`, and one that is both a `single_`. `standing` is its own label. Incomplete steps, turns on the
-    spot, jumps, and steps aside and backward get none. The keyframe `passing` marks the frame of each step at which the
-    swinging foot passes the other, where it does.
+    The label names the foot that swings. `step_left` and `step_right` are steps of a walk; `run_left` and `run_right`
+    are steps with a phase in which no foot touches the ground. The first step after standing has the prefix `start_`
+    and begins where the foot leaves the ground; the last step before standing has the prefix `stop_`; a step with
+    standing before and after it has the prefix `single_`. Periods of standing have the label `standing`. Incomplete
+    steps, turns on the spot, jumps, side steps and backward steps have no segment. The keyframe `passing` marks the
+    frame at which the swinging foot passes the other, if it does.
 
     Parameters
     ----------
@@ -71,15 +72,15 @@ class _Step(NamedTuple):
 
 
 def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) -> list[Stance]:
-    """Find the periods in which both feet are on the ground for long."""
+    """Find the periods in which both feet are on the ground for long enough to count as standing."""
     both = [Stance(max(a.start, b.start), min(a.end, b.end)) for a in stances[0] for b in stances[1]]
     return sorted(one for one in both if one.end - one.start >= max(1.0, standing_s * clip.frame_rate_hz))
 
 
 def _steps(stances: tuple[list[Stance], ...], standing: list[Stance]) -> list[_Step]:
-    """Find steps: from each contact to the next if that is of the other foot; after standing, from lift to contact.
+    """Find the steps, each from a contact to the next contact of the other foot.
 
-    A stance that begins with the clip has no contact.
+    A step after standing begins where the foot leaves the ground. A stance that begins with the clip has no contact.
     """
     begins, ends = {one.start for one in standing}, {one.end for one in standing}
     lifts = [{after.start: before.end for before, after in pairwise(of_side)} for of_side in stances]
@@ -107,7 +108,7 @@ def _has_flight(step: _Step, flying: NDArray[np.bool_], frame_rate_hz: float) ->
 
 
 def _label(step: _Step, has_flight: bool) -> str | None:
-    """Choose the label of a step; None for a jump, which is a flight out of standing."""
+    """Choose the label of a step; None for a jump, in which both feet leave the ground after standing."""
     if has_flight:
         manner = None if step.from_standing else "run"
     elif step.from_standing:

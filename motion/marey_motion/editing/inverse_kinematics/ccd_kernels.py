@@ -42,9 +42,9 @@ STAYING = 1e-9
 
 @compiled
 def _pair_up(targets, frame, k, body, place, tips, turns, matrix):  # type: ignore[no-untyped-def]
-    """Add up Σ w·b·aᵀ (3, 3) of the vectors a that joint k turns and their targets b; count the pairs.
+    """Fill the sum Σ w·b·aᵀ (3, 3) over pairs of a vector a that joint k turns and its target direction b.
 
-    Returns the number of pairs and the last one, each as unit vectors.
+    Returns the number of pairs, and the last pair as unit vectors.
     """
     matrix[:] = 0.0
     pairs = 0
@@ -88,7 +88,7 @@ def _add_pair(matrix, weight, a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _davenport(matrix, form):  # type: ignore[no-untyped-def]
-    """Fill the quadratic form (4, 4) of quaternions whose maximum is the best rotation (Davenport's q-method)."""
+    """Fill Davenport's matrix (4, 4), whose eigenvector of the largest eigenvalue is the best rotation (q-method)."""
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     form[0, 0] = trace
     for i in range(3):
@@ -109,7 +109,7 @@ def _form_value(form, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _largest_eigenvector(form, vectors):  # type: ignore[no-untyped-def]
-    """Compute the unit eigenvector of the largest eigenvalue of `form` (4, 4), symmetric, by Jacobi; destroys it."""
+    """Compute the unit eigenvector of the largest eigenvalue of the symmetric `form` (4, 4) by Jacobi, in place."""
     vectors[:] = 0.0
     for i in range(4):
         vectors[i, i] = 1.0
@@ -152,7 +152,7 @@ def _annihilate(form, vectors, p, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _best_turn(pairs, start, end, matrix, form, vectors):  # type: ignore[no-untyped-def]
-    """Compute the smallest world rotation that brings the vectors nearest to their targets."""
+    """Compute the smallest world rotation that turns the vectors as close as possible to their target directions."""
     if pairs == 1:
         return between(start, end)
     _davenport(matrix, form)
@@ -213,7 +213,7 @@ def _turned_joint(body, k, spin, local, pairs, start, end, work):  # type: ignor
 
 @compiled
 def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
-    """Turn every joint once, from the tips of the chains to their root."""
+    """Turn every movable joint once, from the tips of the chains to their root."""
     for k in range(body.parents.shape[0] - 1, -1, -1):
         if not body.movable[k]:
             continue
@@ -235,9 +235,9 @@ def _sweep(body, targets, frame, local, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def descend(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve every frame on its own: `rotations` (F, K, 4) are changed in place, `found` is filled.
+    """Solve each frame independently: `rotations` (F, K, 4) are changed in place, `found` is filled.
 
-    ends: most sweeps, tolerance in metres, tolerance in radians.
+    `ends` are the maximum number of sweeps, the tolerance in metres and the tolerance in radians.
     """
     most_sweeps, tolerance_m, tolerance_rad = ends
     best = np.empty(rotations.shape[1:])

@@ -48,7 +48,7 @@ LIMIT_REACHED_RAD = 1e-9
 
 @compiled
 def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-untyped-def]
-    """Compute the change of an angular error when the joint turns by `turn` and the target direction by `drift`."""
+    """Compute the change of an angular error if the joint turns by `turn` and the target direction by `drift`."""
     if kind == ORIENTATION:
         # The inverse left Jacobian of the rotation group at `error`.
         angle = length(error)
@@ -61,7 +61,7 @@ def _turned_error(kind, error, gaze, wished, turn, drift):  # type: ignore[no-un
 
 @compiled
 def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
-    """Compute the change of `look_error` when the gaze turns by a vector."""
+    """Compute the change of `look_error` if the gaze turns by a small rotation vector."""
     across = cross(wished, gaze)
     sine, cosine = length(across), dot(wished, gaze)
     if sine < 1e-9:
@@ -74,7 +74,7 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of target `c` by an unknown that moves its tip by `move` and turns its joint by `spin`."""
+    """Fill derivatives of the error of target `c` by an unknown that moves its tip by `move` and turns it by `spin`."""
     if targets.kinds[c] == POSITION:
         axes = targets.axes
         change = (move[0] * axes[c, 0], move[1] * axes[c, 1], move[2] * axes[c, 2])
@@ -93,7 +93,7 @@ def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, colu
 
 @compiled
 def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-untyped-def]
-    """Fill derivatives (3·C, 3·V + 3) of the scaled errors by displacements of the V movable joints and of the root."""
+    """Fill the Jacobian (3·C, 3·V + 3) of the scaled errors by displacements of the V movable joints and the root."""
     jacobian[:] = 0.0
     columns = 0
     for k in range(body.parents.shape[0]):
@@ -121,7 +121,7 @@ def fill_jacobian(body, targets, frame, work, jacobian):  # type: ignore[no-unty
 
 @compiled
 def _displace(body, local, root, first_local, first_root, work):  # type: ignore[no-untyped-def]
-    """Fill displacements (3·V + 3,) since the start, and return the sum of their weighted squares."""
+    """Fill the displacements (3·V + 3,) from the initial pose, and return the sum of their weighted squares."""
     columns, cost = 0, 0.0
     for k in range(local.shape[0]):
         if body.movable[k]:
@@ -139,7 +139,7 @@ def _displace(body, local, root, first_local, first_root, work):  # type: ignore
 
 @compiled
 def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
-    """Fill D⁻¹: a diagonal, with the directions taken out in which a joint would leave its limits."""
+    """Fill the diagonal of D⁻¹, where D contains the damping and the weights of the displacements."""
     columns = 0
     for k in range(body.parents.shape[0]):
         if body.movable[k]:
@@ -154,7 +154,7 @@ def _fill_softness(body, damping, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _soften(work, vector, out):  # type: ignore[no-untyped-def]
-    """Fill `out` with D⁻¹·vector."""
+    """Fill `out` with D⁻¹·vector, without the excluded directions of the joints."""
     for v in range(work.blocked.shape[0]):
         known, along = work.blocked[v], 0.0
         for i in range(3):
@@ -173,7 +173,7 @@ def _soften(work, vector, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def _solve_positive(matrix, right):  # type: ignore[no-untyped-def]
-    """Solve matrix·x = right in place by Cholesky's factors; the matrix (m, m) is destroyed."""
+    """Solve matrix·x = right in place by Cholesky decomposition, which overwrites the matrix (m, m)."""
     m = right.shape[0]
     for i in range(m):
         for j in range(i + 1):
@@ -218,9 +218,9 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Exclude a direction from the steps of movable joint v; return whether it was not excluded before.
+    """Exclude a direction from the steps of movable joint v; return whether this is new.
 
-    `work.outward` is the blocked direction, or, if two are blocked, the one that is free.
+    `work.outward` is the excluded direction, or, if two are excluded, the direction that remains free.
     """
     known = work.blocked[v]
     if known == 1:
@@ -273,7 +273,7 @@ def _fill_gradient(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
-    """Fill Jacobian and gradient of the pose just measured; return the mean size of the Jacobian's rows."""
+    """Fill Jacobian and gradient of the measured pose; return the mean squared length of the Jacobian's rows."""
     fill_jacobian(body, targets, frame, work, work.jacobian)
     for c in range(targets.kinds.shape[0]):
         for i in range(3):
@@ -288,7 +288,7 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
-    """Fill the trial pose that a damped step leads to, joints at their limits sliding along them."""
+    """Fill the trial pose after a damped step; joints at their limits slide along them."""
     _fill_softness(body, damping, work)
     work.blocked[:] = 0
     for _ in range(LIMIT_PASSES):
@@ -347,9 +347,9 @@ def _solve_frame(body, targets, frame, offsets, ends, local, root, work, before,
 
 @compiled
 def solve_frames(body, targets, ends, roots, rotations, work, found):  # type: ignore[no-untyped-def]
-    """Solve every frame on its own: `roots` (F, 3) and `rotations` (F, K, 4) are changed in place, `found` is filled.
+    """Solve each frame independently: `roots` (F, 3), `rotations` (F, K, 4) change in place, `found` is filled.
 
-    ends: most steps, tolerance in metres, tolerance in radians.
+    `ends` are the maximum number of steps, the tolerance in metres and the tolerance in radians.
     """
     for f in range(rotations.shape[0]):
         frame = min(f, targets.values.shape[0] - 1)

@@ -146,7 +146,7 @@ def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
 
 @compiled
 def measure_frames(body, targets, tolerances, roots, rotations, work, residuals, reached):  # type: ignore[no-untyped-def]
-    """Fill residuals (F, C) and whether all targets are reached (F,)."""
+    """Fill the residuals (F, C) and the flags (F,) of frames in which all targets are reached."""
     tolerance_m, tolerance_rad = tolerances
     for f in range(rotations.shape[0]):
         frame = min(f, targets.values.shape[0] - 1)

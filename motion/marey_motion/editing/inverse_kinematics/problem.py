@@ -1,7 +1,6 @@
-"""Targets and freedom packed into the arrays that the kernels of inverse kinematics work on.
+"""Targets and movable joints, packed into arrays for the kernels of inverse kinematics.
 
-Of a skeleton only the joints between the root and the targets matter; these K joints are numbered
-parents first.
+Only the joints between the root and the targets matter; these K joints are numbered with parents before children.
 """
 
 from __future__ import annotations
@@ -28,7 +27,10 @@ _KINDS: dict[type, int] = {PositionTarget: 0, OrientationTarget: 1, LookAtTarget
 
 
 class JointChains(NamedTuple):
-    """K joints: parents (K,), offsets (F or 1, K, 3) metres, and what each may do; `carries` (K, C) its targets."""
+    """K joints: parents (K,), offsets (F or 1, K, 3) in metres, freedom and limits.
+
+    `carries` (K, C) marks the targets that move with each joint.
+    """
 
     parents: Ints
     offsets: Floats
@@ -41,7 +43,7 @@ class JointChains(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """C targets: kinds and joints (C,), values (F or 1, C, 4), the rest (C, 3); `scales` (C,) of their errors."""
+    """C targets: kinds, joints and error scales (C,), values (F or 1, C, 4), all other arrays (C, 3)."""
 
     kinds: Ints
     joints: Ints
@@ -62,7 +64,7 @@ class SolverResult(NamedTuple):
 
 
 class Placing(NamedTuple):
-    """Scratch arrays for one pose of K joints and C targets; the last three are for the best turn of one joint."""
+    """Scratch arrays for one pose of K joints and C targets; the last three are for the best rotation of a joint."""
 
     spins: Floats
     places: Floats
@@ -101,12 +103,12 @@ class Stepping(NamedTuple):
 
 
 class IkProblem(NamedTuple):
-    """Everything that stays the same while a solver runs, and the poses it changes.
+    """Input of a solver, and the poses that the solver changes.
 
     Parameters
     ----------
     joints : (K,) indices in the skeleton
-    roots, rotations : (F, 3) metres and (F, K, 4) local, copies of the motion's
+    roots, rotations : (F, 3) in metres and (F, K, 4) local rotations, copied from the motion
     """
 
     joints: Ints
@@ -134,7 +136,7 @@ class IkProblem(NamedTuple):
 
         Parameters
         ----------
-        regularisation_m : float    metres that a displacement of one radian counts for
+        regularisation_m : float    cost of a displacement of one radian, as an error in metres
 
         Returns
         -------
@@ -206,7 +208,8 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
     for number, target in enumerate(targets):
         if not 0 <= target.joint < skeleton.joint_count:
             raise EditError(
-                f"there is no joint {target.joint}, the skeleton has {skeleton.joint_count}", where=f"targets[{number}]"
+                f"there is no joint {target.joint}; the skeleton has the joints 0 to {skeleton.joint_count - 1}",
+                where=f"targets[{number}]",
             )
     if not targets:
         raise EditError("at least one target is needed", where="targets")
@@ -226,7 +229,11 @@ def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags,
     may_turn = set(joints if freedom.joints is None else freedom.joints)
     movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
     if not movable.any() and not freedom.root_moves:
-        raise EditError("none of the joints that may move affects a target", code="chain-invalid", where="joints")
+        raise EditError(
+            "no target depends on the joints that may turn; include a joint between root and target",
+            code="chain-invalid",
+            where="joints",
+        )
     limits, limited, stiffness = np.zeros((count, 14)), np.zeros(count, np.bool_), np.zeros(count)
     for k, joint in enumerate(joints):
         stiffness[k] = freedom.stiffness.get(joint, 0.0)
@@ -277,15 +284,21 @@ def _checked_values(target: Target, number: int, frames: int) -> Floats:
     except ValueError as error:
         raise EditError(str(error), where=f"targets[{number}]") from None
     if len(values) not in (1, frames):
-        raise EditError(f"{len(values)} values for {frames} frames", where=f"targets[{number}]")
+        raise EditError(
+            f"the target has {len(values)} values for {frames} frames; one value, or one per frame, is needed",
+            where=f"targets[{number}]",
+        )
     if isinstance(target, PositionTarget) and (not target.axes or set(target.axes) - set("xyz")):
-        raise EditError(f"{target.axes!r} are not axes; write them as in 'xz'", where=f"targets[{number}].axes")
+        raise EditError(
+            f"axes must be one or more of x, y and z, such as 'xz', not {target.axes!r}",
+            where=f"targets[{number}].axes",
+        )
     return values
 
 
 def _scale(target: Target, number: int) -> float:
     if not (np.isfinite(target.weight) and target.weight > 0.0):
-        raise EditError(f"{target.weight} must be a positive number", where=f"targets[{number}].weight")
+        raise EditError(f"the weight must be a positive number, not {target.weight}", where=f"targets[{number}].weight")
     unit = 1.0 if isinstance(target, PositionTarget) else ANGLE_LENGTH_M
     return float(np.sqrt(target.weight)) * unit
 
@@ -293,5 +306,5 @@ def _scale(target: Target, number: int) -> float:
 def _vector(values: Any, where: str) -> Floats:
     vector = np.asarray(values, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise EditError("three finite numbers are needed", where=where)
+        raise EditError("the vector must be three finite numbers", where=where)
     return vector

@@ -64,7 +64,7 @@ def direction(a):  # type: ignore[no-untyped-def]
 
 @compiled
 def perpendicular(a):  # type: ignore[no-untyped-def]
-    """Compute a unit vector at a right angle to `a`, from the coordinate axis that `a` is farthest from."""
+    """Compute a unit vector perpendicular to `a`, from the coordinate axis with the largest angle to `a`."""
     x, y, z = abs(a[0]), abs(a[1]), abs(a[2])
     axis = (1.0, 0.0, 0.0)
     if y <= x and y <= z:
@@ -97,7 +97,7 @@ def exponential(v):  # type: ignore[no-untyped-def]
 
 @compiled
 def logarithm(q):  # type: ignore[no-untyped-def]
-    """Compute axis times angle of a rotation, of at most half a turn."""
+    """Compute the rotation vector (axis times angle, at most π) of a rotation."""
     sign = -1.0 if q[0] < 0.0 else 1.0
     v = (sign * q[1], sign * q[2], sign * q[3])
     sine = length(v)
@@ -123,7 +123,7 @@ def between(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def twist_angle(q, axis):  # type: ignore[no-untyped-def]
-    """Compute the twist of `q` = swing · twist about the unit vector `axis`, in radians from -π to π."""
+    """Compute the angle (radians, -π to π) of the twist about the unit vector `axis`, where `q` = swing · twist."""
     angle = 2.0 * math.atan2(dot((q[1], q[2], q[3]), axis), q[0])
     if angle > math.pi:
         angle -= 2.0 * math.pi

@@ -1,8 +1,8 @@
-"""Inverse kinematics: rotations of joints that bring points, orientations and looks to their targets.
+"""Inverse kinematics: joint rotations that bring points, orientations and look-at axes to their targets.
 
-Three solvers, each for one frame or many, which are solved one by one: the same frame has the same result alone and
-among others. No solver returns a pose with a larger error than the given pose (weighted squares of metres, where
-`ANGLE_LENGTH_M` is a radian). If the given pose violates limits, it is brought within them before the comparison.
+There are three solvers. Each solves frames independently: a frame has the same result alone and among others. No solver
+returns a pose with a larger error than the given pose. The error is the weighted sum of squares in metres, with
+`ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, it is brought within them before the comparison.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SolvedPoses:
     Parameters
     ----------
     motion : the frames, with the joints turned
-    residual_before, residual_after : (F, C) error of each target: metres, or radians
+    residual_before, residual_after : (F, C) error of each target, in metres or radians
     iterations : (F,) sweeps or steps
     reached : (F,) whether all targets are met within the tolerances
     """
@@ -57,13 +57,13 @@ class SolvedPoses:
 
 @dataclass(frozen=True)
 class TwoBoneLimb:
-    """A chain of two bones; joints between its own are carried along as they are.
+    """A chain of two bones, such as an arm or a leg; joints between its three joints keep their local rotations.
 
     Parameters
     ----------
     start, middle, end : indices of shoulder, elbow, wrist, or hip, knee, ankle
     hinge : unit axis in the middle joint's frame about which the limb bends. It is used where the limb is nearly
-        straight, or a little overstretched, so that its pose does not define the axis; with None the axis is arbitrary
+        straight, or a little overstretched, so that its pose does not define the axis; if None, the axis is arbitrary
     """
 
     start: int
@@ -73,12 +73,12 @@ class TwoBoneLimb:
 
     @property
     def joints(self) -> tuple[int, int, int]:
-        """Indices from the end up."""
+        """Indices of the three joints: end, middle, start."""
         return self.end, self.middle, self.start
 
 
 class _LimbKernel(NamedTuple):
-    """A limb in the numbering of the kernels."""
+    """A limb whose joints have the indices of the kernels."""
 
     start: int
     middle: int
@@ -92,7 +92,7 @@ class _LimbKernel(NamedTuple):
 def limb_ending_at(
     skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
 ) -> TwoBoneLimb | None:
-    """Find the arm or leg whose wrist or ankle a joint is.
+    """Find the arm or leg that ends at a joint, which must be its wrist or ankle.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def solve(
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Solve for targets of joints, by the solver that suits them or by a given one.
+    """Solve inverse kinematics by a given solver or the one that suits the targets.
 
     Parameters
     ----------
@@ -149,13 +149,14 @@ def solve(
 
     Raises
     ------
-    EditError    naming the target that is invalid, or why the solver does not fit
+    EditError    naming the invalid target, or if the solver cannot be used for these targets
     """
     asked = limb_targets(targets, limb)
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
         if asked is None or limb is None:
             raise EditError(
-                "the two-bone solver takes one position in all axes, and at most one orientation, of the end of a limb",
+                "the two-bone solver needs a limb, one position target in all axes for its end, and at most one "
+                "orientation target for its end; use another solver",
                 code="solver-unfit",
                 where="solver",
             )
@@ -182,9 +183,9 @@ def solve_ccd(
 ) -> SolvedPoses:
     """Solve by cyclic coordinate descent: joint after joint, from the targets to the root, takes the best rotation.
 
-    For one target that is the shortest rotation that aims at it (Wright 2015); for several, the rotation that solves
-    Wahba's problem for all of them at once (Davenport's q-method); for a hinge, the best angle within its limits. The
-    best pose of all sweeps is returned.
+    The best rotation is, for one target, the shortest rotation that aims at it (Wright 2015); for several targets, the
+    solution of Wahba's problem for all of them (Davenport's q-method); for a hinge, the best angle within its limits.
+    The best pose of all sweeps is returned.
 
     Parameters
     ----------
@@ -205,7 +206,11 @@ def solve_ccd(
     from marey_motion.editing.inverse_kinematics import ccd_kernels
 
     if freedom.root_moves:
-        raise EditError("cyclic coordinate descent cannot shift the root", code="solver-unfit", where="root_moves")
+        raise EditError(
+            "cyclic coordinate descent cannot shift the root; use least squares",
+            code="solver-unfit",
+            where="root_moves",
+        )
     problem = pose_problem(skeleton, motion, targets, freedom)
     found = problem.found
     ends = (int(options.most_iterations), float(options.tolerance_m), float(options.tolerance_rad))
@@ -223,8 +228,8 @@ def solve_least_squares(
 ) -> SolvedPoses:
     """Solve by damped least squares over all targets, with the analytic Jacobian of rotation-vector displacements.
 
-    Minimises the weighted squares of the errors plus those of the displacements, `regularisation_m` per radian, so that
-    directions without a target stay unchanged. Joints at a limit slide along it.
+    Minimises the weighted squares of the errors plus those of the displacements (`regularisation_m` metres per radian),
+    so that directions without a target stay unchanged. Joints at a limit slide along it.
 
     Parameters
     ----------
@@ -264,7 +269,7 @@ def solve_two_bone(
     damping_zone_rad: float = 0.0,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Bring a limb's tip to a position in closed form: exact where it can be reached, else stretched towards it.
+    """Bring the end of a limb to a position in closed form; a limb that cannot reach it is stretched towards it.
 
     The middle joint opens or closes in the plane of the limb; then the limb is aimed (Lee and Shin 1999, 5.3).
 
@@ -293,11 +298,13 @@ def solve_two_bone(
 
     targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
     if limb_targets(targets, limb) is None:
-        raise EditError("all targets must be for the end of the limb, and the position in all axes", where="targets")
+        raise EditError(
+            "all targets must be for the end of the limb, and the position target must have all axes", where="targets"
+        )
     path = skeleton.path_to_root(limb.end)
     if not {limb.middle, limb.start} <= set(path) or not limb.start < limb.middle < limb.end:
         raise EditError(
-            "start, middle and end must be a chain of joints from the root outwards", code="chain-invalid", where="limb"
+            "middle must be a descendant of start, and end a descendant of middle", code="chain-invalid", where="limb"
         )
     problem = pose_problem(skeleton, motion, targets, Freedom(limb.joints))
     found = problem.found
@@ -335,7 +342,7 @@ def _kernel_limb(
 
 
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
-    """Undo frames that the closed form made worse, such as by an orientation that moves a tool out of reach."""
+    """Restore the frames whose error the closed form increased, such as by an orientation that moves a tool away."""
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
     problem.rotations[worse] = before[worse]

@@ -31,9 +31,9 @@ class PositionTarget:
     ----------
     joint : index of the joint
     position : (3,), or (F, 3) for each frame    metres, world
-    axes : coordinates that count, the others are free
-    offset : (3,) metres in the joint's frame, from the joint to the point: the tip of a tool
-    weight : of the squared distance
+    axes : coordinates that must match, such as "xz"; the others are free
+    offset : (3,) metres in the joint's frame, from the joint to the point, such as the tip of a tool
+    weight : weight of the squared distance
     """
 
     joint: int
@@ -55,8 +55,8 @@ class OrientationTarget:
     Parameters
     ----------
     joint : index of the joint
-    rotation : (4,), or (F, 4) for each frame    unit, world
-    weight : of the squared angle, where `ANGLE_LENGTH_M` is one radian
+    rotation : (4,), or (F, 4) for each frame    unit quaternion, in the world
+    weight : weight of the squared angle, at `ANGLE_LENGTH_M` metres per radian
     """
 
     joint: int
@@ -71,7 +71,7 @@ class OrientationTarget:
 
 @dataclass(frozen=True, eq=False)
 class LookAtTarget:
-    """Target point of an axis of a joint, such as that of the eyes.
+    """Point at which an axis of a joint, such as the gaze, should be directed.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class LookAtTarget:
     point : (3,), or (F, 3) for each frame    metres, world
     axis : (3,) direction in the joint's frame that should point at the target
     offset : (3,) metres in the joint's frame, from the joint to the eye
-    weight : of the squared angle, where `ANGLE_LENGTH_M` is one radian
+    weight : weight of the squared angle, at `ANGLE_LENGTH_M` metres per radian
     """
 
     joint: int
@@ -103,10 +103,10 @@ class JointLimit:
 
     Parameters
     ----------
-    axis, side : (3,) unit directions in the joint's frame at a right angle to each other: the axis of the twist, and
-        the first axis of the swing; the second is axis × side
-    twist_rad : least and greatest twist
-    swing_rad : half axes of the ellipse that the swing's rotation vector stays in, about `side` and about axis × side
+    axis, side : (3,) perpendicular unit vectors in the joint's frame: the axis of the twist, and the first axis of the
+        swing; the second axis of the swing is axis × side
+    twist_rad : least and greatest twist angle
+    swing_rad : half axes, about `side` and about axis × side, of the ellipse that contains the swing's rotation vector
     reference : (4,) local rotation from which twist and swing are measured
     """
 
@@ -119,12 +119,14 @@ class JointLimit:
     def __post_init__(self) -> None:
         low, high = self.twist_rad
         if not -math.pi <= low <= high <= math.pi:
-            raise EditError(f"a twist from {low:g} to {high:g}; -π ≤ least ≤ greatest ≤ π is needed", where="twist_rad")
+            raise EditError(
+                f"the twist limits must be increasing and from -π to π, not {low:g} and {high:g}", where="twist_rad"
+            )
         if not all(0.0 <= half <= math.pi for half in self.swing_rad):
-            raise EditError(f"half axes {self.swing_rad}; each must be in 0 to π", where="swing_rad")
+            raise EditError(f"each swing limit must be from 0 to π, not {self.swing_rad}", where="swing_rad")
         axis, side = _vector(self.axis, "axis"), _vector(self.side, "side")
         if not np.allclose((axis @ axis, side @ side, axis @ side), (1.0, 1.0, 0.0), atol=1e-6):
-            raise EditError("axis and side must be of length 1 and at a right angle", where="axis")
+            raise EditError("axis and side must be perpendicular unit vectors", where="axis")
 
     @classmethod
     def hinge(
@@ -170,7 +172,7 @@ class JointLimit:
 
     @property
     def row(self) -> Floats:
-        """Target as the row (14,) that the kernels read."""
+        """Limit as the row (14,) that the kernels read."""
         reference = quaternions.normalise(_rows(self.reference, 4, "reference")[0])
         return np.concatenate(
             (reference, _vector(self.axis, ""), _vector(self.side, ""), self.twist_rad, self.swing_rad)
@@ -179,13 +181,14 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Limits at which a solver stops.
+    """Tolerances, iteration limit and regularisation of the solvers.
 
     Parameters
     ----------
-    tolerance_m, tolerance_rad : targets missed by no more are reached
-    most_iterations : sweeps of cyclic coordinate descent, steps of least squares
-    regularisation_m : least squares: metres that a displacement of one radian, or of one metre of the root, counts for
+    tolerance_m, tolerance_rad : largest error at which a target counts as reached
+    most_iterations : maximum number of sweeps (cyclic coordinate descent) or steps (least squares)
+    regularisation_m : cost of a displacement of one radian, or of one metre of the root, as an error in metres (least
+        squares only)
     """
 
     tolerance_m: float = 1e-4
@@ -196,7 +199,9 @@ class SolverOptions:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0):
-                raise EditError(f"{value} must be a number of at least 0", code="option-invalid", where=name)
+                raise EditError(
+                    f"the value must be a finite number of at least 0, not {value}", code="option-invalid", where=name
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,10 +210,10 @@ class Freedom:
 
     Parameters
     ----------
-    joints : indices of the joints that may turn; None for all that carry a target
+    joints : indices of the joints that may turn; None for all joints between the root and a target
     root_moves : whether the root may be shifted (least squares only)
-    limits : by joint index; a joint outside its limits is brought into them first
-    stiffness : by joint index, 0 (turns freely, as joints that are not named) to below 1
+    limits : limits by joint index; a joint outside its limits is brought within them first
+    stiffness : stiffness by joint index, from 0 (turns freely, the default) to below 1
     """
 
     joints: tuple[int, ...] | None = None
@@ -219,7 +224,9 @@ class Freedom:
     def __post_init__(self) -> None:
         for joint, stiffness in self.stiffness.items():
             if not 0.0 <= stiffness < 1.0:
-                raise EditError(f"{stiffness} must be in 0 to below 1", where=f"stiffness of joint {joint}")
+                raise EditError(
+                    f"stiffness must be at least 0 and below 1, not {stiffness}", where=f"stiffness of joint {joint}"
+                )
 
 
 def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
@@ -242,7 +249,9 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
     if top not in path:
         names = skeleton.joint_names
         raise EditError(
-            f"{names[effector]} is not a descendant of {names[top]}", code="chain-invalid", where=names[top]
+            f"{names[effector]} is not a descendant of {names[top]}; choose an ancestor",
+            code="chain-invalid",
+            where=names[top],
         )
     return path[: path.index(top) + 1]
 
@@ -250,7 +259,7 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
 def _rows(values: ArrayLike, size: int, where: str) -> Floats:
     array = np.asarray(values, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != size or not array.size:
-        raise EditError(f"shape {array.shape} where ({size},) or (frames, {size}) is needed", where=where)
+        raise EditError(f"the shape must be ({size},) or (frames, {size}), not {array.shape}", where=where)
     if not np.isfinite(array).all():
         raise EditError("all numbers must be finite", where=where)
     return np.atleast_2d(array)
@@ -259,6 +268,6 @@ def _rows(values: ArrayLike, size: int, where: str) -> Floats:
 def _vector(values: ArrayLike, where: str) -> Floats:
     rows = _rows(values, 3, where)
     if rows.shape != (1, 3):
-        raise EditError(f"shape {np.shape(values)} where (3,) is needed", where=where)
+        raise EditError(f"the shape must be (3,), not {np.shape(values)}", where=where)
     vector: Floats = rows[0]
     return vector

@@ -1,4 +1,4 @@
-"""Inverse kinematics of limbs with two bones: the distance of the target gives their angle, then the limb is aimed."""
+"""Inverse kinematics of limbs with two bones: the target's distance gives the bend, then the limb is aimed at it."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
-    """Reduce the change to the inner angle `wished`, the more the straighter the limb becomes (Kovar et al. 2002, 5.2).
+    """Damp the change of the inner angle from `angle` to `wished` near a straight limb (Kovar et al. 2002, 5.2).
 
-    In the last `zone` radians before straight, the change from `angle` is weighed by a cubic that falls from 1 to 0.
+    In the last `zone` radians before straight, the change is weighted by a cubic that falls from 1 to 0.
     """
     if wished <= angle or zone <= 0.0:
         return wished
@@ -78,10 +78,10 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 
 @compiled
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
-    """Compute the angle about the upper bone from a limb's hinge to the axis about which it bends by `wished` radians.
+    """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
-    A nearly straight limb bends about its hinge, even where it is a little overstretched; a bend to the side is kept,
-    and the added bend is about the hinge. The pose of a bent limb defines the axis.
+    `wished` is the bend in radians. A nearly straight limb bends about its hinge, even if it is a little overstretched;
+    an existing bend to the side is kept. The bending axis of a bent limb is that of its pose.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-
 
 @compiled
 def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: ignore[no-untyped-def]
-    """Turn the limb's joints of one pose, `local` (K, 4), so that its tip comes to `target`."""
+    """Turn the joints of the limb in one pose, `local` (K, 4), so that its tip reaches `target`."""
     place_joints(body.parents, offsets, root, local, work.spins, work.places)
     spin = rotation_at(work.spins, limb.end)
     if limb.ending == GIVEN:
@@ -131,7 +131,7 @@ def _reach(limb, body, offsets, root, local, target, rotation, work):  # type: i
 
 @compiled
 def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
-    """Turn joint k by a rotation that is given in the world before its parents are turned."""
+    """Turn joint k by a world rotation that was computed before the joint's ancestors were turned."""
     parent = body.parents[k]
     spin = product(turn, rotation_at(work.spins, k))
     if parent >= 0:
@@ -141,9 +141,9 @@ def _turn(body, work, local, k, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):  # type: ignore[no-untyped-def]
-    """Solve every frame on its own: `rotations` (F, K, 4) are changed in place.
+    """Solve each frame independently: `rotations` (F, K, 4) are changed in place.
 
-    targets (F or 1, 3) metres in the world; target_rotations (F or 1, 4), read when the limb's ending is GIVEN.
+    targets (F or 1, 3) are in metres in the world; target_rotations (F or 1, 4) are used if the limb's ending is GIVEN.
     """
     for f in range(rotations.shape[0]):
         target = vector_at(targets, min(f, targets.shape[0] - 1))
@@ -154,7 +154,7 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """Compute the largest span (F,) that limbs of span `starts` reach before damping reduces their stretching."""
+    """Compute the longest distance (F,) that limbs, now `starts` metres from start to end, reach without damping."""
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]
