@@ -148,7 +148,7 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
     @property
     def trial_count(self) -> int:
-        """The number of trajectories."""
+        """The number of trials."""
         return len(self.families) * len(self.speeds_m_s) * len(self.turn_rates_deg_s)
 
     @model_validator(mode="after")

@@ -225,7 +225,7 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
         raise TileError(f"there is no quaternion after the first {lead} of {columns} columns")
     choice = body.take(count)
     if (choice > 7).any():
-        raise TileError("the number of a quaternion's predicted component must be 0 to 7")
+        raise TileError("a quaternion's prediction, component + 4 * sign, must be 0 to 7")
     predicted_rows, other_rows = _rows(choice & 3, columns, lead)
     channels = np.empty((columns, frames), np.uint32)
     channels[other_rows] = others = _undo_difference(body, 4, columns - count, frames)

@@ -121,7 +121,9 @@ class WristContactProposal(_Proposal):
         allow_inf_nan=False,
         description="Share of the farthest distance from rest at which a hand has arrived.",
     )
-    release: bool = Field(False, description="Also add a keyframe `release` at the last frame at the far place.")
+    release: bool = Field(
+        False, description="Also add a keyframe `release` at the last frame in which the hand is at its far place."
+    )
 
 
 Proposal = Annotated[StepsProposal | VelocityMinimaProposal | WristContactProposal, Field(discriminator="method")]
