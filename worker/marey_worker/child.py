@@ -57,7 +57,7 @@ def main() -> None:
 
 
 class Garbage:
-    """Collection of cyclic garbage after each job, without the objects of loaded modules.
+    """Collector of cyclic garbage, called after each job; it skips the objects of loaded modules.
 
     Modules own nearly all objects and live as long as the process; searching these would take 0.1 s after every job.
     """

@@ -68,7 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
     parser.add_argument("--server", help="address of the server")
     parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time")
-    parser.add_argument("--name", help="name shown to people")
+    parser.add_argument("--name", help="name of the worker, shown to people")
     parser.add_argument("--cache", type=Path, help="folder that keeps downloaded inputs")
     parser.add_argument("--token-file", type=Path, help="file that holds a token with the scope `work`")
     parser.add_argument(

@@ -40,8 +40,8 @@ class InputCache:
     def get_many(self, keys: Sequence[str], fetch: Callable[[list[int]], Sequence[bytes | None]]) -> list[bytes | None]:
         """Return the bytes of `keys`; those that are not cached come from `fetch`, which gets their indices.
 
-        `fetch` may return only the first of them; then the result ends before the first key without an answer. None is
-        returned as it is, and not stored.
+        `fetch` may leave out values at the end; the result then ends before the first key without a value. A value of
+        None is returned, but not stored.
         """
         paths = [self.folder / hashlib.sha256(key.encode()).hexdigest() for key in keys]
         held = [self._read(path) for path in paths]

@@ -53,7 +53,9 @@ _cache: LruCache[bytes, MatchingClips] = LruCache(max_entries=MOST_KEPT)
 
 @dataclass(frozen=True)
 class ClipSet:
-    """Clips of a database with their trims and loops, which determine it together with options and normaliser."""
+    """Clips of a matching database, with their trims and loops.
+
+    Together with the options and the normaliser, they determine the database."""
 
     clips: tuple[PinnedInput, ...]
     rig: PinnedInput | None = None
