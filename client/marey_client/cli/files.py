@@ -104,7 +104,7 @@ def ls(
     tag: Annotated[
         str | None, typer.Option(help="List only items with one of these tags, separated by commas.")
     ] = None,
-    deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, here and below.")] = False,
+    deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, in the folder and below.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """List the contents of a folder."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 
 from marey_client.cli.invocation import AsJson
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_schemas.log_lines import LogForm
 
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
 
@@ -22,13 +22,6 @@ DatabaseUrl = Annotated[
         help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder."
     ),
 ]
-
-
-class LogForm(StrEnum):
-    """Form of log lines."""
-
-    TEXT = "text"
-    JSON = "json"
 
 
 def add_to(app: typer.Typer) -> None:
@@ -56,8 +49,7 @@ def serve(
     """Run a server with its database and a local worker until stopped."""
     from marey_client import embedded
 
-    form = None if log_form is None else log_form.value
-    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=form)
+    embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
 
 
 def worker(
@@ -96,7 +88,7 @@ def worker(
         name=name,
         cache=cache,
         cache_mb=cache_mb,
-        log_form=None if log_form is None else log_form.value,
+        log_form=log_form,
     )
 
 

@@ -31,12 +31,12 @@ MOST_TOLD = 1e15
 
 
 def parameters_of(model: type[BaseModel]) -> dict[str, Schema]:
-    """Return the JSON Schema of each field of a model, by name; references are replaced by what they refer to."""
+    """Return the JSON Schema of each field of a model, by name; references are replaced by their targets."""
     return resolved(model.model_json_schema())
 
 
 def resolved(schema: Schema) -> dict[str, Schema]:
-    """Return the schema of each property of an object, by name; references are replaced by what they refer to."""
+    """Return the schema of each property of an object, by name; references are replaced by their targets."""
     definitions = schema.get("$defs", {})
     return {name: _resolved(one, definitions) for name, one in schema.get("properties", {}).items()}
 
@@ -143,7 +143,7 @@ def assignment(text: str) -> tuple[str, str]:
 
 
 def read_value(text: str, schema: Schema) -> Any:
-    """Return a value of the type in the schema; lists are JSON or written 1,2,3, ranges of frames 10:200."""
+    """Parse a text as a value of the schema's type; lists are JSON or `1,2,3`, ranges of frames are `10:200`."""
     if _takes(schema, "null") and text == "null":
         return None
     if _takes(schema, "string"):
