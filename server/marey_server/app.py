@@ -228,7 +228,7 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
 
 
 def make_worker_token(database: Database, settings: Settings) -> str:
-    """Create a token for the workers that this process starts.
+    """Create a token for the workers that this process starts, which can claim jobs and do nothing else.
 
     Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep theirs.
     """
@@ -239,7 +239,7 @@ def make_worker_token(database: Database, settings: Settings) -> str:
 def _replace_worker_token(tx: Transaction, name: str) -> str:
     tx.principal = users.administrator_principal(tx)
     tokens.revoke_named(tx, name)
-    wanted = TokenCreate(name=name, scopes=("read", "write", "work"), expires_in_s=None)
+    wanted = TokenCreate(name=name, scopes=("work",), expires_in_s=None)
     return tokens.create_token(tx, wanted).secret
 
 
