@@ -37,7 +37,7 @@ def bvh(
     frames: int | str | None = None,
     frame_time: str = "0.01",
 ) -> bytes:
-    """Return a BVH file of these lines of numbers; the header tells their count unless `frames` says otherwise."""
+    """Return a BVH file of these lines of numbers; the header declares their number, or `frames`."""
     declared = len(rows) if frames is None else frames
     return (
         hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)

@@ -56,10 +56,6 @@ def _whole_way(item: pytest.Item) -> bool:
     return there and not item.get_closest_marker("check")
 
 
-def _soak(item: pytest.Item) -> bool:
-    return item.get_closest_marker("soak") is not None
-
-
 def _needs_mocap(item: pytest.Item) -> bool:
     return "mocap" in getattr(item, "fixturenames", ())
 
@@ -86,10 +82,9 @@ TIERS = {
             "fault cases": _fault,
             "whole ways": _whole_way,
             "slow": _slow,
-            "for soak": _soak,
         },
     ),
-    "test": Tier(EXAMPLES, STEPS, {"for soak": _soak, "fault cases on the other database": _fault_on_other_database}),
+    "test": Tier(EXAMPLES, STEPS, {"fault cases on the other database": _fault_on_other_database}),
     "soak": Tier(20 * EXAMPLES, 5 * STEPS, {}),
 }
 
