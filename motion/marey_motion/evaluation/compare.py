@@ -42,10 +42,10 @@ class MetricChange:
 
     Parameters
     ----------
-    before, after : means over the trials in which both sides define the metric, in the metric's own unit
+    before, after : means over the trials in which both evaluations define the metric, in the metric's own unit
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
-    trials : number of these trials; a single one shows no spread, and both bounds are its change
+    trials : number of these trials; with a single trial, both bounds are its change
     """
 
     metric: str
@@ -58,7 +58,7 @@ class MetricChange:
 
     @property
     def verdict(self) -> str:
-        """One of: same, better, worse, changed (a metric without direction), unclear (the interval holds 0)."""
+        """One of: same, better, worse, changed (a metric without direction), unclear (the interval contains 0)."""
         if self.low == self.high == 0.0:
             return "same"
         if self.low <= 0.0 <= self.high or self.trials < 2:
@@ -70,9 +70,9 @@ class MetricChange:
 
 @dataclass(frozen=True)
 class TrialChange:
-    """Trial whose two records differ, with the first tick that differs and its mean offset on both sides.
+    """Trial whose two records differ, with the first tick that differs and the mean offset in both evaluations.
 
-    `same_motion`: only the names of displayed clips differ, such as those of two equal clips; all numbers are the same.
+    `same_motion` is true if only the names of displayed clips differ and all numbers are equal.
     """
 
     trial: str
@@ -88,10 +88,10 @@ class Comparison:
 
     Parameters
     ----------
-    metrics : one per metric both sides know, in alphabetical order
-    changed : the trials whose records differ at all, in the suite's order
-    removed, added : uids of the clips that only one side has
-    newly_unused : uids of the clips both have that only the first one used
+    metrics : changes of the metrics that both evaluations have, in alphabetical order
+    changed : the trials whose records differ, in the suite's order
+    removed, added : uids of the clips that only the first, or only the second, data set has
+    newly_unused : uids of the clips of both data sets that only the first evaluation used
     coverage_change_s : (V, O) float64    seconds of data gained per cell of the coverage map
     """
 
@@ -118,7 +118,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
 
     Raises
     ------
-    MotionError    naming the difference of conditions, or when a side was read without its records
+    MotionError    if the conditions differ (the error names them), or if an evaluation was read without its records
     """
     require_comparable(before.provenance, after.provenance)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
@@ -216,7 +216,7 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
 
 
 def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
-    """Compute clip and frame displayed at each tick (T, 2), per result and trial, with clips numbered alike."""
+    """Compute the clip and frame displayed at each tick (T, 2), per result and trial, with the same clip numbers."""
     numbers: dict[str, int] = {}
     return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
 
@@ -229,7 +229,7 @@ def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[st
 
 
 def _numbers_differ(first: TrialRecord, second: TrialRecord) -> NDArray[np.bool_]:
-    """Find the ticks (T,) at which two records differ in anything but row numbers, which depend on the database."""
+    """Find the ticks (T,) at which two records differ, except in row numbers, which depend on the database."""
     differs: NDArray[np.bool_] = np.any(first.positions != second.positions, axis=1)
     for name in ("headings", "status", "match_cost", "continuing_cost", "pose_cost"):
         one, other = getattr(first, name), getattr(second, name)

@@ -1,7 +1,7 @@
 """Coverage of a set of clips: windows of one second, counted over cells of speed and turn rate.
 
-Windows lie within one clip. A cell reaches half-way to its neighbours on the grid, so every trial owns one; data that
-is faster, slower or turns more than the outermost cells is among the windows, not in the map.
+A window never spans two clips. The cells are centred on the points of the trial grid, with edges half-way between
+neighbours, so each trial has its own cell. Windows beyond the outermost cells are listed, but not counted in the map.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Wind
     Returns
     -------
     Windows    F - rate_hz windows, none for a clip of a second or less. Speed is the path's length per second,
-        whatever its direction; forward and strafe (positive to the left) are means along the facing half-way through
-        each step.
+        whatever its direction. Forward and strafe (positive to the left) are mean velocities relative to the facing
+        direction half-way through each step.
     """
     span = round(WINDOW_S * rate_hz)
     steps = np.diff(positions, axis=0)
@@ -70,7 +70,7 @@ def measure_coverage(
 ) -> Coverage:
     """Measure the windows of all clips, and the seconds they cover in each cell of the trial grid.
 
-    Clips that walk in place, as on a treadmill, would count as standing still: they are left out unless asked for.
+    Clips that walk in place, as on a treadmill, would count as standing still; they are left out by default.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def coverage_of(
     *,
     window_s: float,
 ) -> Coverage:
-    """Make the map of given windows.
+    """Make the coverage map of given windows.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
 
 
 def cell_edges(values: Sequence[float], step: float) -> Floats:
-    """Compute edges half-way between the values of a grid, the outer cells equally wide on both sides.
+    """Compute cell edges half-way between the values of a grid; the outermost values are centred in their cells.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn
 
 @dataclass(frozen=True)
 class Hole:
-    """A trial's cell that lacks data."""
+    """A cell of the trial grid that lacks data."""
 
     speed_m_s: float
     turn_rate_deg_s: float

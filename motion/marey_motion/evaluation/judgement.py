@@ -26,7 +26,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """Ratio of a trial's errors to each of the three limits; above 1 is too much, infinite where not defined."""
+    """Ratio of each of a trial's three errors to its limit; above 1 exceeds the limit, infinite if not defined."""
 
     place: float
     speed: float
@@ -34,7 +34,7 @@ class Strain(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest of the three."""
+        """The largest of the three ratios."""
         return max(self)
 
 
@@ -74,7 +74,7 @@ def judge(result: EvaluationResult) -> Judgement:
 
 
 def is_followed(outcome: TrialResult) -> bool:
-    """Check whether a trial keeps the three limits.
+    """Check whether a trial is within the three limits.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def is_followed(outcome: TrialResult) -> bool:
 
     Returns
     -------
-    bool    True if the trial keeps all three
+    bool    True if no limit is exceeded
     """
     return strain(outcome).worst <= 1.0 + TOLERANCE
 
@@ -96,7 +96,7 @@ def strain(outcome: TrialResult) -> Strain:
 
     Returns
     -------
-    Strain    above 1 beyond a limit
+    Strain    ratios; a value above 1 exceeds its limit
     """
     speed = max(mean_speed_m_s(outcome.trial), TOLERANCE)
     place, bias, turn = (outcome.metrics.get(name) for name in ("offset_mean", "se_v", "se_omega_deg"))
@@ -108,7 +108,7 @@ def strain(outcome: TrialResult) -> Strain:
 
 
 def mean_speed_m_s(trial: Trial) -> float:
-    """Compute the mean desired speed over the circle; a switching trial begins it with its own speed.
+    """Compute the mean desired speed over the circle; a switching trial begins the circle at its base speed.
 
     Parameters
     ----------

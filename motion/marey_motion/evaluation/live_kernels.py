@@ -1,7 +1,7 @@
-"""The compiled steps of `live_windows`, kept apart so that importing the rest of the package does not load numba.
+"""Compiled functions of `live_windows`, kept apart so that importing the rest of the package does not load numba.
 
-`take` and `filters` are the tuples of `live_windows`; everything in `take` is changed in place. Frames are handled one
-by one, so that results do not depend on how the frames were divided into requests.
+`take` and `filters` are the tuples of `live_windows`; the arrays of `take` are changed in place. Frames are processed
+one by one, so that results do not depend on how the frames were divided into requests.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
-    """Replace the oldest step of the ring. Sums are recomputed once per round, so that rounding does not accumulate."""
+    """Replace the oldest step of the ring buffer. Sums are recomputed once per turn, so that rounding stays bounded."""
     for column, value in enumerate((length, ahead, left)):
         take.sums[column] += value - take.steps[place, column]
         take.steps[place, column] = value
@@ -57,7 +57,7 @@ def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
 
 @compiled
 def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
-    """Smooth the root at a frame and move it there."""
+    """Compute the smoothed root at a frame and make it the current one."""
     x = _estimate(take, filters.positions, frame, 0)
     z = _estimate(take, filters.positions, frame, 1)
     facing_x = _estimate(take, filters.directions, frame, 2)
@@ -70,7 +70,7 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
 
 @compiled
 def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
-    """Fill in speed, turn rate, forward and strafe of the last window; return False if there is none yet."""
+    """Fill in speed, turn rate, forward and strafe velocity of the last window; return False if there is none yet."""
     frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
     if frame < span:
         return False
@@ -83,7 +83,7 @@ def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
 
 @compiled
 def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
-    """Process raw frames (n, 4); return the number of windows that they complete, which are written to `windows`."""
+    """Process raw frames (n, 4); write the windows that they complete to `windows` and return their number."""
     width = take.raw.shape[0]
     written = 0
     for index in range(frames.shape[0]):
@@ -102,7 +102,7 @@ def receive(take, filters, frames, duration_s, shortest_mean, windows):  # type:
 
 @compiled
 def finish(take, filters, duration_s, shortest_mean, windows):  # type: ignore[no-untyped-def]
-    """Smooth the last frames of a take, which no frames follow; windows as in `receive`."""
+    """Smooth the last frames of a take; write the windows that they complete and return their number."""
     written = 0
     for frame in range(take.counters[SMOOTHED], take.counters[RECEIVED]):
         _smooth(take, filters, frame, shortest_mean)

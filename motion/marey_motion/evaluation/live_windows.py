@@ -1,8 +1,8 @@
 """The windows of `coverage.sliding_windows` for frames that arrive one by one, at a constant cost per frame.
 
-A root is smoothed as `matching.simulation_root` smooths it. Its filters look half a second ahead, so results are half a
-second late (`LiveWindows.delay_s`); when a take ends, its last frames are smoothed as those of a clip that ends there,
-and nothing is left out.
+The root is smoothed as in `matching.simulation_root`. The filters look half a second ahead, so results are half a
+second late (`LiveWindows.delay_s`). When a take ends, its last frames are smoothed like the end of a clip, so that no
+window is missing.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class LiveTake(NamedTuple):
 
     Parameters
     ----------
-    raw : (D, 4)    ground position (x, z) in metres and unit facing (x, z) of the newest frames, as they came
+    raw : (D, 4)    ground position (x, z) in metres and unit facing (x, z) of the newest frames, not smoothed
     steps : (S, 3)    length, forward and leftward part of the newest steps of the smoothed root, metres
-    headings : (S + 1,)    its newest headings, radians, continuous
-    sums : (3,)    of `steps`
-    root : (3,)    position and heading of the smoothed root in the newest frame that has them
-    counters : (2,) int64    frames received and smoothed
+    headings : (S + 1,)    newest headings of the smoothed root, radians, continuous
+    sums : (3,)    sums of the columns of `steps`
+    root : (3,)    ground position (x, z) and heading of the smoothed root, in the newest smoothed frame
+    counters : (2,) int64    number of frames received and number of frames smoothed
     """
 
     raw: Floats
@@ -62,7 +62,7 @@ class LiveWindows:
     def __init__(self, rate_hz: float) -> None:
         if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:
             raise MotionError(
-                f"{rate_hz:g} frames per second; {LEAST_FRAME_RATE_HZ:g} to {MOST_FRAME_RATE_HZ:g} are possible; "
+                f"the frame rate must be {LEAST_FRAME_RATE_HZ:g} to {MOST_FRAME_RATE_HZ:g} Hz, not {rate_hz:g}; "
                 "send every n-th frame of a faster recording",
                 where="frame_rate_hz",
             )
@@ -75,7 +75,7 @@ class LiveWindows:
 
     @property
     def delay_s(self) -> float:
-        """Seconds until a frame becomes part of a window: those of the frames that smooth the direction."""
+        """Seconds until a frame becomes part of a window: half the width of the filter of directions."""
         return len(self._filters.directions) // 2 / self.rate_hz
 
     @property
@@ -85,12 +85,12 @@ class LiveWindows:
 
     @property
     def newest_frame(self) -> Floats | None:
-        """Position (m) and unit facing (4,) of the newest frame, unsmoothed; None at the beginning of a take."""
+        """Unsmoothed position (x, z) in metres and facing (x, z) of the newest frame; None at the start of a take."""
         return self._take.raw[(self.frame_count - 1) % len(self._take.raw)].copy() if self.frame_count else None
 
     @property
     def newest_window(self) -> Windows | None:
-        """The last window of the current take, with numbers as values."""
+        """The last window of the current take, with scalars instead of arrays."""
         from marey_motion.evaluation import live_kernels
 
         window = np.empty(4)
@@ -176,8 +176,9 @@ class LiveWindows:
 def smoother(window: int) -> Floats:
     """Make the matrix of a Savitzky-Golay filter: row i estimates frame i of a window from all its frames.
 
-    The middle row is the filter; the rows above it belong to the beginning of a take and those below to its end, where
-    the polynomial of the outermost window continues to the edge. A window too short for that changes nothing.
+    The middle row is the filter. The rows before it are for the beginning of a take and the rows after it for its end,
+    where the polynomial of the outermost window is evaluated up to the edge. If the window is too short for the
+    polynomial, the result is the identity.
 
     Parameters
     ----------
@@ -197,5 +198,5 @@ def smoother(window: int) -> Floats:
 
 
 def _shortened(matrix: Floats, frame_count: int) -> Floats:
-    """Make the smoother of a take shorter than the window, over the largest odd number of its frames."""
+    """Make the smoother for a take that is shorter than the window, over the largest odd number of its frames."""
     return matrix if frame_count >= len(matrix) else smoother(frame_count - (frame_count + 1) % 2)

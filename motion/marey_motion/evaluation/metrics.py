@@ -1,8 +1,9 @@
 """Metrics of a trial: accuracy, responsiveness and costs, over the whole trial and per regime.
 
-Everything is measured on steps: step k leads from tick k - 1 to tick k. Its speed is the chord's length over its
-duration, its error is recorded minus reference, and its offset is the distance of the two positions at tick k. A regime
-is a stretch of constant demand: the approach, the trial's own speed ("base"), the other one ("switched").
+Everything is measured on steps: step k leads from tick k - 1 to tick k. Its speed is the distance between its two
+positions divided by its duration, its error is the recorded minus the reference value, and its offset is the distance
+between recorded and reference position at tick k. A regime is all time with the same desired motion: the approach, the
+trial's base speed ("base"), or the speed it switches to ("switched").
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ LEAST_TRAVEL_M_S = 0.05
 
 @dataclass(frozen=True, eq=False)
 class TrialSeries:
-    """A trial step by step; S = T - 1 steps, arrays of shape (S,) unless said otherwise.
+    """Measurements of each step of a trial: S = T - 1 steps, arrays of shape (S,).
 
     Parameters
     ----------
-    times_s : when the step ends, from the start of the trial
-    speeds_m_s, turn_rates_rad_s : recorded; the turn rate is that of the facing
-    travel_turn_rates_rad_s : of the direction of travel; NaN where the character hardly moves
-    wanted_speeds_m_s, wanted_turn_rates_rad_s : of the reference
+    times_s : end of the step, from the start of the trial
+    speeds_m_s, turn_rates_rad_s : recorded speed and turn rate of the facing direction
+    travel_turn_rates_rad_s : turn rate of the direction of travel; NaN if the character hardly moves
+    wanted_speeds_m_s, wanted_turn_rates_rad_s : speed and turn rate of the reference
     offsets_m : distance from the reference at the same tick
-    cross_track_m, along_track_m : its components in the reference's frame, positive to the left and ahead
+    cross_track_m, along_track_m : components of this offset in the reference's frame, positive to the left and ahead
     regimes : index into `REGIMES`
-    pieces : number of the stretch of constant speed, -1 for the approach
+    pieces : index of the period of constant speed, -1 for the approach
     """
 
     rate_hz: float
@@ -61,7 +62,7 @@ class TrialSeries:
 
 
 def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> TrialSeries:
-    """Compute the speeds, turn rates and offsets of each step beside the reference.
+    """Compute the speeds, turn rates and offsets of each step, recorded and of the reference.
 
     Parameters
     ----------
@@ -75,12 +76,12 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
 
     Raises
     ------
-    MotionError    for another trial's record
+    MotionError    if the record belongs to another trial
     """
     ticks, rate = len(record.rows), record.rate_hz
     if ticks != reference.tick_count or rate != reference.rate_hz:
         raise MotionError(
-            f"the record has {ticks} ticks at {rate:g} Hz, its reference {reference.tick_count} at "
+            f"the record has {ticks} ticks at {rate:g} Hz, but its reference has {reference.tick_count} ticks at "
             f"{reference.rate_hz:g} Hz",
             where=trial.name,
         )
@@ -106,7 +107,7 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
 
 
 def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, options: EvaluationOptions) -> TrialResult:
-    """Compute every metric of one trial (docs/explanation/evaluation.md), and of its regimes where it has several.
+    """Compute every metric of one trial (docs/explanation/evaluation.md), and of each regime if it has several.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
 
     Raises
     ------
-    MotionError    when record and reference belong to different trials
+    MotionError    if record and reference belong to different trials
     """
     series = trial_series(trial, reference, record)
     window = np.full(len(series.times_s), True) if options.window == "all" else series.pieces >= 0
@@ -144,7 +145,7 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Compute the change of direction since the step before; NaN if either is too short or their demands differ."""
+    """Compute turn rates from the step before; NaN if a step is too short or only one of both is in the approach."""
     turned = np.diff(np.arctan2(steps[:, 0], steps[:, 1]))
     turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
     moving = speeds >= LEAST_TRAVEL_M_S
@@ -180,7 +181,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
 
 
 def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
-    """Compute the standard deviation about the mean of each regime, over all regimes together."""
+    """Compute the standard deviation over all regimes, each about its own mean."""
     if not len(values):
         return None
     squares = 0.0
@@ -209,7 +210,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean time to answer a switch, None without any answer, and count those without an answer."""
+    """Compute the mean response time to speed switches (None without any) and count the switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -223,7 +224,7 @@ def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | N
 
 
 def _stretches(pieces: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Find the half-open ranges of equal values."""
+    """Find the half-open ranges of consecutive equal values."""
     bounds = [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist(), len(pieces)]
     return list(pairwise(bounds))
 
@@ -233,7 +234,7 @@ def _hold_steps(series: TrialSeries) -> int:
 
 
 def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
-    """Compute the seconds from a switch until the speed stays right; None if the next switch is earlier."""
+    """Compute the seconds from a switch until the speed stays correct; None if the next switch comes first."""
     wanted = series.wanted_speeds_m_s[first:stop]
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
     hold = _hold_steps(series)
@@ -253,7 +254,7 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 
 
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Pool the costs of steps; a step's cost is that of its first tick, whose choice is displayed after it."""
+    """Pool the costs of steps; a step has the cost of its first tick, whose choice is displayed at the next tick."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
         "pose_cost": record.pose_cost[:-1][window],
@@ -295,7 +296,7 @@ def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
 
 
 def _of(measure: Callable[[Floats], np.float64 | float], values: Floats) -> float | None:
-    """Apply the measure to the values; None if there are none."""
+    """Apply the measure to the values; return None if there are no values."""
     return float(measure(values)) if len(values) else None
 
 
@@ -314,8 +315,9 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
     """Pool the metrics of several trials, and of their regimes under the regime's name.
 
-    A maximum is the largest, a root mean square that of all trials, a count the sum, and all others are means over the
-    trials that define them. `dse_…_pooled` is the root mean square of the trials' spreads.
+    A maximum is the largest of all trials, a root mean square the root mean square of the trials' values, and a count
+    the sum. All other metrics are means over the trials that define them. `dse_…_pooled` is the root mean square of the
+    trials' spreads.
 
     Parameters
     ----------

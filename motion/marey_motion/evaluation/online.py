@@ -1,7 +1,7 @@
-"""Coverage during a recording: the data so far, the missing data, and paths that fill it.
+"""Coverage during a recording: the data so far, the missing data, and paths that provide it.
 
-A performance arrives as frames, in pieces of any size. For a whole clip, the windows counted are those that
-`coverage.measure_coverage` counts for it at the same frame rate.
+A performance arrives as frames, in groups of any size. For a whole clip, the counted windows are the same as those of
+`coverage.measure_coverage` at the same frame rate.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ AWAY_DECIMALS = 1
 
 @dataclass(frozen=True)
 class PerformerState:
-    """Position of the performer in the newest frame, and motion by the newest window, which is None at first.
+    """Position of the performer in the newest frame, and motion in the newest window, which is None at first.
 
     Ground position in metres, heading in radians, strafe positive to the left.
     """
@@ -54,9 +54,9 @@ class PerformerState:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A cell that lacks data, and the way to fill it.
+    """A cell that lacks data, and a path that fills it.
 
-    `path` starts where the performer is and faces: (0, 0) at heading 0, x to the left and z ahead, metres.
+    `path` is in metres in the performer's frame: it starts at (0, 0) with heading 0, x to the left and z ahead.
     """
 
     hole: Hole
@@ -64,12 +64,12 @@ class Target:
 
 
 class OnlineCoverage:
-    """Seconds of data in each cell of a grid, growing with a performance.
+    """Seconds of data in each cell of a grid, updated during a performance.
 
     Parameters
     ----------
-    rate_hz : of the performance's frames, 10 to 240
-    grid : the cells are those of `coverage.measure_coverage`
+    rate_hz : frame rate of the performance, 10 to 240
+    grid : the trial grid, with the same cells as in `coverage.measure_coverage`
     least_s : seconds wanted in each cell
     seconds : (V, O) seconds of data that exist already, for example an evaluation's `Coverage.seconds`
 
@@ -92,10 +92,12 @@ class OnlineCoverage:
         self.turn_rate_edges_deg_s = cell_edges(self.grid.turn_rates_deg_s, TURN_RATE_STEP_DEG_S)
         shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
         if shape[0] * shape[1] > MOST_CELLS:
-            raise MotionError(f"{shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are possible", where="grid")
+            raise MotionError(
+                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are possible", where="grid"
+            )
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:
-            raise MotionError(f"shape {self._before.shape}, but the grid has {shape} cells", where="seconds")
+            raise MotionError(f"the shape must be {shape} as in the grid, not {self._before.shape}", where="seconds")
         self._live = LiveWindows(rate_hz)
         self.counts = np.zeros(shape, dtype=np.int64)
         self.frame_count = 0
@@ -105,7 +107,7 @@ class OnlineCoverage:
     def add_frames(self, body: MatchingBody, clip: Clip) -> Windows:
         """Add the next frames.
 
-        A take begins with the first frame in which hips and shoulders give a direction.
+        A take begins with the first frame in which hips and shoulders define a facing direction.
 
         Parameters
         ----------
@@ -118,7 +120,7 @@ class OnlineCoverage:
 
         Raises
         ------
-        MotionError    if the frames lie too far away; none of them is added
+        MotionError    if a frame is too far from the origin; no frame is added
         """
         positions = Motion.of(clip).positions(body.skeleton)
         _require_near(positions)
@@ -138,7 +140,7 @@ class OnlineCoverage:
 
         Raises
         ------
-        MotionError    if a value is invalid or too far away; none of them is added
+        MotionError    if a value is invalid or too far from the origin; no frame is added
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(
@@ -174,7 +176,7 @@ class OnlineCoverage:
 
     @property
     def delay_s(self) -> float:
-        """Delay of windows behind the newest frame: half of the second over which directions are smoothed."""
+        """Delay of the newest window behind the newest frame, in seconds: half the width of the direction filter."""
         return self._live.delay_s
 
     @property
@@ -202,14 +204,14 @@ class OnlineCoverage:
         return PerformerState(x, z, float(np.arctan2(facing_x, facing_z)), self._live.newest_window)
 
     def targets(self, count: int, *, path_s: float = TARGET_PATH_S) -> tuple[Target, ...]:
-        """List the cells that lack data, nearest first to the performer's motion, or to standing still.
+        """List the cells that lack data, the nearest to the performer's current speed and turn rate first.
 
-        Distances are counted in cells.
+        Distances are counted in cells. Without a performer, they are measured from standing still.
 
         Parameters
         ----------
-        count : int    number of cells, at most
-        path_s : float    seconds of the path of each
+        count : int    largest number of cells
+        path_s : float    duration of each path, seconds
 
         Returns
         -------
@@ -271,14 +273,14 @@ class OnlineCoverage:
 
 def _require_near(positions: Floats) -> None:
     if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
-        raise MotionError(f"a frame lies more than {FARTHEST_M:g} m from the origin", where="positions")
+        raise MotionError(f"a frame is more than {FARTHEST_M:g} m from the origin", where="positions")
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:
-    """Normalise facing directions (n, 2); one that is too short takes the direction of the frame before it.
+    """Normalise facing directions (n, 2); a direction that is too short is replaced by that of the frame before it.
 
-    `before` (2,) is the direction of the frame before the first. Without it, frames before the first long enough
-    direction are left out, and the last m directions (m, 2) are returned.
+    `before` (2,) is the direction of the frame before the first. If it is None, leading frames without a direction are
+    left out, so that only the last m directions (m, 2) are returned.
     """
     length = np.hypot(facing[:, 0], facing[:, 1])
     known = length >= SHORTEST_LATERAL_M

@@ -1,4 +1,4 @@
-"""Origin and conditions of an evaluation, as digests of canonical content."""
+"""Digests of the content and conditions of an evaluation, by which two evaluations can be compared."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from marey_schemas.options.evaluation import EvaluationOptions
 def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials: Sequence[Trial]) -> Provenance:
     """Compute the digests of the data, the cost function and the trials.
 
-    `dataset` names the motion that was played, whatever its clips are called; `clips` the documents it came from, or
-    the motion of a clip whose document is not known.
+    `dataset` is the digest of the motion that was played, without the names of the clips. `clips` is the digest of the
+    documents of the clips, or of the motion of a clip whose document is not known.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _digest(value: Any) -> str:
 
 
 def _canonical(value: Any) -> Any:
-    """Convert to plain values with one spelling per number: 3 and 3.0 are the same option, and -0.0 is 0.0."""
+    """Convert to plain values in which equal numbers are written equally: 3 as 3.0, and -0.0 as 0.0."""
     if isinstance(value, Options):
         return _canonical(value.model_dump())
     if is_dataclass(value) and not isinstance(value, type):

@@ -22,9 +22,9 @@ class Jumps(NamedTuple):
 
     Parameters
     ----------
-    ticks : (J,) int64    the first tick after the jump
+    ticks : (J,) int64    the first tick after each jump
     left, entered : (J,) int64    rows displayed before and after
-    forced : (J,) bool    the clip had ended; the others were chosen
+    forced : (J,) bool    whether the jump was forced because the clip had ended; all other jumps were chosen
     """
 
     ticks: NDArray[np.int64]
@@ -64,7 +64,7 @@ def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> N
 
 
 def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
-    """Find every jump of a trial, in its order. A loop that begins again does not jump.
+    """Find every jump of a trial, in the order of time. The restart of a loop is no jump.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ class SourceUsage:
     ----------
     uid, name : str    of the source clip
     clips : tuple of int    indices of the one or two clips made from it
-    ticks, share, entries    sums
+    ticks, share, entries    sums over these clips
     popularity : (frames,) int64    ticks of each frame, summed
     """
 
@@ -186,7 +186,7 @@ def sum_by_source(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> 
 
 
 def recorded_rows(clips: Sequence[DatabaseClip], usage: Sequence[ClipUsage]) -> int:
-    """Count the rows of the clips as recorded; a mirrored copy adds none.
+    """Count the rows of the recorded clips, without mirrored copies.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
 def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> float | None:
     """Compute the share of chosen jumps that land within `TREADING_S` of their start, in the same clip.
 
-    A character that finds nothing to continue with returns to nearly the same frame at every search, and glides.
+    A character without suitable data returns to nearly the same frame at every search, so it slides on the ground.
 
     Parameters
     ----------

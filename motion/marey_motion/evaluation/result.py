@@ -19,7 +19,7 @@ Metrics = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class TrialResult:
-    """One trial: its metrics, and those of each regime of a switching one ("base", "switched")."""
+    """Metrics of one trial, and of each regime ("base", "switched") if its speed switches."""
 
     trial: Trial
     metrics: Metrics
@@ -32,8 +32,8 @@ class ClipUsage:
 
     Parameters
     ----------
-    ticks, entries : ticks displayed; times jumped to, by choice or because another clip had ended
-    popularity : (frames,) int64    ticks each frame was displayed
+    ticks, entries : ticks in which it was displayed; number of jumps to it, chosen or forced by the end of a clip
+    popularity : (frames,) int64    number of ticks in which each frame was displayed
     trials : number of trials that displayed it
     """
 
@@ -52,13 +52,14 @@ class Coverage:
     Parameters
     ----------
     clip : (W,) int32    index of the clip of each window
-    speed_m_s, turn_rate_rad_s, forward_m_s, strafe_m_s : (W,) float64    strafe positive to the left
+    speed_m_s, turn_rate_rad_s, forward_m_s, strafe_m_s : (W,) float64    means of each window; strafe is positive to
+        the left
     speed_edges_m_s, turn_rate_edges_deg_s : (V + 1,), (O + 1,)    cells centred on the trial grid
     seconds : (V, O) float64    seconds of data in each cell
     deficit_s : (V, O) float64    seconds that each cell lacks
-    index : share of target cells with enough
-    symmetry : 1 where turning left and right are covered alike, 0 where only one is
-    too_short : indices of clips under a second
+    index : share of the target cells with enough data
+    symmetry : 1 if turning left and right are covered equally, 0 if only one of them is covered
+    too_short : indices of the clips without a window, of one second or less
     """
 
     clip: NDArray[np.int32]
@@ -77,7 +78,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Conditions that must agree to compare two results, and their origin. All digests are "sha256:…"."""
+    """Digests ("sha256:…") of the data of an evaluation and of the conditions that comparable evaluations share."""
 
     dataset: str
     clips: Mapping[str, str]
@@ -94,10 +95,11 @@ class EvaluationResult:
     Parameters
     ----------
     suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"
-    usage : one per clip, in the order of `clips`
-    switches : (S, 3) int64    row left, row entered, how often, of all jumps of the suite; ordered by the first two
-    records : one per trial, in the order of `trials`
-    baseline : the same suite over generated clips that own every cell of the grid, without records; None when left out
+    usage : use of each clip, in the order of `clips`
+    switches : (S, 3) int64    row left, row entered and count of all jumps of the suite; ordered by the first two
+    records : record of each trial, in the order of `trials`
+    baseline : result of the same suite over clips generated for every cell of the grid, without records; None if not
+        computed
     """
 
     options: EvaluationOptions

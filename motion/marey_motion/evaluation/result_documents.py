@@ -24,7 +24,7 @@ Tree = dict[str, Any]
 
 
 def result_to_tree(result: EvaluationResult) -> Tree:
-    """Convert an evaluation without its records, which are a document of their own.
+    """Convert an evaluation without its records, which are a separate document.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def result_from_tree(tree: Mapping[str, Any], records: Sequence[TrialRecord] = (
     Parameters
     ----------
     tree : mapping    result of `result_to_tree`
-    records : sequence of TrialRecord    its records, where they are at hand
+    records : sequence of TrialRecord    its records, if they were read
 
     Returns
     -------
@@ -143,10 +143,10 @@ def _usage(tree: Mapping[str, Any], clips: Sequence[DatabaseClip]) -> tuple[Clip
 
 
 def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> Tree:
-    """Join the records of all or some trials to few large arrays.
+    """Join the records of all or some trials into a few large arrays.
 
-    `starts` (R + 1,) bounds each record's ticks. A cost that is not defined at every tick is kept as the ticks where it
-    is, counted over all records, and its values.
+    Record r has the ticks [starts[r], starts[r + 1]). A cost that is not defined at every tick is stored as the ticks
+    at which it is defined, counted over all records, and its values.
 
     Parameters
     ----------
@@ -159,7 +159,10 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
     """
     rates = {record.rate_hz for record in records}
     if len(trials) != len(records) or len(rates) != 1:
-        raise MotionError(f"{len(records)} records at rates {sorted(rates)} for {len(trials)} trials")
+        raise MotionError(
+            f"one record per trial at one rate is needed, but there are {len(records)} records at the rates "
+            f"{sorted(rates)} for {len(trials)} trials"
+        )
     return {
         "schema": RECORDS_SCHEMA,
         "rate_hz": rates.pop(),

@@ -1,7 +1,7 @@
 """The trials of an evaluation and their trajectories.
 
 A trial starts at the origin facing +z, goes straight for its approach and then turns at a constant rate. Its speed is
-constant, or switches between two values at fixed intervals; the turn rate stays: the path is a chain of tangent arcs.
+constant or switches between two values at fixed intervals. With switches, the path is a chain of tangent arcs.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ _DEFAULTS = EvaluationOptions()
 class Trial:
     """One trajectory to follow: straight for `approach_s`, then a circle, or a chain of arcs whose speed switches.
 
-    Speeds in m/s; `turn_rate_rad_s` positive to the left. `switch_speed_m_s` and `switch_every_s` count for the
-    switching family only, whose clock starts with the circle.
+    Speeds are in m/s; `turn_rate_rad_s` is positive to the left. `switch_speed_m_s` and `switch_every_s` are used by
+    the switching family only; its first interval begins with the circle.
     """
 
     family: Family
@@ -48,7 +48,7 @@ class Trial:
 
 
 def demand(trial: Trial) -> str:
-    """Describe the demand of a trial in words.
+    """Describe the desired motion of a trial in words.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Reference:
 
     Parameters
     ----------
-    tick_count : T, ticks of the trial itself; the arrays have T + look_ahead rows
+    tick_count : number T of ticks of the trial itself; the arrays have L more rows
     positions : (T + L, 2) float64    metres on the ground
     headings, speeds_m_s, turn_rates_rad_s : (T + L,) float64
     """
@@ -87,7 +87,7 @@ class Reference:
 
 
 def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
-    """List every pair of the grid in every family, ordered by family, speed and turn rate as the options list them.
+    """List a trial for every family, speed and turn rate, in the order of the options.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
     Raises
     ------
-    MotionError    for two trials of one name, such as speeds that differ by less than a millionth
+    MotionError    if two trials have the same name, such as with speeds that differ by less than a millionth
     """
     trials = tuple(
         Trial(
@@ -120,7 +120,7 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
 
 def require_names(trials: Iterable[Trial]) -> None:
-    """Check that trials have different names: records are kept by them.
+    """Check that trials have different names, since records are stored by name.
 
     Parameters
     ----------
@@ -155,15 +155,17 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
     Raises
     ------
-    MotionError    for a trial without ticks, or one whose speed switches without an interval
+    MotionError    if the trial has no ticks, or if its speed switches without an interval
     """
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
         raise MotionError(
-            f"a trial of {trial.approach_s:g} s and {trial.duration_s:g} s has no ticks", where=trial.name
+            f"a trial with an approach of {trial.approach_s:g} s and a duration of {trial.duration_s:g} s has no ticks "
+            f"at {rate_hz:g} Hz",
+            where=trial.name,
         )
     if trial.family == "switching" and not trial.switch_every_s > 0.0:
-        raise MotionError("the speed must switch at intervals longer than 0 s", where=trial.name)
+        raise MotionError("the interval between speed switches must be longer than 0 s", where=trial.name)
     times = np.arange(tick_count + int(np.ceil(look_ahead_s * rate_hz))) / rate_hz
     starts, speeds, turn_rates = _pieces(trial, float(times[-1]))
     origins, headings = _piece_origins(starts, speeds, turn_rates)
@@ -180,7 +182,7 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
 
 def _pieces(trial: Trial, end_s: float) -> tuple[Floats, Floats, Floats]:
-    """Start time, speed and turn rate of each piece of constant speed and turn rate."""
+    """Compute start time, speed and turn rate of each piece of constant speed and turn rate."""
     circles = 1
     if trial.family == "switching":
         circles += max(0, int((end_s - trial.approach_s) / trial.switch_every_s))
@@ -203,8 +205,8 @@ def _piece_origins(starts: Floats, speeds: Floats, turn_rates: Floats) -> tuple[
 def _arc(speed: Floats, turn_rate: Floats, heading: Floats, elapsed: Floats) -> tuple[Floats, Floats]:
     """Compute the displacement (..., 2) and heading after moving for `elapsed` seconds from `heading`.
 
-    The chord of an arc of angle a is its length times sin(a/2)/(a/2), in the direction half-way through the turn; this
-    form needs no case for a turn rate of zero.
+    The chord of an arc with angle a is the arc's length times sin(a/2)/(a/2), in the direction half-way through the
+    turn. This formula needs no special case for a turn rate of zero.
     """
     turn = turn_rate * elapsed
     chord = speed * elapsed * np.sinc(turn / (2.0 * np.pi))

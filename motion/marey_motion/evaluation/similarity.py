@@ -1,7 +1,7 @@
 """Similarity of the poses in each cell of the coverage map, across clips.
 
-A cell may be full and yet useless for motion matching, when its clips never come near each other: data that is dense
-but not blendable. A frame belongs to the cell of the second that begins with it.
+A cell may have enough data and yet be useless for motion matching, if poses of its clips are never close enough to
+blend. A frame belongs to the cell of the one-second window that begins with it.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ MOST_FRAMES = 2_000
 
 @dataclass(frozen=True, eq=False)
 class PoseSimilarity:
-    """Per cell (V, O) of the coverage map, how near its frames are to the nearest frame of another source in it.
+    """Distances, in each cell (V, O) of the coverage map, between frames and the nearest frame of another source.
 
     Parameters
     ----------
-    threshold_m : up to where a frame can be blended: summed distance of the pose joints, metres
-    frames, sources : (V, O) int64    in the cell; a clip and its mirrored copy are one source
-    measured : (V, O) int64    how many frames were compared, evenly chosen where there are more than `MOST_FRAMES`
-    distance_m : (V, O) median distance; NaN where there are no two sources
+    threshold_m : largest distance at which frames can be blended: sum over the pose joints, metres
+    frames, sources : (V, O) int64    numbers in the cell; a clip and its mirrored copy are one source
+    measured : (V, O) int64    number of frames compared; evenly chosen if there are more than `MOST_FRAMES`
+    distance_m : (V, O) median distance; NaN with fewer than two sources
     blendable_share : (V, O) share of the measured frames within the threshold; 0 with one source, NaN without frames
-    share : of all frames in cells, each cell's share counting by its frames; None when there are none
+    share : mean of `blendable_share`, weighted by the frames of each cell; None without frames
     """
 
     threshold_m: float
@@ -117,16 +117,16 @@ def measure_similarity(
 
 
 def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Thin rows evenly.
+    """Select rows evenly.
 
     Parameters
     ----------
     rows : (n,) int64    the rows
-    most : int    rows to keep, at most
+    most : int    largest number of rows to keep
 
     Returns
     -------
-    (m,) int64    every k-th row, with the least k that is enough
+    (m,) int64    every k-th row, with the smallest possible k
     """
     return rows[:: max(1, -(-len(rows) // most))]
 
@@ -170,7 +170,7 @@ def window_cells(coverage: Coverage) -> NDArray[np.int64]:
 
 
 def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
-    """Number the source of each row.
+    """Find the source of each row, as a number.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def nearest_poses(
 
     Returns
     -------
-    (Q,) float64    metres, summed over the points, as the pose cost of a transition; infinite without another group
+    (Q,) float64    metres, summed over the points like the pose cost of a transition; infinite without another group
     """
     from marey_motion.evaluation import similarity_kernels as kernels
 

@@ -11,8 +11,8 @@ from marey_motion.kernels import compiled
 def nearest_of_others(queries, query_groups, points, groups, found):  # type: ignore[no-untyped-def]
     """Fill found (Q,) with the summed distance of each query (Q, P, 3) from the nearest of points (N, P, 3).
 
-    Only points of another group count; infinite where there are none. The points that were nearest to the query before
-    are tried first, which settles most others early.
+    Only poses of another group are compared; the result is infinite if there are none. The pose that was nearest to the
+    previous query is tried first, so that most other poses are ruled out early.
     """
     before = 0
     for q in range(queries.shape[0]):

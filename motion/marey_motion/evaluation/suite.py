@@ -60,7 +60,7 @@ def run_suite(
     finished: Callable[[Trial, TrialRecord], None] | None = None,
     cancelled: CancelCallback | None = None,
 ) -> list[TrialRecord]:
-    """Play motion matching along each trial's reference.
+    """Run motion matching along the reference trajectory of each trial.
 
     Callbacks run in the calling thread.
 
@@ -68,11 +68,11 @@ def run_suite(
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
-    trials : sequence of Trial, optional    all of the suite's when None; any part of them can be run alone
-    done : mapping of str to TrialRecord, optional    records made before, by the name of their trial; these trials are
+    trials : sequence of Trial, optional    the trials to run; all of the suite if None
+    done : mapping of str to TrialRecord, optional    existing records, by the name of their trial; these trials are
         not run again
-    index : SearchIndex, optional    index of the database's normalised features, built when None
-    threads : int, optional    trials at once, one per processor when None
+    index : SearchIndex, optional    index of the database's normalised features, built if None
+    threads : int, optional    number of trials at a time; one per processor if None
     progress : callable, optional    called as progress(trials done, total, name of the last one)
     finished : callable, optional    called with each trial and its record as soon as it is made
     cancelled : callable, optional    called before each trial; returns True to stop
@@ -83,8 +83,8 @@ def run_suite(
 
     Raises
     ------
-    EvaluationCancelled    once trials already begun are finished
-    MotionError    for two trials of one name, such as speeds that differ by less than a millionth
+    EvaluationCancelled    if cancelled, after the trials that were running are finished
+    MotionError    if two trials have the same name, such as with speeds that differ by less than a millionth
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     require_names(wanted)
@@ -114,7 +114,7 @@ def _runner(
 
 
 def guide_for(trial: Trial, database: MatchingDatabase) -> Reference:
-    """Compute a trial's trajectory as far beyond its end as the database looks ahead.
+    """Compute a trial's trajectory, extended beyond its end by the look-ahead of the database.
 
     Parameters
     ----------
@@ -176,10 +176,10 @@ def assemble(
 
     Raises
     ------
-    MotionError    for other trials' records
+    MotionError    if the records belong to other trials
     """
     if len(trials) != len(records):
-        raise MotionError(f"{len(records)} records for {len(trials)} trials")
+        raise MotionError(f"each trial needs one record, but there are {len(records)} records for {len(trials)} trials")
     rate = database.options.rate_hz
     results = tuple(
         measure_trial(trial, reference(trial, rate), record, options)
@@ -226,14 +226,14 @@ def evaluate(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """Run the whole suite and measure it, by default beside the same suite over generated clips.
+    """Run and measure the whole suite, by default together with the same suite over generated clips for comparison.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
     threads : int, optional    trials at once, one per processor when None
-    with_baseline : bool    evaluate generated clips, too
+    with_baseline : bool    whether to also evaluate generated clips
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -258,7 +258,7 @@ def evaluate_baseline(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> EvaluationResult:
-    """Evaluate generated clips that own every cell, without records; the last result is cached.
+    """Evaluate clips generated for every cell of the grid, without records; the last result is cached.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The walk of characters through the frames of a set of clips, as a directed graph.
+"""Directed graph of the frames that characters display and of the jumps between them.
 
 The terms are those of Kovar et al. (2002): clips that lead to each other and back form a strongly connected component;
 a dead end is a component that is never left again.
@@ -27,9 +27,9 @@ class WalkGraph:
     Parameters
     ----------
     rows : (N,) int64    database rows displayed, ascending: the nodes
-    ticks : (N,) int64    how long each was displayed
-    edges : (E, 3) int64    row left, row entered, how often; ordered by the first two
-    walks : for each record (R, 3) int64    first tick, first row and number of frames of each uninterrupted run
+    ticks : (N,) int64    number of ticks in which each was displayed
+    edges : (E, 3) int64    row left, row entered and count; ordered by the first two
+    walks : for each record (R, 3) int64    first tick, first row and number of frames of each run without a jump
     """
 
     clips: tuple[DatabaseClip, ...]
@@ -116,7 +116,7 @@ def graph_to_graphml(graph: WalkGraph, trials: Sequence[str] = ()) -> bytes:
     Parameters
     ----------
     graph : WalkGraph    the graph
-    trials : sequence of str    names of the walks; walk0 and so on when empty
+    trials : sequence of str    names of the walks; walk0 and so on if empty
 
     Returns
     -------
@@ -162,7 +162,7 @@ _NOT_IN_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def _readable(text: str) -> str:
-    """Replace what XML 1.0 does not allow, such as control characters."""
+    """Replace characters that XML 1.0 does not allow, such as control characters."""
     return _NOT_IN_XML.sub("\ufffd", text)
 
 
@@ -172,9 +172,9 @@ class ClipGraph:
 
     Parameters
     ----------
-    counts : {(clip left, clip entered): how often}, in ascending order; a clip may follow itself
+    counts : number of jumps by (clip left, clip entered), in ascending order; a clip may follow itself
     components : strongly connected components of the clips that were displayed, largest first, then by lowest index
-    dead_ends : components that were entered and not left again
+    dead_ends : components that were entered and never left
     """
 
     counts: Mapping[tuple[int, int], int]

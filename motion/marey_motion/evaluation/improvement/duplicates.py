@@ -1,9 +1,9 @@
-"""Near-duplicates: clips with the same poses in the same order and the same course of the root.
+"""Near-duplicates: clips with nearly the same poses in the same order and nearly the same path of the root.
 
-A frame is its pose joints and the future root at each horizon, as points in the frame of the root: two walks whose
-poses agree but that turn differently are different. The distance of two clips is that of their best alignment in time
-(`alignment.dtw`): mean distance of the points per frame of the longer clip, in metres. It is 0 for the same frames of
-clips with equal content.
+A frame is compared by points in the frame of its root: the pose joints and the future root at each horizon, so that
+walks with equal poses but different turns differ. The distance of two clips is that of their best alignment in time
+(`alignment.dtw`): the sum over its path of the mean distance between points, divided by the frames of the longer clip,
+in metres. It is 0 for the same frames of clips with equal content.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class NearDuplicate:
 
     Parameters
     ----------
-    distance_cm : per frame
-    same_content : they are the same frames of equal documents
+    distance_cm : distance per frame, centimetres
+    same_content : whether the sources are the same frames of equal documents
     """
 
     first: str
@@ -45,7 +45,7 @@ class NearDuplicate:
 
 @dataclass(frozen=True)
 class NearDuplicates:
-    """Pairs under the threshold, the nearest first, and how many pairs had to be aligned of all there are."""
+    """Pairs within the threshold, nearest first, with the number of pairs that were aligned and of all pairs."""
 
     pairs: tuple[NearDuplicate, ...]
     threshold_cm: float
@@ -63,7 +63,7 @@ def find_near_duplicates(
 ) -> NearDuplicates:
     """Find all pairs of sources whose distance is at most the threshold.
 
-    The result is exact: most pairs are settled by lower bounds of their distance. Progress counts sources.
+    The result is exact: lower bounds of the distance rule out most pairs without alignment. Progress counts sources.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def find_near_duplicates(
 
 
 class _Families:
-    """The clips of a database, those of one source one after another."""
+    """The clips of a database, grouped by source."""
 
     def __init__(self, database: MatchingDatabase) -> None:
         families = clips_by_source(database.clips).values()
@@ -162,7 +162,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose sources to remove so that no pair is left.
+    """Choose sources to remove so that no pair of near-duplicates is left.
 
     Of a pair, the source that is displayed less is removed; in a tie the shorter one, then the one with the higher uid.
 
@@ -174,7 +174,7 @@ def spared_sources(
 
     Returns
     -------
-    tuple of (str, NearDuplicate)    each source with the pair whose other source stays
+    tuple of (str, NearDuplicate)    each source to remove, with the pair whose other source stays
     """
     families = clips_by_source(database.clips)
     frames = {source: database.clips[own[0]].frame_count for source, own in families.items()}

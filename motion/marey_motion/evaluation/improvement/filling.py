@@ -25,7 +25,7 @@ MOST_FRAMES = 200
 
 @dataclass(frozen=True)
 class FilledCell:
-    """A cell of the grid that lacks data, and how many of the missing seconds a candidate has."""
+    """A cell of the grid that lacks data, and the number of missing seconds that a candidate provides."""
 
     speed_m_s: float
     turn_rate_deg_s: float
@@ -40,14 +40,15 @@ class Filling:
     Parameters
     ----------
     collection : name of its collection
-    seconds : of the clip
-    cells : that it helps to fill, most seconds first
-    filled_s : sum over the cells
-    blendable_share : of its frames in these cells, how many come near a frame of the set; None for another skeleton
-    measured : frames compared
-    needs_retarget : it is of another skeleton; its share is known once it is retargeted
-    score : filled_s times blendable_share; candidates are ranked by it, those without a share last by filled_s
-    coverage_index : of the set with this candidate
+    seconds : duration of the clip
+    cells : the cells that it helps to fill, most seconds first
+    filled_s : seconds that it fills, summed over the cells
+    blendable_share : share of its frames in these cells that can be blended with a frame of the set; None for another
+        skeleton
+    measured : number of frames compared
+    needs_retarget : whether it has another skeleton and must be retargeted before its share can be measured
+    score : filled_s times blendable_share, by which candidates are ranked; those without a share follow, by filled_s
+    coverage_index : coverage index of the set with this candidate
     """
 
     collection: str
@@ -65,7 +66,7 @@ class Filling:
 
 @dataclass(frozen=True)
 class Addition:
-    """One step of filling: the gain of a candidate beside the set and all earlier candidates."""
+    """One step of filling: the gain of a candidate over the set with all earlier candidates."""
 
     filling: Filling
     filled_s: float
@@ -83,13 +84,13 @@ def rank_fillings(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[Filling, ...]:
-    """Rank the sources of other collections that hold data the set lacks, the best first.
+    """Rank the sources of other collections that contain data the set lacks, the best first.
 
     Parameters
     ----------
     database : MatchingDatabase    the set
     coverage : Coverage    its coverage
-    collections : mapping of str to MatchingDatabase    by name; of any skeleton, at the set's rate
+    collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
     options : EvaluationOptions    grid and least seconds per cell
     threshold_m : float    distance up to which a frame can be blended, metres, as in `similarity`
     most_frames : int    frames compared per source
@@ -127,7 +128,7 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates: each is the best for the data that the set and the earlier ones lack, until none helps.
+    """Order candidates: each step adds the best for the data that is still missing, until no candidate helps.
 
     Candidates of another skeleton come after all others.
 
@@ -188,7 +189,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Compute the deficit of each cell with `seconds` of data; half a frame is ignored as rounding."""
+    """Compute the deficit of each cell after adding `seconds` of data; half a frame or less counts as rounding."""
     left = np.maximum(missing - seconds, 0.0)
     left[left < 0.5 / options.database.rate_hz] = 0.0
     return left

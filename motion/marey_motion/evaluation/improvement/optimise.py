@@ -1,7 +1,8 @@
 """Optimisation of a data set: clips are removed or added one by one while that lowers an objective.
 
-Every step tries all candidates, each by simulating the trials that it can change, and takes the best one. The objective
-falls with every step, so no set comes twice and the loop ends. The log of the steps is enough to continue later.
+Every step tries all candidates, each by simulating the trials that it can change, and applies the best one. The
+objective decreases with every step, so no set is visited twice and the loop ends. The log of the steps is enough to
+continue later.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ class OptimisationStep:
 
     Parameters
     ----------
-    sources : removed or added: one source, or at once all sources that no trial needs
+    sources : the removed or added sources: one, or all sources that no trial needs
     absent : the sources that are not in the set after the step, in ascending order
-    objective : after the step, metres
+    objective : objective after the step, metres
     metrics : headline metrics after the step
     data_s : seconds of data after the step
-    evaluations : candidates tried up to here, over all steps
+    evaluations : number of candidates tried, over all steps so far
     changed_trials : trials whose result the step changes
     """
 
@@ -72,8 +73,8 @@ def optimise(
     simulation : Resimulation    over a database with all clips of the set and all that may be added
         (`selection.joined`)
     options : OptimisationOptions    objective and budget
-    absent : collection of str    sources that may be added; the others are the set
-    log : sequence of OptimisationStep    earlier steps to continue from; `absent` is then that of their start
+    absent : collection of str    sources that may be added; all other sources are the set
+    log : sequence of OptimisationStep    earlier steps to continue from; `absent` is then the value before these steps
     made : callable, optional    called with every new step
     progress : callable, optional    called as progress(candidates tried, total of this step, uid)
 
@@ -83,7 +84,7 @@ def optimise(
 
     Raises
     ------
-    MotionError    for a log that does not come from this database, these trials and this objective
+    MotionError    if the log was not made with this database, these trials and this objective
     """
     steps = list(log)
     if steps:
@@ -132,8 +133,8 @@ def _require_same(simulation: Resimulation, options: OptimisationOptions, last: 
     value = objective_value(options.objective, simulation.results(last.absent), simulation.seconds(last.absent))
     if value != last.objective:
         raise MotionError(
-            f"the objective is {value:.17g} where the log has {last.objective:.17g}; go on with the same clips, "
-            "normaliser, trials and objective, or start a new log",
+            f"the objective after this step is {value:.17g}, but the log has {last.objective:.17g}; continue with the "
+            "same clips, normaliser, trials and objective, or start a new log",
             code="log-mismatch",
             where=f"step {last.number}",
         )
@@ -152,7 +153,7 @@ class _Search:
         self.spent = False
 
     def best_step(self, last: OptimisationStep, progress: ProgressCallback | None) -> OptimisationStep | None:
-        """Choose the candidate that lowers the objective most; None when none gains enough or the budget is spent."""
+        """Choose the candidate that lowers the objective most; None if none lowers it enough or the budget is spent."""
         candidates = self._candidates(frozenset(last.absent))
         best: tuple[float, Action, tuple[str, ...], Sources] | None = None
         for done, (action, sources, absent) in enumerate(candidates):

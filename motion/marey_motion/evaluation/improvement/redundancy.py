@@ -19,11 +19,11 @@ class Removal:
 
     Parameters
     ----------
-    seconds : of data saved
-    trials : how many need the clip; the others stay as they are, to the last bit
-    changes : of the suite's headline metrics, after minus before
-    harm : change of the objective without its price of data, metres; negative where the removal helps
-    harm_per_s : per second of data saved; removals are ranked by it, the least first
+    seconds : seconds of data saved
+    trials : number of trials that need the clip; all other trials stay identical
+    changes : changes of the suite's headline metrics, after minus before
+    harm : change of the objective without its term for the amount of data, metres; negative if the removal helps
+    harm_per_s : harm per second of data saved, by which removals are ranked, the least first
     """
 
     source: str
@@ -37,13 +37,13 @@ class Removal:
 
 @dataclass(frozen=True)
 class PlannedRemoval:
-    """One step of a plan: a removal beside all earlier ones, and where it leads.
+    """One step of a plan: a removal after all earlier ones, and its result.
 
     Parameters
     ----------
-    removal : measured against the step before
+    removal : the removal, measured against the step before
     metrics : headline metrics of the suite after this step
-    seconds_left : of data
+    seconds_left : seconds of data left
     """
 
     removal: Removal
@@ -66,7 +66,7 @@ def leave_one_out(
     simulation : Resimulation    the suite over the set
     objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
-    consider : int, optional    only so many sources, those that the fewest trials need, then by uid; all when None
+    consider : int, optional    number of sources to try: those that the fewest trials need, then by uid; all if None
     progress : callable, optional    called as progress(sources done, total, uid)
 
     Returns
@@ -102,15 +102,15 @@ def plan_removals(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[PlannedRemoval, ...]:
-    """Plan removals, each the least harmful per second once the earlier ones are made.
+    """Plan removals: each step removes the source that harms least per second of data saved.
 
-    Every step is simulated, so that its metrics are those of an evaluation of the clips that are left. Stops early when
+    Every step is simulated, so its metrics equal those of an evaluation of the remaining clips. The plan ends early if
     nothing more can be removed. Progress counts steps.
 
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
-    count : int    number of removals, at most
+    count : int    largest number of removals
     objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
     consider : int, optional    as for `leave_one_out`

@@ -1,14 +1,14 @@
 """A suite of trials over parts of one database, simulated no more often than needed.
 
-Clips are taken away by making their rows unselectable, which gives the very trials that a database without them gives:
-a row is displayed only when it was chosen or follows one that was, both within its clip; what a trial computes depends
-on displayed and chosen rows and on the least cost among selectable ones; and since the order of rows stays, ties go to
-the same row.
+Clips are removed by making their rows unselectable. The trials are then the same as with a database without these
+clips: a row is displayed only if it was chosen or follows a chosen row of the same clip; a trial depends only on the
+displayed and chosen rows and on the least cost among selectable rows; and since the order of rows stays, ties are
+decided the same way.
 
-For the same reason a trial that neither displays nor chooses a row of some clips is, without these clips, the same to
-the last bit: at every search the row that was cheapest is still there and still the first of the cheapest, and what
-the trial did before the search is the same by induction. So only trials that need a clip are run again without it. The
-same holds from any part of the database to a smaller part, which is how results are shared below.
+For the same reason, removing clips of which a trial neither displays nor chooses a row leaves the trial identical to
+the bit: at every search the cheapest row is still available and still the first of the cheapest, and the trial up to
+the search is the same by induction. So only the trials that need a clip are run again without it. The same is true
+between any part of the database and a smaller part, so results are shared between parts.
 """
 
 from __future__ import annotations
@@ -47,11 +47,12 @@ class Resimulation:
 
     Parameters
     ----------
-    trials : the suite's when None
+    trials : the trials; those of the suite if None
     records : records of these trials over the whole database, if they exist already
     threads, cancelled : as in `suite.run_suite`
 
-    `simulated` counts the trials that were run, `sources` has the indices of each source's clips.
+    The attribute `simulated` is the number of trials that were run; `sources` maps each source to the indices of its
+    clips.
     """
 
     def __init__(
@@ -88,8 +89,8 @@ class Resimulation:
 
         Raises
         ------
-        MotionError    for an unknown source and when no selectable row is left
-        EvaluationCancelled    when cancelled
+        MotionError    if a source is unknown or no selectable row is left
+        EvaluationCancelled    if cancelled
         """
         gone = frozenset(removed)
         require_sources(self.sources, gone)
@@ -150,7 +151,7 @@ class Resimulation:
         return bool(np.any(self.database.selectable & ~rows_of_sources(self.database.clips, removed)))
 
     def seconds(self, removed: Collection[str] = NONE) -> float:
-        """Compute the duration of the data that is left, mirrored copies not counted.
+        """Compute the duration of the remaining data, without mirrored copies.
 
         Parameters
         ----------
@@ -163,7 +164,7 @@ class Resimulation:
         return sum(self._frames(source) for source in self.sources if source not in removed) / self._rate_hz
 
     def seconds_of(self, source: str) -> float:
-        """Compute the duration of one source, its mirrored copy not counted.
+        """Compute the duration of one source, without its mirrored copy.
 
         Parameters
         ----------

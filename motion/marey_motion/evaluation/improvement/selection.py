@@ -1,7 +1,7 @@
 """Parts of a matching database: with fewer clips, with fewer frames, or joined with another one.
 
-Nothing is recomputed: rows keep their features, and the normaliser stays. Clips are taken with their mirrored copies;
-both are named by the uid of the source.
+Nothing is recomputed: rows keep their features, and the normaliser stays. A clip and its mirrored copy are selected
+together, by the uid of the source.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:
-    """Look up the uid of the clip as recorded.
+    """Return the uid of the source: the recorded clip, also for its mirrored copy.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def require_sources(known: Collection[str], wanted: Collection[str]) -> None:
     """
     unknown = sorted(set(wanted) - set(known))
     if unknown:
-        raise MotionError(f"there is no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
+        raise MotionError(f"the database has no clip {unknown[0]}", code="unknown-clip", where=unknown[0])
 
 
 def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> Flags:
@@ -79,7 +79,7 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
     Raises
     ------
-    MotionError    for a source that has no clip
+    MotionError    if a source has no clip
     """
     require_sources({source_of(clip) for clip in clips}, sources)
     rows = np.zeros(clips[-1].stop if clips else 0, dtype=np.bool_)
@@ -96,7 +96,7 @@ def _by_row(database: MatchingDatabase) -> dict[str, Any]:
 
 
 def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabase:
-    """Join two databases of one skeleton and the same options, under the first one's normaliser.
+    """Join two databases with the same skeleton and options; the result has the normaliser of the first.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
 
 def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:
-    """Add local translations of these joints to a database, from their offsets where it has none."""
+    """Add local translations of these joints to a database, equal to their offsets if the joints have none."""
     if joints == database.translated_joints:
         return database
     translations = np.empty((database.row_count, len(joints), 3), np.float32)
@@ -145,8 +145,8 @@ def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> Matchin
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
     """Check whether clips of two databases can be mixed.
 
-    Tips, and offsets that both replace by translations, may differ. A database built with the other's body
-    (`build_database`) has its skeleton.
+    Tips may differ, and so may the offsets of joints that are translated in both databases. A database that is built
+    with the other database's body (`build_database`) has the same skeleton.
 
     Parameters
     ----------

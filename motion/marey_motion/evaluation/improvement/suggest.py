@@ -42,10 +42,10 @@ class Suggestions:
     ----------
     unused : data that can be removed without changing a trial
     redundant : every clip tried, ranked by the harm of its removal per second saved
-    plan : several removals after one another, beginning without the unused clips
+    plan : a sequence of removals, starting from the set without its unused clips
     spared : near-duplicates to remove, each with the pair whose other clip stays
-    fillings, additions : clips of other collections, one by one and after one another
-    tried : how many of the needed clips were left out in turn, and how many there are
+    fillings, additions : clips of other collections, each alone and as a sequence of additions
+    tried : number of needed clips that were left out one at a time, and number of all needed clips
     """
 
     result: EvaluationResult
@@ -77,7 +77,8 @@ def suggest(
     ----------
     database : MatchingDatabase    the set
     result : EvaluationResult    its evaluation with all records
-    collections : mapping of str to MatchingDatabase, optional    others to search for clips, by name; of any skeleton
+    collections : mapping of str to MatchingDatabase, optional    other collections to search for clips, by name; of any
+        skeleton
     options : SuggestionOptions, optional    options
     threads : int, optional    threads to use, one per processor when None
     progress : callable, optional    called as progress(done, total, name)
@@ -89,7 +90,7 @@ def suggest(
 
     Raises
     ------
-    MotionError    when the evaluation does not belong to this database
+    MotionError    if the evaluation does not belong to this database
     EvaluationCancelled    when cancelled
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
@@ -144,19 +145,19 @@ def _redundancy(
 
 def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     if len(result.records) != len(result.trials):
-        raise MotionError("suggestions need the evaluation with the records of all its trials", code="records-missing")
+        raise MotionError("suggestions need an evaluation with the records of all its trials", code="records-missing")
     own = provenance_of(database, result.options, [trial.trial for trial in result.trials])
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:
         raise MotionError(
-            f"the evaluation is of other data: its {' and '.join(different)} differ; evaluate this set first",
+            f"the evaluation belongs to another data set: {' and '.join(different)} differ; evaluate this set first",
             code="not-comparable",
             where=", ".join(different),
         )
 
 
 class _Stages:
-    """Progress over several stages as one count: a thousand for each."""
+    """Progress over several stages as one count, with a thousand units for each stage."""
 
     NAMES = ("duplicates", "similarity", "filling", "leaving out", "planning")
 

@@ -1,4 +1,4 @@
-"""The same suite under other weights of the feature groups, to find those that matter."""
+"""Evaluations of the same suite with other weights of the feature groups, to find the groups that matter."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class SweepRow:
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of one group on the objective, among the settings that differ from the first in it alone.
+    """Influence of one feature group on the objective, from the settings that differ from the first in this group only.
 
     Parameters
     ----------
     spread : largest minus least objective, metres
-    best_weight : with the least objective
-    gain : decrease of the objective against the first setting, metres
+    best_weight : weight with the least objective
+    gain : decrease of the objective from the first setting to the best, metres
     """
 
     group: str
@@ -53,7 +53,7 @@ class Influence:
 
 
 def vary_each_group(options: DatabaseOptions, factors: Sequence[float]) -> tuple[FeatureWeights, ...]:
-    """List the options' weights, then each group's weight times each factor with all others unchanged.
+    """List the given weights, then variants in which one group's weight is multiplied by one factor.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def sweep_weights(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[SweepRow, ...]:
-    """Run the suite under each setting; features and the normaliser's spreads are those of the database.
+    """Run the suite with each setting; features and the normaliser's spreads are those of the database.
 
     Progress counts trials over all settings.
 
@@ -143,7 +143,7 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
 
     Raises
     ------
-    MotionError    for a group whose weight was 0: its scale is not known
+    MotionError    if the weight of a group was 0, so that its scale is not known
     """
     options = database.options.model_copy(update={"weights": weights})
     scale = database.normaliser.scale.copy()

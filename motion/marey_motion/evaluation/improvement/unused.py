@@ -1,13 +1,13 @@
 """Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
 
-Both can go without changing any trial, to the last bit, as long as the normaliser stays: `resimulation` says why for
-clips. Of a used clip those frames are unneeded that lie farther than `MARGIN_BEFORE_S` before and the look-ahead plus
-`MARGIN_AFTER_S` after every frame that a trial displayed or chose, and beyond the window of frames that a search there
-may not choose. Taking their rows out of the database leaves the rows that are needed, the ones that follow them and all
-their features as they are. The margins are as wide as filters and differences reach, so that they hold what the
-features of needed frames were made from, too; but a recording that is cut there is sampled and filtered again, which
-rounds differently, and its frames near the cut have no frames to look ahead to. The result is then nearly, but not
-exactly, the same, and such a cut is not called safe.
+Both can be removed from the database without changing any trial, to the bit, as long as the normaliser stays;
+`resimulation` explains why for whole clips. A frame of a used clip is unneeded if it is far from every frame that a
+trial displayed or chose: at least `MARGIN_BEFORE_S` before it, or the look-ahead plus `MARGIN_AFTER_S` after it, and
+outside the window in which a search at that frame may not choose. Removing the rows of unneeded frames changes neither
+the needed rows, nor the rows that follow them, nor their features. The margins also contain all frames from which
+filters and differences computed the features of needed frames. If instead the recording itself is cut there, it is
+sampled and filtered again, which rounds differently, and frames near the cut have no frames to look ahead to. The
+result is then nearly, but not exactly, the same, so such a cut is not reported as safe.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class UnusedClip:
 
 @dataclass(frozen=True)
 class UnusedRange:
-    """Frames [start, stop), at the database's rate from the clip's first row, that no trial needs of a source.
+    """Frames [start, stop) of a source that no trial needs, neither in the clip nor in its mirrored copy.
 
-    They are unneeded in the clip and in its mirrored copy. Times are times of the recording, which may begin before the
-    first row.
+    Frames are counted at the database's rate from the clip's first row. Times are those of the recording, which may
+    begin before the first row.
     """
 
     source: str
@@ -74,7 +74,7 @@ class Unused:
 
     @property
     def seconds(self) -> float:
-        """Seconds of data saved by all of it, mirrored copies not counted."""
+        """Seconds of data saved by removing all of it, without mirrored copies."""
         return sum(clip.seconds for clip in self.clips) + sum(part.seconds for part in self.ranges)
 
 
