@@ -47,9 +47,9 @@ def write_clip_file(
     ----------
     clip : Clip    the motion
     file_format : str    name of the format
-    unit : str or float    unit of length by name or in metres, where the format leaves it open
-    info : mapping, optional    the clip's `info` document; Euler angles keep the rotation orders of the file it came
-        from
+    unit : str or float    unit of length by name or in metres, for formats without a fixed unit
+    info : mapping, optional    the clip's `info` document; Euler angles are written in the rotation orders of the file
+        from which the clip was imported
 
     Returns
     -------
@@ -76,15 +76,15 @@ def write_motion_file(
     time: Literal["canonical", "source"] = "canonical",
     skeleton: Skeleton | None = None,
 ) -> ExportedFile:
-    """Write the motion of a clip, or of an aligned clip, as a file: the export that server and worker share.
+    """Write the motion of a clip, or of an aligned clip, as a file; server and worker both export by this function.
 
     Parameters
     ----------
-    source : ItemToExport    its documents; `hierarchy` is needed unless `skeleton` is given
+    source : ItemToExport    the item's documents; `hierarchy` is needed unless `skeleton` is given
     file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
-    unit : str or float    unit of length by name or in metres, where the format leaves it open
-    time : str    of an aligned clip: its canonical frames, or those of the clip it was made of, where that was
-    skeleton : Skeleton, optional    the skeleton, where it was made of its hierarchy before
+    unit : str or float    unit of length by name or in metres, for formats without a fixed unit
+    time : str    for an aligned clip, whether to write its canonical frames or restore the source clip
+    skeleton : Skeleton, optional    the skeleton, if it was already made from `hierarchy`
 
     Returns
     -------
@@ -106,7 +106,7 @@ def write_motion_file(
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
-    """Read the rotation orders of the file a clip came from, where it is still on that file's skeleton."""
+    """Read the rotation orders of the file a clip was imported from, if the clip still has that file's skeleton."""
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))
     if len(channels) != clip.skeleton.joint_count:

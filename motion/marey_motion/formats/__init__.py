@@ -1,6 +1,6 @@
-"""Files of motion: readers and writers, one module per row of `marey_schemas.formats`, and one conversion of units.
+"""Readers and writers of motion files, one module per format of `marey_schemas.formats`, and the conversion of units.
 
-A module has `read_<name>` where its row reads something, and `write_<name>` where it writes motion.
+A module has `read_<name>` if its format can be imported, and `write_<name>` if motion can be exported to it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read_motion(
     Parameters
     ----------
     data : bytes    the content of the file
-    name : str    its name: the ending helps to detect the format, and messages carry it
+    name : str    its name, which helps to detect the format and appears in messages
     companion : bytes, optional    the ASF of an AMC, the skeleton document of a predecessor's clip
     companion_name : str    its name, for messages
     options : ImportOptions, optional    facts that the user knows better than the file
@@ -61,7 +61,7 @@ def read_motion(
     Raises
     ------
     UnknownFormat    if no reader knows the file
-    AmbiguousUnits    if the user has to choose a unit of length or an axis
+    AmbiguousUnits    if the unit of length or the upward axis cannot be determined and must be given in `options`
     FormatError    with file, line and joint, if the file is wrong
 
     Examples
@@ -94,7 +94,7 @@ def read_source(
     ----------
     data : bytes    the content of the file
     name : str    its name
-    companion : bytes or None    content of the file that belongs to it
+    companion : bytes or None    content of the companion file, such as the ASF of an AMC
     companion_name : str    its name
     options : ImportOptions    facts that the user knows better than the file
 
@@ -136,7 +136,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
     Raises
     ------
-    UnknownFormat    for any other format
+    UnknownFormat    if the format is not one of these
     FormatError    if the format cannot hold the clip
 
     Examples

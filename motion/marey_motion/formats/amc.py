@@ -1,6 +1,6 @@
-"""AMC (Acclaim motion capture): reading a motion with the ASF skeleton it belongs to.
+"""AMC (Acclaim motion capture): reading a motion together with its ASF skeleton.
 
-Angles turn about fixed axes in the order the skeleton lists them: `dof rx ry rz` is Rz · Ry · Rx.
+Angles are extrinsic rotations about fixed axes, in the order of the skeleton's `dof`: `dof rx ry rz` is Rz · Ry · Rx.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def read_amc(
     file : str    its name, for messages
     companion : bytes, optional    content of the ASF file
     companion_name : str    its name, for messages
-    frame_rate_hz : float, optional    frames per second; AMC files carry none, 120 is assumed with a warning
+    frame_rate_hz : float, optional    frames per second; if neither this nor the file gives a rate, 120 is assumed with
+        a warning
 
     Returns
     -------
@@ -73,23 +74,23 @@ def read_amc(
 
 
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
-    """Read whether angles are in degrees, and the frame rate if one is given; leave `lines` before the first frame.
+    """Read the unit of angles and the frame rate, if given; leave `lines` before the first frame.
 
-    Where the AMC does not say, its angles are in the unit of its skeleton's, `degrees` or not.
+    Returns whether angles are in degrees; if the AMC does not say, `degrees`, which is the unit of its skeleton.
     """
     rate_hz = None
     while True:
         position, number = lines.position, lines.number
         line = next(iter(lines), None)
         if line is None:
-            raise lines.error("the file holds no frames", code="file-truncated")
+            raise lines.error("the file contains no frames", code="file-truncated")
         words = line.lower().split()
         if words[0] == b":degrees" or words[0] == b":radians":
             degrees = words[0] == b":degrees"
         elif words[0] == b":samples-per-second":
             rate_hz = lines.numbers(words[1:], 1, ":SAMPLES-PER-SECOND")[0]
             if rate_hz <= 0:
-                raise lines.error("a frame rate must be positive")
+                raise lines.error(f"the frame rate must be positive, not {rate_hz:g}")
         elif words[0].isdigit():
             lines.position, lines.number = position, number
             return degrees, rate_hz

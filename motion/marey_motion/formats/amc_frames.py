@@ -1,6 +1,6 @@
-"""Frames of an AMC file, scanned.
+"""Scanner of the frames of an AMC file.
 
-A frame is a line with its number, then one line per bone, in any order: its name and a value per degree of freedom.
+A frame is a line with its number, then one line per bone, in any order: its name and one value per degree of freedom.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LONG_TOKENS_PER_CALL = 1 << 14
 
 @dataclass(frozen=True)
 class BoneTable:
-    """The bones as the scanner needs them: names end to end, where each ends, and which columns are its own."""
+    """Bones of the skeleton as arrays for the scanner: concatenated names with their ends, and columns of each bone."""
 
     names: NDArray[np.uint8]
     name_ends: NDArray[np.int64]
@@ -164,7 +164,7 @@ def _begin_frame(text, start, stop, state):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore[no-untyped-def]
-    """Return the index of the bone named at `text[start:stop]`, searched from `expected` on; -1 if there is none."""
+    """Return the index of the bone whose name is `text[start:stop]`, or -1; the search begins at bone `expected`."""
     bones = name_ends.size
     for step in range(bones):
         bone = expected + step
@@ -185,7 +185,7 @@ def _bone_called(text, start, stop, names, name_ends, expected):  # type: ignore
 
 @compiled
 def _read_bone(text, i, first_columns, values, long_tokens, state):  # type: ignore[no-untyped-def]
-    """Read the numbers up to the end of the line; return where they end, or -1 if one is malformed."""
+    """Read the numbers up to the end of the line; return the position after them, or -1 if a number is malformed."""
     bone, frame = state[_BONE], state[_FRAME]
     state[_FOUND] = 0
     while i < text.size and text[i] != 10 and text[i] != 13:
@@ -230,21 +230,21 @@ def _read_long_tokens(
 def _fail(
     stopped: int, lines: TextLines, skeleton: AsfSkeleton, seen: NDArray[np.int64], state: NDArray[np.int64]
 ) -> NoReturn:
-    """Raise what stopped the scanner, at the line where it stopped."""
+    """Raise the error that stopped the scanner, with the line where it stopped."""
     bone = skeleton.bones[state[_BONE]]
     word = lines.data[state[_POSITION] : state[_POSITION] + 64].split(maxsplit=1)[:1] or [b""]
     if stopped == _BAD_NUMBER:
         raise lines.error(number_problem(excerpt(word[0])), code="bad-number", joint=bone.name)
     if stopped == _UNKNOWN_BONE:
         raise lines.error(
-            f"the skeleton has no bone {excerpt(word[0])!r}; is this the AMC's own ASF?", code="unknown-bone"
+            f"the skeleton has no bone {excerpt(word[0])!r}; use the ASF that belongs to this AMC", code="unknown-bone"
         )
     if stopped == _REPEATED_BONE:
         raise lines.error(f"the bone appears twice in frame {state[_NUMBER]}", joint=bone.name)
     if stopped == _WRONG_WIDTH:
         cut = state[_FOUND] < len(bone.channels) and not lines.data[state[_POSITION] :].strip(b"\r\n\t ").count(b"\n")
         raise lines.error(
-            f"{state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
+            f"the bone has {state[_FOUND]} values for {len(bone.channels)} degrees of freedom"
             + ("; the file is cut off" if cut else ""),
             code="file-truncated" if cut else "frame-width",
             joint=bone.name,

@@ -1,9 +1,10 @@
 """ASF (Acclaim skeleton file): reading.
 
-A bone has a direction and a length in world axes at rest, and an `axis`, the frame its angles are measured in. With C
-the rotation of that frame and M the one of the angles, the bone turns by C · M · C⁻¹ against its parent. Joints here
-keep world-aligned frames at rest (identity rest rotations, as in BVH): each sits at the start of its bone, so its
-offset is its parent's bone vector, and bones that end the hierarchy leave an end site.
+In an ASF, a bone has a direction and a length in world axes at rest, and an `axis`: the frame in which its angles are
+measured. With C the rotation of that frame and M the rotation by the angles, the bone turns by C · M · C⁻¹ relative to
+its parent. The joints that are made of the bones have world-aligned frames at rest (identity rest rotations, as in
+BVH). Each joint is at the start of its bone, so its offset is its parent's bone vector; the end of a bone without
+children becomes an end site.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ _CHANNELS = {kind + axis for kind in "rt" for axis in _AXES}
 
 @dataclass
 class Bone:
-    """A bone as the file has it.
+    """A bone in the units and conventions of the file.
 
-    `vector` is direction times length in the file's unit, world axes; `frame` the quaternion of its `axis`;
-    `channels` its degrees of freedom in order ("rx", "tz"); `line` its line in the file.
+    `vector` is the direction times the length, in the file's unit and world axes. `frame` is the quaternion of its
+    `axis`. `channels` are its degrees of freedom in order ("rx", "tz"). `line` is its line in the file.
     """
 
     name: str
@@ -167,7 +168,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
 
 
 class _AsfReader:
-    """Reads section by section; a section is every line after a keyword that begins with a colon."""
+    """Reader of the sections of an ASF file; a section is a keyword that begins with a colon and the lines after it."""
 
     def __init__(self, lines: TextLines) -> None:
         self.lines = lines
@@ -204,7 +205,7 @@ class _AsfReader:
         if words[0].lower() == b"length":
             self.length_unit = self.lines.numbers(words[1:], 1, "length")[0]
             if self.length_unit <= 0:
-                raise self.lines.error(f"a unit of length of {self.length_unit}; a positive number is needed")
+                raise self.lines.error(f"the unit of length must be a positive number, not {self.length_unit}")
         elif words[0].lower() == b"angle":
             degrees = _IN_DEGREES.get(b" ".join(words[1:]).lower())
             if degrees is None:
@@ -227,7 +228,7 @@ class _AsfReader:
         if keyword == b"begin":
             self.bone = Bone("", self.lines.number)
         elif bone is None:
-            raise self.lines.error(f"{excerpt(words[0])!r} outside of begin … end")
+            raise self.lines.error(f"{excerpt(words[0])!r} must be between begin and end")
         elif keyword == b"end":
             self._end_bone(bone)
         elif keyword == b"name":
@@ -251,9 +252,9 @@ class _AsfReader:
         if not bone.name or len(bone.name) > MAX_JOINT_NAME_LENGTH:
             raise self.lines.error(f"a bone needs a name of at most {MAX_JOINT_NAME_LENGTH} characters")
         if bone.name in self.bones or bone.name == ROOT:
-            raise self.lines.error("a second bone of this name", joint=bone.name)
+            raise self.lines.error("two bones have this name; rename one of them", joint=bone.name)
         if bone.direction is None:
-            raise self.lines.error("the bone has no direction", joint=bone.name)
+            raise self.lines.error("the bone has no direction; add a line 'direction x y z'", joint=bone.name)
         if len(self.bones) + 1 == MAX_JOINTS:
             raise FormatLimit(f"more than {MAX_JOINTS} bones", file=self.lines.file, line=self.lines.number)
         self.bones[bone.name] = bone

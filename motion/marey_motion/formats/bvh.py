@@ -1,7 +1,7 @@
 """BVH (Biovision hierarchy): reading; writing is in `bvh_writer`.
 
-Rotations are intrinsic in the order of a joint's CHANNELS, in degrees, whatever their number and wherever its
-position channels are. Position channels replace the joint's OFFSET, axis by axis.
+Rotations are intrinsic, in degrees, in the order of a joint's CHANNELS; a joint may have any number of rotation
+channels, before or after its position channels. A position channel replaces the joint's OFFSET on its axis.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _PRINTED_DIGITS = 1e-6
 
 @dataclass(frozen=True)
 class ChannelColumns:
-    """Columns of the number table that hold each channel.
+    """Columns of the number table in which each channel is.
 
-    `turns` and `axes` are (J, 3): column and axis of each joint's turns; `positions` is (J, 3): column of x, y, z.
-    `NO_COLUMN` marks a channel that the joint lacks. `labels` name each column for messages.
+    `turns` and `axes` (J, 3) are the column and the axis of each joint's rotations; `positions` (J, 3) are the columns
+    of x, y and z. `NO_COLUMN` marks a channel that the joint lacks. `labels` name each column for messages.
     """
 
     turns: NDArray[np.int64]
@@ -133,14 +133,14 @@ def _read_frames(
         lines.number = table.ragged_line
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
-            f"{counted(table.ragged_count, 'value')}; the channels need {width}"
+            f"the line has {counted(table.ragged_count, 'value')}, but the channels need {width}"
             + ("; the file is cut off in its last line" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )
     if frames == 0 and header.declared_frames:
         lines.number = header.data_line
         declared = counted(header.declared_frames, "frame")
-        raise lines.error(f"the header declares {declared} and none follows", code="file-truncated")
+        raise lines.error(f"the header declares {declared}, but the file contains none", code="file-truncated")
     _warn_of_layout(header, frames, wrapped, warnings)
     return table.values.reshape(frames, width) if frames else np.empty((0, width))
 
@@ -178,7 +178,7 @@ def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: Cha
 def _positions_of(
     joints: list[int], values: NDArray[np.float64], columns: ChannelColumns, offsets: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Read local positions (F, k, 3) of k joints: position channels, and OFFSET on the axes without one."""
+    """Read local positions (F, k, 3) of k joints: position channels, or OFFSET on axes without a position channel."""
     wanted = columns.positions[joints]
     positions = values[:, wanted]
     absent = wanted == NO_COLUMN
@@ -187,7 +187,7 @@ def _positions_of(
 
 
 def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Fill in offsets where a file has none at all below the root, and leaves its bones to the position channels."""
+    """Compute offsets from the position channels if all OFFSETs below the root are zero."""
     if source.offsets[1:].any():
         return
     bones = np.median(translations, axis=0)
@@ -205,10 +205,10 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Add offsets where a file's position channels below the root are displacements from them, as some exporters write.
+    """Add offsets to position channels below the root that are displacements from them, as some exporters write.
 
-    Taken as positions they would fold every bone to nothing, which no motion does: the channels of most joints stay
-    within a tenth of a bone's length of zero.
+    Such channels are detected by their size: those of most joints stay within a tenth of the bone's length of zero.
+    Taken as positions, they would give every bone nearly no length.
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)
@@ -228,7 +228,7 @@ def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float6
 
 
 def _drop_redundant_translations(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Keep only joints whose positions say more than their OFFSET, to the last digit that files print."""
+    """Keep only joints whose positions differ from their OFFSET by more than the rounding of files."""
     offsets = source.offsets[list(source.translated_joints)]
     size = np.abs(source.offsets).max()
     moving = (np.abs(translations - offsets) > _PRINTED_DIGITS * size).any(axis=(0, 2))

@@ -48,7 +48,7 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """A HIERARCHY that was read, and the position and line number after it. Nothing changes its lists."""
+    """A parsed HIERARCHY, and the position and line number after it. Its lists are never changed."""
 
     header: BvhHeader
     position: int
@@ -98,7 +98,7 @@ def _read_hierarchy(lines: TextLines) -> BvhHeader:
 
 
 class _HierarchyReader:
-    """Reads joints piece by piece; the open joints are a list, not the call stack, so depth costs nothing."""
+    """Reader of joints, token by token; open joints are in a list, not on the call stack, so depth does not matter."""
 
     def __init__(self, lines: TextLines) -> None:
         self.lines = lines
@@ -117,13 +117,13 @@ class _HierarchyReader:
     def _read_piece(self, piece: bytes) -> None:
         if piece == b"{":
             if not self.brace_due:
-                raise self.lines.error("{ without a joint before it", joint=self._joint_name())
+                raise self.lines.error("a { must follow a joint", joint=self._joint_name())
             self.brace_due = False
         elif self.brace_due:
-            raise self.lines.error(f"{{ is needed here, not {excerpt(piece)!r}", joint=self._joint_name())
+            raise self.lines.error(f"a {{ must follow the joint, not {excerpt(piece)!r}", joint=self._joint_name())
         elif piece == b"}":
             if not self.open:
-                raise self.lines.error("} without a joint to close")
+                raise self.lines.error("this } closes no joint; remove it")
             self.open.pop()
         else:
             keyword, *rest = piece.split(maxsplit=1)
@@ -140,7 +140,7 @@ class _HierarchyReader:
             self._read_channels(rest.split())
         else:
             raise self.lines.error(
-                f"{excerpt(piece)!r} is not what belongs here: ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace",
+                f"expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, not {excerpt(piece)!r}",
                 joint=self._joint_name(),
             )
 
@@ -148,19 +148,22 @@ class _HierarchyReader:
         header = self.header
         if keyword == b"ROOT" and header.names:
             raise self.lines.error(
-                "a second ROOT; a file holds one skeleton here, so split it into one file per ROOT",
+                "the file has a second ROOT, but only one skeleton per file is supported; split it into one file per "
+                "ROOT",
                 code="several-roots",
             )
         if not self.open and keyword == b"JOINT":
-            raise self.lines.error("a JOINT outside of any joint; the first one must be ROOT")
+            raise self.lines.error("this JOINT has no parent; the first joint must be a ROOT")
         if self.open and self.open[-1] == _END_SITE:
-            raise self.lines.error("a JOINT inside an End Site", joint=self._joint_name())
+            raise self.lines.error("an End Site must not contain a JOINT", joint=self._joint_name())
         if len(header.names) == MAX_JOINTS:
-            raise FormatLimit(f"more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number)
+            raise FormatLimit(
+                f"the file has more than {MAX_JOINTS} joints", file=self.lines.file, line=self.lines.number
+            )
         name = decode_name(rest) or f"joint{len(header.names)}"
         if len(name) > MAX_JOINT_NAME_LENGTH:
             raise self.lines.error(
-                f"a joint name of {len(name)} characters, more than the limit of {MAX_JOINT_NAME_LENGTH}"
+                f"the joint name has {len(name)} characters, more than the limit of {MAX_JOINT_NAME_LENGTH}"
             )
         self.brace_due = True
         header.parents.append(self.open[-1] if self.open else -1)
@@ -171,14 +174,14 @@ class _HierarchyReader:
 
     def _begin_end_site(self) -> None:
         if not self.open or self.open[-1] == _END_SITE:
-            raise self.lines.error("an End Site outside of any joint", joint=self._joint_name())
+            raise self.lines.error("an End Site must be inside a joint", joint=self._joint_name())
         self.brace_due = True
         self.header.end_sites.append((self.open[-1], [0.0, 0.0, 0.0]))
         self.open.append(_END_SITE)
 
     def _read_offset(self, words: list[bytes]) -> None:
         if not self.open:
-            raise self.lines.error("OFFSET outside of any joint")
+            raise self.lines.error("an OFFSET must be inside a joint")
         offset = self.lines.numbers(words, 3, "OFFSET", self._joint_name())
         if self.open[-1] == _END_SITE:
             self.header.end_sites[-1] = (self.header.end_sites[-1][0], offset)
@@ -188,15 +191,17 @@ class _HierarchyReader:
     def _read_channels(self, words: list[bytes]) -> None:
         joint = self._joint_name()
         if not self.open or self.open[-1] == _END_SITE:
-            raise self.lines.error("CHANNELS outside of any joint", joint=joint)
+            raise self.lines.error("CHANNELS must be inside a joint", joint=joint)
         if not words or not words[0].isdigit():
-            raise self.lines.error("CHANNELS needs the number of channels", joint=joint)
+            raise self.lines.error("CHANNELS must be followed by the number of channels", joint=joint)
         names = [_CHANNEL_BY_KEY.get(word.lower(), "") for word in words[1:]]
         if "" in names:
             unknown = excerpt(words[1 + names.index("")])
             raise self.lines.error(f"channel {unknown!r} is not one of {', '.join(CHANNELS)}", joint=joint)
         if len(words[0]) > 3 or int(words[0]) != len(names):
-            raise self.lines.error(f"CHANNELS says {excerpt(words[0])} and names {len(names)}", joint=joint)
+            raise self.lines.error(
+                f"CHANNELS declares {excerpt(words[0])} channels, but lists {len(names)}", joint=joint
+            )
         if len(set(names)) != len(names):
             raise self.lines.error("a channel is named twice", joint=joint)
         self.header.channels[self.open[-1]] = tuple(names)
@@ -224,7 +229,7 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
         elif match := _FRAMES.fullmatch(line):
             frames = match[1]
             if not frames.isdigit() or len(frames) > 18:
-                raise lines.error(f"Frames is {excerpt(frames)!r}, a count is needed")
+                raise lines.error(f"Frames must be a whole number, not {excerpt(frames)!r}")
         elif frames is not None and read_number(line.split()[0]) is not None:
             lines.position, lines.number = position, number  # the numbers begin without a Frame Time
             break

@@ -1,7 +1,7 @@
 """BVH: writing.
 
-The root and every joint with translations of its own get six channels, all others three, positions first: the layout
-that every loader reads. Positions replace offsets, as this project's reader and the common ones understand them.
+The root and every joint with translations have six channels, positions before rotations; all other joints have three
+rotation channels. This is the most common layout. Positions replace offsets, as most readers expect.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def write_bvh(
     ----------
     clip : Clip    F frames
     unit : str or float    unit of length by name ("cm", "m", "inch", …) or in metres
-    rotation_order : str    order of the turns, outermost first, for joints without one in `source`
+    rotation_order : str    order of the rotations, outermost first, for joints without an order in `source`
     source : SourceInfo, optional    record of the file the clip was imported from; its joints keep their rotation
         orders
 
@@ -46,7 +46,7 @@ def write_bvh(
 
     Raises
     ------
-    FormatError    when a length in that unit has more than twelve digits before the point
+    FormatError    if a length in that unit has more than twelve digits before the decimal point
     """
     order = _depth_first(clip.skeleton)
     axes = np.array([_axes_of(clip.skeleton, joint, rotation_order, source) for joint in order])
@@ -67,7 +67,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """List joints in depth-first order; the order of the skeleton where that is one."""
+    """List joints in depth-first order: the order of the skeleton if it is depth-first."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()
@@ -105,7 +105,7 @@ def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: flo
 
 
 def _written_name(name: str) -> str:
-    """Remove the characters that would end a name in the file."""
+    """Replace the characters of a joint name that BVH does not allow by underscores."""
     return "".join("_" if character in "{}\n\r" else character for character in name)
 
 

@@ -55,7 +55,8 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
 
     Raises
     ------
-    AmbiguousUnits    when neither the file, its body nor the options give the unit or the upward axis
+    AmbiguousUnits    if neither the file nor the options state the unit or the upward axis, and the size and pose of
+        the body do not determine it
     """
     _check_range(source, file)
     try:
@@ -97,7 +98,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
 
 
 def _check_range(source: SourceMotion, file: str) -> None:
-    """Refuse lengths whose squares or float32 forms would overflow; no body or path is that long in any unit."""
+    """Refuse lengths whose squares or float32 values would overflow; no body or path is that long in any unit."""
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
@@ -133,13 +134,13 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
 
 
 def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    """Convert vectors (..., 3) to other axes and to metres; bits stay where nothing changes."""
+    """Convert vectors (..., 3) to other axes and to metres; exact if nothing changes."""
     turned = vectors if np.array_equal(axes, np.eye(3)) else vectors @ axes.T
     return turned if scale == 1.0 else turned * scale
 
 
 def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real]:
-    """Convert rotations to other axes. A mirrored axis also reverses the sense of rotation, so signs are exact."""
+    """Convert rotations to other axes, exactly. A mirrored axis also reverses the direction of rotation."""
     if np.array_equal(axes, np.eye(3)):
         return rotations
     sense = np.rint(np.linalg.det(axes))
@@ -169,6 +170,6 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
 
 @lru_cache(maxsize=KEPT_SKELETONS)
 def _rotation_orders(channels: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
-    """List the orders in which joints of more than one turn take them."""
+    """List the rotation orders of the joints with more than one rotation channel."""
     orders = {"".join(name[0] for name in names if name.endswith("rotation")) for names in channels}
     return tuple(sorted(order for order in orders if len(order) > 1))

@@ -1,4 +1,4 @@
-"""Detection of a file's format by its content, or by its name where the content does not show it."""
+"""Detection of a file's format by its content, or by its name if the content is not sufficient."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ZIP = b"PK\x03\x04"
 
 
 def detect_format(data: bytes, name: str) -> FileFormat:
-    """Find the format of a file; its content counts more than its name.
+    """Find the format of a file; its content has precedence over its name.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def detect_format(data: bytes, name: str) -> FileFormat:
 
     Raises
     ------
-    UnknownFormat    for empty files, archives and formats without a row in `marey_schemas.formats`
+    UnknownFormat    if the file is empty, an archive, or of a format that is not in `marey_schemas.formats`
     """
     start = data[:_START]
     if not start.strip(_BLANK) and not data.strip(_BLANK):
@@ -53,7 +53,7 @@ def detect_format(data: bytes, name: str) -> FileFormat:
         archive = "zip"
     if archive:
         raise UnknownFormat(
-            f"a {archive} archive; unpack it and import the files inside", code="format-archive", file=name
+            f"the file is a {archive} archive; unpack it and import the files inside", code="format-archive", file=name
         )
     foreign = next((kind for mark, kind in _FOREIGN.items() if data.startswith(mark)), None)
     if foreign:

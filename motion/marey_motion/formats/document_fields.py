@@ -1,4 +1,4 @@
-"""Fields of unvalidated documents: the value in the required type, or an error that names the field."""
+"""Reading of fields of unvalidated documents: a value of the required type, or an error that names the field."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Euler angles of files to quaternions and back, each joint with its own order of axes.
+"""Conversion between Euler angles of files and quaternions; each joint has its own order of axes.
 
-Angles are intrinsic: channels Z, X, Y mean R = Rz · Rx · Ry, each turn about the axes that the ones before it made.
+Angles are intrinsic: channels Z, X, Y mean R = Rz · Rx · Ry.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _EXACTLY_REDUCED_DEG = 1e9
 def _half_angle(angle_deg):  # type: ignore[no-untyped-def]
     """Compute cosine and sine of half an angle given in degrees.
 
-    Degrees are reduced exactly before they become radians, and the same operations run on every machine, so that one
-    file gives the same bytes everywhere.
+    Angles are reduced exactly, in degrees, before the conversion to radians. The operations are the same on every
+    machine, so a file gives the same bytes everywhere.
     """
     if abs(angle_deg) > _EXACTLY_REDUCED_DEG:
         angle_deg = np.fmod(angle_deg, 720.0)
@@ -87,8 +87,8 @@ def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-u
 def euler_from_rotations(rotations, axes, angles_deg):  # type: ignore[no-untyped-def]
     """Fill Euler angles from quaternions by way of the rotation matrix; the inverse of `rotations_from_euler`.
 
-    Of the two solutions the one nearer to the frame before is taken, and whole turns are added so that angles do not
-    jump. Where the middle turn is a right angle the third follows the frame before and the first takes the rest.
+    Of the two solutions, the one nearer to the frame before is used, and whole turns are added so that angles do not
+    jump. In gimbal lock (middle angle ±90°), the third angle stays as in the frame before and the first is computed.
 
     Parameters
     ----------

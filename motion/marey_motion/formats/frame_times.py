@@ -1,4 +1,4 @@
-"""Frame rates behind rounded frame times."""
+"""Frame rates computed from the rounded frame times of files."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ LONGEST_FRAME_TIME_S = 1.0
 def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWarning]) -> float:
     """Compute the rate of a file from its frame time.
 
-    Files round: .0083333 means 120 Hz. A known rate within a relative 1e-4 is taken instead of the reciprocal, with a
-    warning where they differ beyond the last bits. Farther from it, as .0333 is from 30 Hz, the reciprocal is taken and
-    a warning names the rate that may be meant.
+    Files round frame times: .0083333 means 120 Hz. If a common rate is within a relative difference of 1e-4 of the
+    reciprocal, it is used instead, with a warning if the two differ by more than the last bits. If the difference is
+    larger, as for .0333 and 30 Hz, the reciprocal is used and a warning names the rate that may be meant.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
 
     Raises
     ------
-    FormatError    if no valid rate follows, naming the option that sets it
+    FormatError    if the frame time gives no valid rate; the error names the option that sets the rate
     """
     if frame_time_s is None:
         raise _no_rate("the file has no Frame Time", file)

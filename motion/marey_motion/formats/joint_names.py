@@ -9,7 +9,7 @@ MAX_JOINT_NAME_LENGTH = 255
 
 
 def unique_names(names: Sequence[str], parents: Sequence[int]) -> tuple[str, ...]:
-    """Make names unique with the parent's name before them and, if necessary, a number.
+    """Make repeated names unique by prefixing the parent's name and, if necessary, adding a number.
 
     The same hierarchy always gets the same names.
 

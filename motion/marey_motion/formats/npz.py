@@ -123,7 +123,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
 
 def _foreign(data: bytes, file: str) -> FormatError:
-    """Explain the error for an archive of another kind: AMASS and its like are npz files, too."""
+    """Make the error for an npz archive of another kind, such as AMASS."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = [excerpt(name.removesuffix(".npy").encode()) for name in archive.namelist()[:_MEMBERS_SHOWN]]
     if {"poses", "trans"} <= set(members):
@@ -140,7 +140,7 @@ def _source(arrays: dict[str, NDArray[Any]], file: str, frame_rate_hz: float | N
     joints = arrays["joint_names"].size
     names = tuple(str(name) for name in arrays["joint_names"])
     if not 1 <= joints <= MAX_JOINTS:
-        raise FormatLimit(f"{joints} joints; 1 to {MAX_JOINTS} are accepted", file=file)
+        raise FormatLimit(f"the file has {joints} joints; 1 to {MAX_JOINTS} are accepted", file=file)
     sites = _array(arrays, "end_site_joints", "i", (arrays["end_site_joints"].size,), file)
     tips = _array(arrays, "end_site_offsets", "f", (len(sites), 3), file).astype(np.float64)
     source = SourceMotion(
@@ -174,7 +174,7 @@ def _array(arrays: dict[str, NDArray[Any]], name: str, kind: str, shape: tuple[i
     if array.dtype.kind != kind or array.shape != shape:
         raise FormatError(
             f"member {name!r} is {array.dtype} of shape {array.shape}; "
-            f"{'integers' if kind == 'i' else 'floating point'} of shape {shape} is needed",
+            f"{'integers' if kind == 'i' else 'floating point numbers'} of shape {shape} are needed",
             file=file,
         )
     if kind == "f" and not np.isfinite(array).all():
@@ -189,7 +189,11 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
             members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in known]
             total = sum(info.file_size for info in members)
             if total > MAX_BYTES or len(members) > len(known):
-                raise FormatLimit(f"the archive unpacks to {total} bytes; {MAX_BYTES} are accepted", file=file)
+                raise FormatLimit(
+                    f"the archive unpacks to {total} bytes in {len(members)} files; at most {MAX_BYTES} bytes in "
+                    f"{len(known)} files are accepted",
+                    file=file,
+                )
             return {info.filename.removesuffix(".npy"): _read_member(archive, info) for info in members}
     except _ARCHIVE_ERRORS as error:
         if isinstance(error, FormatError):
@@ -198,18 +202,18 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array, whose header must announce exactly the bytes that follow it."""
+    """Read one array, and check that the size in its header is the size of its data."""
     content = archive.read(info)
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
-        raise ValueError(f"member {info.filename} is .npy version {version}, 1.0 is needed")
+        raise ValueError(f"member {info.filename} has .npy version {version}, but 1.0 is needed")
     shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     size = dtype.itemsize
     for length in shape:
         size *= length
     if dtype.hasobject or size != len(content) - stream.tell():
-        raise ValueError(f"member {info.filename} announces {size} bytes and holds {len(content) - stream.tell()}")
+        raise ValueError(f"member {info.filename} declares {size} bytes, but contains {len(content) - stream.tell()}")
     stream.seek(0)
     array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     return array

@@ -1,8 +1,8 @@
-"""Decimal numbers out of text, fast and bit for bit what Python's `float` gives.
+"""Fast parsing of decimal numbers in text, with exactly the results of Python's `float`.
 
-A number of at most 2**53 in its digits, scaled by at most 10**22, needs one correctly rounded multiplication or
-division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI 1990). Everything else,
-a vanishing part of real files, is handed to `float` token by token.
+A number whose digits form an integer of at most 2**53, scaled by a power of ten up to 10**22, needs one correctly
+rounded multiplication or division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI
+1990). All other numbers, which are rare in real files, are parsed by `float`.
 """
 
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ _POSITION, _LINE, _VALUES, _IN_LINE, _ROWS, _RAGGED_LINE, _RAGGED_COUNT, _LONG_T
 class NumberTable:
     """Numbers of a text block, row after row.
 
-    `values` is flat; `rows` counts the lines that hold numbers. `ragged_line` is the first line (from 1) that does not
-    hold the wanted number of values, but `ragged_count`; 0 when every line does. `last_line` is the last line read.
+    `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the first line (from 1) with another
+    number of values than expected, namely `ragged_count`; 0 if there is none. `last_line` is the last line read.
     """
 
     values: NDArray[np.float64]
@@ -41,7 +41,7 @@ class NumberTable:
 
 
 class BadNumber(ValueError):
-    """A token that is no finite decimal number: its text, its line and which value of the block it stands for."""
+    """A token that is not a finite decimal number: its text, its line, and the index of its value in the block."""
 
     def __init__(self, token: str, line: int, index: int, in_line: int) -> None:
         super().__init__(f"{token!r} in line {line} is not a finite decimal number")
@@ -53,7 +53,7 @@ class BadNumber(ValueError):
 
 @compiled
 def parse_number(text, start):  # type: ignore[no-untyped-def]
-    """Read one decimal number at `text[start:]`, which must end in a line feed: no loop checks for the end of the text.
+    """Read one decimal number at `text[start:]`, which must end in a line feed, since the end of text is not checked.
 
     Positions are unsigned, because signed ones cost a test for negative indices at every byte.
 
@@ -121,7 +121,7 @@ def parse_number(text, start):  # type: ignore[no-untyped-def]
 
 @compiled
 def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
-    """Read numbers until the text ends, `values` or `long_tokens` is full (0) or a token is malformed (1)."""
+    """Read numbers; return 0 if the text ends or `values` or `long_tokens` is full, 1 if a token is malformed."""
     i, end = np.uint64(state[_POSITION]), np.uint64(text.size)
     line, count, in_line, rows = state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
     long_count = 0
@@ -165,7 +165,7 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
 
 
 def ending_in_a_line(text: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Append a line feed to a text without one at its end.
+    """Append a line feed to a text that does not end in one.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     Parameters
     ----------
     text : (bytes,) uint8    the text
-    width : int    numbers expected in a line; other counts are reported, not refused
+    width : int    number of values expected in a line; the first line with another number is reported, not an error
     first_line : int    number of the first line of `text`, from 1
 
     Returns

@@ -16,7 +16,7 @@ _EVERY_OTHER_ZERO = b"\0\0"
 
 
 class TextLines:
-    """The lines of `data`, with LF, CRLF or CR ends, each with its number; reads no further than it is asked to.
+    """Numbered lines of `data`, with LF, CRLF or CR line ends, read on demand.
 
     Attributes
     ----------
@@ -84,10 +84,10 @@ class TextLines:
 
         Raises
         ------
-        FormatError    if there are more, fewer or others
+        FormatError    if the number of words differs, or a word is not a finite decimal number
         """
         if len(words) != count:
-            raise self.error(f"{what} has {counted(len(words), 'value')}, {count} are needed", joint=joint)
+            raise self.error(f"{what} has {counted(len(words), 'value')}, but {count} are needed", joint=joint)
         return [self.number_in(word, what, joint) for word in words]
 
     def number_in(self, word: bytes, what: str, joint: str | None = None) -> float:
@@ -105,7 +105,7 @@ class TextLines:
 
         Raises
         ------
-        FormatError    if it is something else
+        FormatError    if the word is not a finite decimal number
         """
         value = read_number(word)
         if value is None:

@@ -90,7 +90,7 @@ def test_a_compressed_archive_of_the_same_arrays_is_read(archive: dict[str, byte
         ("frame_rate_hz", member(-1.0), "positive"),
         ("joint_names", member(np.array([object()], object)), "damaged"),
         ("joint_names", member(np.array(["a"] * 22)), "unique"),
-        ("translated_joints", member(np.array([7, 3], np.int32)), "increase"),
+        ("translated_joints", member(np.array([7, 3], np.int32)), "increasing"),
         ("poses", b"\x93NUMPY\x01\x00\xff\xff", "damaged"),
         ("poses", b"", "damaged"),
     ],
@@ -132,7 +132,7 @@ def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
 
 def test_a_header_that_announces_more_than_there_is_is_refused(archive: dict[str, bytes]) -> None:
     archive["poses.npy"] = archive["poses.npy"].replace(b"(70, 91)", b"(7000000, 91)", 1)
-    with pytest.raises(FormatError, match="announces"):
+    with pytest.raises(FormatError, match="declares"):
         read_motion(packed(archive), "take.npz")
 
 

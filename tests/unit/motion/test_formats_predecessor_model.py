@@ -238,7 +238,7 @@ def changed(path: list[str], value: object) -> dict[str, Any]:
         (changed(["tspm", "mean"], [50.0] * 8), "plausible speed"),
         (changed(["gmm", "weights"], [0.4, 0.4]), "add up to 1"),
         (changed(["gmm", "covars"], np.zeros((2, 8, 8)).tolist()), "not positive definite"),
-        (changed(["gmm", "covars"], np.eye(8).tolist()), "gmm: weights, means and covars of shapes"),
+        (changed(["gmm", "covars"], np.eye(8).tolist()), "of weights, means and covars do not match"),
         (changed(["gmm"], {"weights": [1.0], "means": [[0.0] * 9], "covars": [np.eye(9).tolist()]}), "9 dimensions"),
         (changed(["keyframes"], {"contact0": 48}), "'contact0' is beyond the 48"),
         (changed(["keyframes"], {"contact0": 1.5}), "'contact0' is 1.5"),

@@ -1,7 +1,7 @@
 """The predecessor's alignment of a clip: its sections in canonical frames, and its time function.
 
-The time function names a frame of the source for each canonical frame, as whole numbers, so it stays constant where the
-source is slower. Some programs wrote it as a text of JSON in the document.
+The time function is a whole frame of the source for each canonical frame, so it is constant where several canonical
+frames correspond to one frame of the source. Some programs wrote it as a string of JSON within the document.
 """
 
 from __future__ import annotations
@@ -101,8 +101,8 @@ def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[
 def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     """Make a time function of whole frames strictly increasing.
 
-    Where it is constant, time continues evenly: each frame of the source is passed in the middle of the canonical
-    frames that name it.
+    A frame of the source that belongs to several canonical frames is assigned to the middle of them; times between are
+    interpolated linearly.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
 
 
 def _list(document: Mapping[str, Any], name: str, file: str) -> list[Any]:
-    """Read a list that may be given as a text of JSON, even as one inside another."""
+    """Read a list that may be encoded as a string of JSON, once or twice."""
     value = document.get(name)
     for _ in range(2):
         if isinstance(value, str):

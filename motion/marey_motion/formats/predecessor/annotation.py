@@ -39,8 +39,8 @@ def read_predecessor_annotation(
     data : bytes    content of the file
     file : str    its name, for messages
     frame_count : int    frames of the clip
-    end_index : str    "inclusive" where sections include their frame `end_idx`, as the predecessor's editor writes and
-        shows them; "exclusive" as its time warping reads them
+    end_index : str    "inclusive" if sections include their frame `end_idx`, as in the predecessor's editor;
+        "exclusive" if they end before it, as in the predecessor's time warping
     labels : sequence of str, optional    read only these, for example if labels of a document overlap and must become
         several layers. Sections of a list have no label and are named "section 1" and so on.
 
@@ -103,8 +103,8 @@ def write_predecessor_annotation(
 ) -> bytes:
     """Write an annotation as JSON.
 
-    The forms have no keyframes; these are written under `keyframes`, which other programs ignore. The list loses the
-    labels. The frames of a label do not show where two of its segments touch.
+    The predecessor has no keyframes; they are written under `keyframes`, which other programs ignore. The form "list"
+    loses the labels. The form "frames" loses the boundary between adjacent segments with the same label.
 
     Parameters
     ----------
@@ -186,6 +186,6 @@ def _frames(given: Any, label: str, file: str) -> list[int]:
 
 
 def _only_shares_ends(segments: Sequence[Segment]) -> bool:
-    """Check that segments overlap in nothing but the frame where they meet."""
+    """Check that neighbouring segments overlap by at most one frame."""
     ordered = sorted(segments, key=lambda one: (one.start, one.end))
     return all(before.end - 1 <= after.start for before, after in pairwise(ordered))

@@ -75,12 +75,12 @@ def motion_of_document(
 
 
 def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encoding = "bson.bz2") -> bytes:
-    """Write a clip document.
+    """Write a clip as a document of the predecessor.
 
     Parameters
     ----------
     clip : Clip    F frames
-    form : str    rows of numbers ("poses") or the engine's objects ("frames")
+    form : str    "poses" for rows of numbers, "frames" for the objects of the engine
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns
@@ -89,7 +89,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 
     Raises
     ------
-    FormatError    for translations of joints below the root, which the format cannot hold
+    FormatError    if joints below the root have translations, which the format cannot contain
     """
     skeleton = clip.skeleton
     if clip.translated_joints:
@@ -136,7 +136,7 @@ def write_predecessor_skeleton(
 
 
 def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArray[np.float64], float]:
-    """Read joint names, rows (F, 3 + 4·J) with quaternions w, x, y, z, and the frame time, from either form of clip."""
+    """Read joint names, poses (F, 3 + 4·J) with quaternions w, x, y, z, and frame time, from either form of clip."""
     if "poses" in document:
         names = text_list(document, "joint_sequence", file)
         poses = number_array(document["poses"], file, "poses")

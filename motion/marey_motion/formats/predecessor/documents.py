@@ -63,9 +63,9 @@ def _subject_of(document: Mapping[str, Any]) -> Subject | None:
 
 
 def model_name(stem: str) -> str:
-    """Name a model after its file: `walk_leftStance` of `walk_leftStance_quaternion_mm`.
+    """Derive the name of a model from its file: `walk_leftStance` from `walk_leftStance_quaternion_mm`.
 
-    The stem may still have the first of two suffixes, as in `walk_mm.bson` of `walk_mm.bson.bz2`.
+    The stem may still contain a suffix, such as `walk_mm.bson` from `walk_mm.bson.bz2`.
 
     Parameters
     ----------

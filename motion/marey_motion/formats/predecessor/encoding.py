@@ -47,7 +47,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
 
     Raises
     ------
-    FormatError    when the bytes are none of the three encodings or hold no document
+    FormatError    if the bytes are in none of the three encodings or contain no document
     """
     if data.startswith(_BZ2_MARK):
         data = _decompressed(data, file)
@@ -59,7 +59,7 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
     except (ValueError, RecursionError, OverflowError, bson.errors.BSONError) as error:
         raise FormatError(f"the document cannot be read: {error}", code="document-damaged", file=file) from error
     if not isinstance(document, dict):
-        raise FormatError("the file holds no document", code="document-damaged", file=file)
+        raise FormatError("the file contains no document", code="document-damaged", file=file)
     return document
 
 

@@ -52,10 +52,10 @@ class PredecessorModel:
     Parameters
     ----------
     primitive : in our convention
-    layout : of the document
-    animated_joints : joints that the document has rotations of; the others of the skeleton rest
+    layout : layout of the document
+    animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
     time_form : form of its time function; None for a model without one, which runs at constant speed
-    time_error_frames : how far the time function of `primitive` is off that of the document, at most
+    time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
     """
 
     primitive: MotionPrimitive
@@ -225,10 +225,10 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Read the time of a model, None if it has none, and which form it has.
+    """Read the time part of a model, or None, and its form.
 
-    Layout 2 was written by two trainers. The first one puts a component into each column of its vectors and means
-    increments; the later one puts it into each row, and means coefficients as layout 3 does.
+    Layout 2 was written by two training programs. The first stores components as columns and uses the form
+    `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.
     """
     if time is None or not time.get("mean"):
         return None, "coefficients"
@@ -328,7 +328,7 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
 
 
 def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
-    """Refuse splines whose values would fill the memory, however small the document is."""
+    """Refuse splines whose evaluation would need too much memory, even if the document is small."""
     if frames * coefficients > MOST_VALUES:
         message = f"{what}: {coefficients} coefficients over {frames} frames; their product is at most {MOST_VALUES:,}"
         raise FormatLimit(message, file=file)
@@ -353,7 +353,7 @@ def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleto
 def _on_skeleton(
     mean: Floats, vectors: Floats, maxima: Floats, animated: list[str], skeleton: Skeleton
 ) -> tuple[Floats, Floats]:
-    """Extend mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) to all joints, in metres; those not animated rest."""
+    """Extend mean (n, 3 + 4·J) and components (k, n, 3 + 4·J) to all joints, in metres; others keep rest rotations."""
     rest = np.concatenate((np.zeros(3), skeleton.rest_rotations.ravel()))
     columns = columns_of(animated, skeleton)
     whole = np.tile(rest, (len(mean), 1))
@@ -383,7 +383,7 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
 
 def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
-    """Read the time function: the first channel, where others hold semantics."""
+    """Read the time function: the first channel, since further channels contain semantics."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:
@@ -393,7 +393,7 @@ def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
 
 
 def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> tuple[LatentMixture, int]:
-    """Read the mixture and its number of temporal components: some models have a mixture of space alone."""
+    """Read the mixture and its number of temporal components, which is 0 for mixtures of space alone."""
     if part is None:
         dimensions = spatial + temporal
         return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal
@@ -404,7 +404,9 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
         covariances = np.zeros((len(means), 0, 0))  # lists of nothing do not tell how many there are
     if means.ndim != 2 or covariances.shape != (len(means), *[means.shape[1]] * 2) or weights.shape != (len(means),):
         shapes = f"{weights.shape}, {means.shape} and {covariances.shape}"
-        raise FormatError(f"gmm: weights, means and covars of shapes {shapes}", code="model-invalid", file=file)
+        raise FormatError(
+            f"gmm: the shapes {shapes} of weights, means and covars do not match", code="model-invalid", file=file
+        )
     if len(means) > MOST_COMPONENTS or means.shape[1] > MOST_DIMENSIONS:
         raise FormatError(f"gmm: more than {MOST_COMPONENTS} distributions or {MOST_DIMENSIONS} dimensions", file=file)
     covered = means.shape[1] - spatial
@@ -421,7 +423,7 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
 
 
 def _numbers(values: Any, file: str, name: str) -> Floats:
-    """Convert nested lists to an array. Raises `FormatError` for numbers too large for a motion of a body."""
+    """Convert nested lists to an array. Raises `FormatError` if a number is too large for the motion of a body."""
     numbers = number_array(values, file, name)
     if np.abs(numbers).max(initial=0.0) > LARGEST:
         raise FormatError(f"field {name!r} holds numbers beyond {LARGEST:g}", code="bad-number", file=file)

@@ -31,7 +31,7 @@ def write_predecessor_model(
     ----------
     primitive : MotionPrimitive    the model
     layout : str    "2" or "3"
-    animated_joints : tuple of str    joints whose rotations are written, all when empty; the others rest
+    animated_joints : tuple of str    joints whose rotations are written; all joints if empty
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns
@@ -87,7 +87,7 @@ def model_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> dict[str, Any]:
-    """Write the primitive in layout 2, with the time convention of its first trainer."""
+    """Write the primitive in layout 2, with the form `increments` of its first training program."""
     mean, vectors = _space(primitive, animated_joints)
     time = as_increments(primitive)
     mixture = {f"gmm_{name}": values for name, values in _mixture(primitive).items()}
@@ -133,6 +133,6 @@ def _mixture(primitive: MotionPrimitive) -> dict[str, Any]:
 
 
 def _roots(covariances: Floats) -> Floats:
-    """Factor covariances into E (K, L, L) with E · Eᵀ = covariance: eigenvectors times roots of eigenvalues."""
+    """Factor covariances into E (K, L, L) with E · Eᵀ = covariance: eigenvectors times square roots of eigenvalues."""
     values, vectors = np.linalg.eigh(covariances)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

@@ -38,10 +38,10 @@ class PredecessorTime:
 
     Parameters
     ----------
-    form : what the spline is of
-    basis : over canonical time 0 to N - 1
-    mean : (n,)
-    directions : (k, n) what one unit of each score adds
+    form : "coefficients" or "increments"
+    basis : basis of the spline over canonical time 0 to N - 1
+    mean : (n,) mean coefficients
+    directions : (k, n) change of the coefficients per unit of each score
     """
 
     form: TimeForm

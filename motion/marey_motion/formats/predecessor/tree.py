@@ -104,8 +104,8 @@ def write_predecessor_tree(tree: SampleTree, spatial: int, branching: int, *, en
     Parameters
     ----------
     tree : SampleTree    the samples
-    spatial : int    spatial numbers of a latent vector; they are the features
-    branching : int    children of a node, at most
+    spatial : int    number of spatial components of a latent vector; these are the features
+    branching : int    largest number of children of a node
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns
@@ -154,7 +154,7 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
 
 
 def _in_tree_order(indices: list[Ints], children: list[int]) -> Ints:
-    """Sort samples so that those of each node are consecutive: those of the leaves, from the first to the last."""
+    """Sort samples by leaf, from the first leaf to the last, so that the samples of each node are consecutive."""
     first = np.concatenate(([1], 1 + np.cumsum(children)[:-1]))
     order: list[Ints] = []
     path = [0]
