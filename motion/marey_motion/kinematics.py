@@ -238,8 +238,8 @@ def ground_projection(positions: AnyFloats) -> AnyFloats:
 def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """Compute the direction that the body faces on the ground.
 
-    The sum of the left-minus-right vectors is crossed with up. Frames in which that axis is vertical take the direction
-    of the frame before them; the first ones, of the first frame that has one.
+    The sum of the left-minus-right vectors is crossed with up. If that axis is vertical, a frame has no direction of
+    its own and takes that of the frame before it; frames before the first direction take that one.
 
     Parameters
     ----------
@@ -347,8 +347,8 @@ def foot_contacts(
 ) -> NDArray[np.bool_]:
     """Detect which feet touch the ground.
 
-    A toe slower than the limit touches the ground; then each frame follows the majority of the frames around it, within
-    the largest odd number that fits in the window, so that single frames cannot flicker.
+    A toe slower than the limit counts as touching the ground. A majority filter over the largest odd number of frames
+    that fits in the window then removes flicker of single frames.
 
     Parameters
     ----------

@@ -423,7 +423,8 @@ def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
 def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
     """Choose the signs of quaternions so that neighbours in time are close.
 
-    q and -q are one rotation; the first frame keeps its sign and each next one takes that of the nearer.
+    q and -q are one rotation; the first frame keeps its sign, and each later frame takes the sign nearer to the frame
+    before it.
 
     Parameters
     ----------

@@ -179,7 +179,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
     ----------
     clip : Clip    motion of the plan's source skeleton
     plan : RetargetPlan    result of `plan_retarget`
-    bones : FollowedBones, optional    result of `moved_bones`, from a caller who has computed it already
+    bones : FollowedBones, optional    result of `moved_bones`, if already computed
 
     Returns
     -------
@@ -252,7 +252,7 @@ def _paired(
 ) -> tuple[JointPair, ...]:
     """Pair the joints of both skeletons with the same standard joint, each target joint once.
 
-    Not the root: where it is not the pelvis as well, it is a handle on the floor that no bone gives a direction to.
+    The root is left out unless it is also the pelvis: it is a handle on the floor, whose direction no bone gives.
     """
     for skeleton, mapping in ((source, source_mapping), (target, target_mapping)):
         for name in mapping.joints.values():

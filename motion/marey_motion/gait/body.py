@@ -49,7 +49,7 @@ class GaitMoments:
         return (len(self.times_s) - 1) / float(self.times_s[-1] - self.times_s[0])
 
     def settled(self, values: AnyFloats, window_s: float = BLENDING_S) -> AnyFloats:
-        """Average values over time, with more weight on the near ones (Hann).
+        """Smooth values over time with a Hann window.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ def _reach(window_s: float, frame_rate_hz: float) -> int:
 
 
 def padding_frames(frame_rate_hz: float) -> int:
-    """Count the moments needed on either side of the wanted ones, so that no end disturbs the averages.
+    """Count the moments to add before and after the requested ones, so that averages at the ends are complete.
 
     Parameters
     ----------

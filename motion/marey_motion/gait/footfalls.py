@@ -33,12 +33,12 @@ class FootShape:
 
     Parameters
     ----------
-    ball_height_m : of the ball joint above the floor in the rest pose
-    heel_length_m : from the heel to the ball along the sole
-    toe_length_m : from the ball to the tip of the toes
-    ball_ahead_m : of the ball in front of the hip in the rest pose
-    half_width_m : from the middle of the body to the foot in the rest pose
-    hip_height_m : of the hip above the floor in the rest pose
+    ball_height_m : height of the ball joint above the floor in the rest pose
+    heel_length_m : distance from the heel to the ball along the sole
+    toe_length_m : distance from the ball to the tip of the toes
+    ball_ahead_m : distance of the ball in front of the hip in the rest pose
+    half_width_m : distance from the middle of the body to the foot in the rest pose
+    hip_height_m : height of the hip above the floor in the rest pose
     """
 
     ball_height_m: float

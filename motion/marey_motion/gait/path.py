@@ -25,7 +25,7 @@ class PathSegment:
     duration_s : seconds, positive
     speed_m_s : speed at its start, metres per second, not negative
     turn_rate_rad_s : change of heading, radians per second; positive turns left
-    end_speed_m_s : speed at its end; the start's when None
+    end_speed_m_s : speed at its end; `speed_m_s` if None
     travel_angle_rad : direction of travel against the heading: 0 forward, π/2 to the left, π backward
     """
 

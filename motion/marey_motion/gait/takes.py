@@ -60,7 +60,7 @@ def generate_gait(
 
     Raises
     ------
-    MotionError    naming the parameter that is wrong, or when the gait would need longer legs
+    MotionError    if a parameter is invalid (the message names it), or if the gait needs longer legs
 
     Examples
     --------
@@ -140,7 +140,7 @@ def foot_motions(
 def _at_studio_size(path: RootPath, times_s: AnyFloats, size: float) -> tuple[RootPath, AnyFloats]:
     """Compute path and times at which the studio skeleton moves like one of `size` times its stature on `path`.
 
-    Bodies of all sizes move alike when times grow with the root of their lengths (equal Froude numbers, Alexander and
+    Bodies of all sizes move alike if times scale with the square root of lengths (equal Froude numbers, Alexander and
     Jayes 1983).
     """
     return path.rescaled(length=1.0 / size, time=size**-0.5), times_s * size**-0.5
@@ -215,7 +215,7 @@ def _programme() -> list[tuple[str, RootPath, tuple[str, ...]]]:
 
 
 def _slalom(speed_m_s: float, turn_rate_rad_s: float, bend_s: float, bends: int) -> RootPath:
-    """Make bends to the left and right, the first and last of half length, so that it ends with its first heading."""
+    """Make alternating bends; the first and last have half the length, so that the initial heading is restored."""
     durations: Sequence[float] = [0.5 * bend_s, *[bend_s] * bends, 0.5 * bend_s]
     return RootPath(
         tuple(

@@ -49,7 +49,7 @@ class Anatomy:
 
     @cached_property
     def _resting(self) -> dict[str, Any] | None:
-        """Part `mapping`; None if the rest pose leaves axes open that a motion can show."""
+        """Part `mapping` with axes from the rest pose; None if some axes can only be found in a motion."""
         try:
             if rest_pose_doubts(self.skeleton, self.mapping):
                 return None
@@ -58,7 +58,7 @@ class Anatomy:
         return _mapping_part(self, None)
 
     def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
-        """Make the part `mapping`: joints, and axes that the rest pose shows, else a clip of the skeleton.
+        """Make the part `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class Anatomy:
 
 
 def _mapping_part(anatomy: Anatomy, clip: Clip | None) -> dict[str, Any]:
-    """Make the part `mapping`; without axes, and with a note, where too little of a body is recognised."""
+    """Make the part `mapping`; if too few joints are recognised, it has a note instead of axes."""
     mapping = anatomy.mapping
     try:
         document = mapping_to_document(mapping, guess_axes(anatomy.skeleton, mapping, clip))
@@ -85,7 +85,7 @@ _KNOWN: LruCache[bytes, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
 
 
 def anatomy_of(skeleton: Skeleton) -> Anatomy:
-    """Return the anatomy of a skeleton, from a cache by equal skeletons, or new.
+    """Return the anatomy of a skeleton; equal skeletons share a cached one.
 
     Parameters
     ----------

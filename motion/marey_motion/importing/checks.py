@@ -97,7 +97,7 @@ def check_clip(clip: Clip, landmarks: Landmarks | None = None) -> tuple[CheckWar
     Parameters
     ----------
     clip : Clip    F frames
-    landmarks : Landmarks, optional    those of its skeleton, where they are known already
+    landmarks : Landmarks, optional    landmarks of its skeleton, if already known
 
     Returns
     -------
@@ -319,7 +319,7 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
 
 
 def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
-    """Warn of limbs of which no joint ever turns, while other joints do."""
+    """Warn of limbs whose joints never turn while other joints do."""
     rotations, limbs = clip.rotations, tracks.body.limbs
     if clip.frame_count < 2 or not limbs:
         return None

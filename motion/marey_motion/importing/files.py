@@ -54,7 +54,7 @@ def planned_entry(planned: PlannedFile) -> ImportEntry | None:
 
 
 def import_file(file: FileToImport) -> ImportedFile:
-    """Read one file and make the documents of its items; whatever is wrong with it is a refusal, not an error.
+    """Read one file and make the documents of its items; a defective file gives a refusal, not an exception.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def _imported(file: FileToImport) -> ImportedFile:
 def mapping_part(found: ImportedFile) -> Tree:
     """Make the part `mapping` of the skeleton that a file brings, with the axes that its clip shows.
 
-    Importing leaves it out, since it takes long and only a skeleton that is new to the project needs one.
+    `import_file` leaves this part out: it takes long, and only a skeleton that is new to the project needs it.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]
 
 
 def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
-    """Move the clip to a given skeleton, which must be the file's own but for its name and its order of joints."""
+    """Move the clip to a given skeleton, which must equal the file's except in its name and order of joints."""
     own = clip.skeleton
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])

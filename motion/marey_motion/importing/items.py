@@ -43,9 +43,9 @@ class FileToImport:
     ----------
     planned : its plan
     data, digest : its bytes and their digest, recorded as the origin of a clip
-    companion, companion_digest : the same of the file that the plan names as its companion
-    options : of the user
-    skeleton : that the clips must use
+    companion, companion_digest : bytes and digest of the companion file that the plan names
+    options : import options given by the user
+    skeleton : stored skeleton that the clips must use
     """
 
     planned: PlannedFile
@@ -99,7 +99,7 @@ class ImportedFile:
     items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone. The skeleton has
         no part `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
-    frames : of the clip
+    frames : number of frames of the clip
     graph : content of a file that holds a graph instead of items
     """
 

@@ -41,7 +41,7 @@ def find_landmarks(skeleton: Skeleton, mapping: JointMapping | None = None) -> L
     Parameters
     ----------
     skeleton : Skeleton    joints; lengths may be in any unit and axes in any order
-    mapping : JointMapping, optional    its standard joints, where they are known already
+    mapping : JointMapping, optional    its standard joints, if already known
 
     Returns
     -------

@@ -87,7 +87,7 @@ def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[
 
 
 def _imported_tree(data: bytes, file: FileToImport, primitive: MotionPrimitive) -> Tree:
-    """Make the part `tree`; seed and features are not known of a tree that was made elsewhere."""
+    """Make the part `tree`; the seed and features of an imported tree are unknown."""
     name = str(file.planned.companion)
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:

@@ -101,8 +101,9 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
     """Find the companion of every file that needs one, such as the ASF of an AMC.
 
-    In the same folder: the file of the same stem, else the one whose stem the file's begins with up to a separator
-    (16_01.amc with 16.asf, 07_01-walk.amc with 07.asf), the longest of several; else the folder's only companion.
+    Only files of the same folder match. The companion has the stem of the file, else the longest stem that precedes a
+    separator in the file's stem (16.asf for 16_01.amc, 07.asf for 07_01-walk.amc); else it is the folder's only file of
+    the companion's format.
 
     Parameters
     ----------

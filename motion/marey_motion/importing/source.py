@@ -36,7 +36,7 @@ class SourceMotion:
     unit_scale_m, up_axis, declared    unit in metres and axis where the format itself fixes them, with the words for
         the record
     channels : tuple of tuples of str    names of each joint's channels in the file's order
-    warnings : list of CheckWarning    defects that the reader overlooked
+    warnings : list of CheckWarning    defects that the reader tolerated
     """
 
     format: str

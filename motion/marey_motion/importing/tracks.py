@@ -80,7 +80,7 @@ def track(clip: Clip, landmarks: Landmarks | None = None) -> Tracks:
     Parameters
     ----------
     clip : Clip    F frames
-    landmarks : Landmarks, optional    those of its skeleton, where they are known already
+    landmarks : Landmarks, optional    landmarks of its skeleton, if already known
 
     Returns
     -------

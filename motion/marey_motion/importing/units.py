@@ -94,8 +94,8 @@ def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options:
     Parameters
     ----------
     source : SourceMotion    the file in its own unit and axes
-    anatomy : Anatomy    that of the source's skeleton
-    file : str    its name, for messages
+    anatomy : Anatomy    anatomy of the source's skeleton
+    file : str    name of the file, for messages
     options : ImportOptions    facts given by the user
 
     Returns
@@ -367,7 +367,7 @@ def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> None:
-    """Warn where left is on the right: with up and the way the feet point, the left foot must be to the left."""
+    """Warn if left and right are exchanged: when facing where the feet point, the left foot must be on the left."""
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":
         return

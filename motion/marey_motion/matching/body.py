@@ -29,9 +29,9 @@ class MatchingBody:
     torso : the joint whose ground projection carries the simulation root: the upper spine, else the hips
     feet, toes : (left, right); the ankles, and what touches the ground (the ankles where there are no toes)
     lefts, rights : matching joints of both sides, hips and shoulders; their difference shows where the body faces
-    pose_joints : the joints of the pose cost, in the order of `POSE_JOINTS`, those that the skeleton has
+    pose_joints : joints of the pose cost: those of `POSE_JOINTS` that the skeleton has, in that order
     partners : (J,) each joint's partner on the other side, its own index for joints of the centre
-    standard_joints : joint index by standard name, of all that the mapping knows
+    standard_joints : joint index by standard name, for all joints of the mapping
     """
 
     skeleton: Skeleton

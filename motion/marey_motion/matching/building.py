@@ -37,15 +37,15 @@ def build_database(
     normaliser: Normaliser | None = None,
     progress: Progress | None = None,
 ) -> MatchingDatabase:
-    """Build a matching database from clips of one skeleton; the same whatever their order.
+    """Build a matching database from clips of one skeleton, independent of their order.
 
     Parameters
     ----------
     clips : sequence of SourceClip    clips of the body's skeleton
     body : MatchingBody    the joints to match
     options : DatabaseOptions    rate, horizons and weights
-    normaliser : Normaliser, optional    one that was fitted before ("pinned"); it brings its own weights. Fitted to
-        these clips when None
+    normaliser : Normaliser, optional    a normaliser fitted earlier ("pinned"), with its own weights; if None, one is
+        fitted to these clips
     progress : callable, optional    called as progress(clips done, total, name of the last one)
 
     Returns
@@ -252,7 +252,7 @@ def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
 def _joined_translations(
     built: Sequence[_Built], body: MatchingBody
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
-    """Collect translations of all joints that any clip translates; a clip without some has their offsets."""
+    """Collect translations of all joints that any clip translates; other clips repeat its offset."""
     joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):
         return None, ()

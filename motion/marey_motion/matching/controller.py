@@ -197,7 +197,7 @@ def trajectory_arrays(guide: Trajectory) -> TrajectoryArrays:
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
     if not 1 <= guide.tick_count <= min(map(len, arrays)):
-        raise MotionError(f"{guide.tick_count} ticks of a trajectory with {min(map(len, arrays))} samples")
+        raise MotionError(f"the trajectory has {guide.tick_count} ticks, but arrays of {min(map(len, arrays))} samples")
     return TrajectoryArrays(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
 
 

@@ -34,7 +34,7 @@ class RootMotion(NamedTuple):
     ----------
     successors : (N,) int64    the row that follows; -1 after the last row of a clip that does not wrap
     steps : (N, 3) float64    metres to the left and forward, in the frame of the row's root, and radians to the left.
-        A clip's end repeats the step that led there: it is what the root's velocity was.
+        The last row of a clip that does not wrap repeats the step that led to it, which gives the root's velocity.
     """
 
     successors: NDArray[np.int64]
@@ -101,8 +101,9 @@ class SourceClip:
 class DatabaseClip:
     """A clip in a database. Its rows are [start, stop); a mirrored one has the uid of its source plus "~mirrored".
 
-    `in_place` clips walk without travelling, as on a treadmill: their speeds say nothing. `first_s` is where in the
-    recording the first row is, in seconds: later than 0 when a range of frames was chosen or a rest pose left out.
+    `in_place` clips walk without travelling, as on a treadmill: their speeds are meaningless. `first_s` is the time of
+    the first row in the recording, in seconds; it is above 0 if a range of frames was chosen or a rest pose was left
+    out.
     """
 
     uid: str
@@ -147,13 +148,13 @@ class MatchingDatabase:
     Parameters
     ----------
     features : (N, D) float64    before normalisation, in metres and metres per second, in the frame of the row's root
-    normaliser : see `Normaliser`; `normaliser.apply(features)` is what costs are made of
+    normaliser : see `Normaliser`; costs are computed from `normaliser.apply(features)`
     selectable : (N,) bool    rows a search may choose
     root_positions : (N, 2) float64    the simulation root on the ground, metres, in the clip's own world
     root_headings : (N,) float64    radians, continuous within a clip
     pose_points : (N, P, 3) float32    positions of the body's pose joints in the frame of the row's root, metres
     poses : (N, 3 + 4·J) float32    joint 0 relative to the root (position in metres and rotation), then local rotations
-    contacts : (N, 2) bool    whether the left and the right foot stand
+    contacts : (N, 2) bool    whether the left and the right foot touch the ground
     translations : (N, k, 3) float32    local translations in metres that replace the offsets of the k
         `translated_joints`, as in a clip; None if no clip has any
     notes : what was left out or looks doubtful

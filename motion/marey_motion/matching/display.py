@@ -51,8 +51,8 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
     """Compute the distances between the displayed pose and the next one.
 
     Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches; the next
-    one is the row that was chosen for the next tick as it is in the database. After the last tick that is the row that
-    follows.
+    one is the row that was chosen for the next tick as it is in the database. At the last tick, the next one is the row
+    that would follow.
 
     Parameters
     ----------

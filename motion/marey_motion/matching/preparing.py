@@ -39,7 +39,7 @@ class PreparedClip:
     ----------
     seam : transition to the next round of a loop whose rows look ahead across it; None if the clip ends
     mirrored : whether left and right are exchanged
-    first_s : how much of the recording lies before the motion, seconds
+    first_s : time of the first frame in the recording, seconds
     """
 
     source: SourceClip
@@ -114,7 +114,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 def _wanted_frames(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, tell: _Tell
 ) -> tuple[Clip, int, bool]:
-    """Cut a clip to its range without rest poses at its ends; return it, its first frame, and if it walks in place."""
+    """Cut a clip to its range without rest poses at its ends; return it, its first frame, whether it walks in place."""
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(

@@ -24,20 +24,20 @@ class Status(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class TrialRecord:
-    """T ticks of a character led by motion matching.
+    """Record of T ticks of a character driven by motion matching.
 
     Parameters
     ----------
     rate_hz : ticks per second
-    rows : (T,) int32    database row displayed; what a search at a tick chose shows in the next tick's row
+    rows : (T,) int32    displayed database row; a row chosen by a search at one tick is displayed at the next
     positions : (T, 2) float64    root on the ground, metres
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
     match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN where nothing was searched
     continuing_cost : (T,) float64    the same for continuing the displayed clip; NaN where nothing was searched or the
         clip had ended
-    pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, with what is left of
-        earlier switches, and the row displayed next; at the last tick, the row that would follow
+    pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, including the
+        remaining offsets of earlier switches, and the row displayed next; at the last tick, the row that would follow
     """
 
     rate_hz: float

@@ -28,15 +28,15 @@ _SCAN_ABOVE = 0.35
 class SearchIndex(NamedTuple):
     """A database made ready for search: a tuple of arrays, so that compiled code takes it as it is.
 
-    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D made even. What
-    is missing of sixteen is filled with repetitions of the last.
+    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D made even. A
+    block or group of fewer than sixteen is padded with copies of its last element.
 
     Parameters
     ----------
     rows : (N, D) float64    normalised features
     selectable : (N,) bool    rows a search may choose
     blocks : (B, D', 16) float32    the blocks' rows, one dimension after the other
-    block_rows : (B, 16) int32    which rows they are
+    block_rows : (B, 16) int32    numbers of these rows
     block_of_row : (N,) int32    the block of a row, or of the selectable one before it
     boxes : (G, D', 2, 16) float32    low and high sides of the boxes about a group's blocks
     group_blocks : (G + 1,) int32    first block of each group, and B

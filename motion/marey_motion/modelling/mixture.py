@@ -88,7 +88,7 @@ class LatentMixture:
         return np.asarray(highest + np.log(np.exp(each - highest[:, None]).sum(axis=1)))
 
     def sample(self, count: int, seed: int, attempt: int = 0) -> Floats:
-        """Draw latent vectors; the first ones are those of a smaller count.
+        """Draw latent vectors; a smaller count gives the first vectors of a larger one.
 
         Parameters
         ----------

@@ -32,13 +32,13 @@ class FunctionalComponents:
 
     Parameters
     ----------
-    basis : of the functions
+    basis : splines of the functions
     mean : (n, D) coefficients
     directions : (k, n, D) what one unit of each score adds to the coefficients; any scaling is undone in them
     projections : (k, n, D) functions whose inner products with coefficients give scores; with the directions they give
         the identity
     variances : (k,) of the training examples' scores
-    energy : (k,) share of the variance that the first 1, 2, ... components hold, of that of all components
+    energy : (k,) cumulative share of the total variance in the first 1, 2, ... components
     """
 
     basis: SplineBasis
@@ -95,17 +95,18 @@ class MotionPrimitive:
 
     Parameters
     ----------
-    name : of the action
-    skeleton : that moves, J joints
+    name : name of the action
+    skeleton : skeleton of the motions, J joints
     frame_rate_hz : of canonical frames
     spatial : 3 + 4·J channels over canonical frames 0 to N - 1: root translation in metres in the canonical frame, then
         local quaternions, not of unit length until they are evaluated
     temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of how many frames of
         real time, at `frame_rate_hz`, pass in each
     temporal_weight : positive
-    mixture : of latent vectors
+    mixture : distribution of latent vectors
     keyframes : canonical frame by label
-    duration_range_s : within which motions last, or None; normal distributions of logarithms have long tails
+    duration_range_s : shortest and longest duration of a motion, or None; normal distributions of logarithms have long
+        tails
     log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
         swing out at their ends, and a motion would stop there
     """
@@ -155,8 +156,8 @@ class MotionPrimitive:
     def sample(self, count: int, seed: int) -> Floats:
         """Draw latent vectors from the mixture.
 
-        Vectors whose motions would be too short or too long are drawn again; that depends only on the place in the row,
-        so that the first ones are those of a smaller count.
+        Vectors whose motions would be too short or too long are drawn again; each is redrawn independently of the
+        others, so that a smaller count gives the first vectors of a larger one.
 
         Parameters
         ----------

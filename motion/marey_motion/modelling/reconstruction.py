@@ -22,13 +22,13 @@ MOST_DIMENSIONS = 200
 
 @dataclass(frozen=True, eq=False)
 class ReconstructionErrors:
-    """Mean distance of joints from where they are in the aligned examples, centimetres.
+    """Mean distance of reconstructed joints from those of the aligned examples, centimetres.
 
     Parameters
     ----------
     components : (c,) 0, 1, 2, ...
     training_cm : (c,) of examples that the components were found in, mean over the examples
-    left_out_cm : (c,) of each example by the components and the mean of all others, mean over the examples
+    left_out_cm : (c,) of examples reconstructed from the components and the mean of all others, mean over the examples
     left_out_each_cm : (m, c)
     """
 

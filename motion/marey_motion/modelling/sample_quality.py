@@ -22,7 +22,8 @@ class FootQuality:
     below_floor_share : share of frames in which at least one foot is under height 0
     below_floor_mean_cm : how deep the lowest foot is in those frames; 0 if there are none
     lowest_cm : mean over the motions of their lowest foot
-    slide_m_s : mean speed on the ground of feet in the frames where feet of the training examples mostly stand
+    slide_m_s : mean speed on the ground of feet in the frames where the same feet of most training examples are on the
+        ground
     """
 
     below_floor_share: float

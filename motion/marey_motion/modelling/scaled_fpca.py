@@ -1,4 +1,4 @@
-"""Weights of channels under which few components keep joints where they are (Du et al. 2016, scaled FPCA)."""
+"""Channel weights that minimise the errors of joint positions for few components (Du et al. 2016, scaled FPCA)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def optimised_weights(
 ) -> tuple[Floats, Keep]:
     """Optimise weights, one for each root axis and each joint, that minimise the squared distance of joints.
 
-    The number of components is that which `keep` gives under the first of the starting weights, and stays.
+    `keep` gives the number of components under the first starting weights; that number is then fixed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Weights of channels for the analysis of principal components: metres and parts of quaternions are no common unit."""
+"""Channel weights for principal component analysis: metres and quaternion components have no common unit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def root_max_weights(poses: Floats) -> Floats:
 
 
 def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
-    """Compute weights by which a step of any channel counts as far as it moves the body.
+    """Compute weights that scale each channel by how far a unit step of it moves the body.
 
     A unit step of a joint's quaternion rotates the joints below it by 2 radians. The joint's weight is the root mean
     square, over all joints of the body, of their displacement: twice their lever arms, and 0 for those that are not

@@ -36,7 +36,7 @@ class TrainedPrimitive:
 
     Parameters
     ----------
-    weights : (3 + 4·J,) that the channels were multiplied by for the analysis; undone in the primitive
+    weights : (3 + 4·J,) factors of the channels in the analysis; undone in the primitive
     """
 
     primitive: MotionPrimitive

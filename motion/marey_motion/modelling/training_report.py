@@ -51,7 +51,7 @@ class ExampleReport:
 
 @dataclass(frozen=True)
 class Durations:
-    """Durations of motions in seconds; `outside_share` are over 5 % outside the range of the examples."""
+    """Durations of motions in seconds; `outside_share` of them are more than 5 % outside the examples' range."""
 
     least_s: float
     mean_s: float
@@ -180,7 +180,7 @@ def _examples(
 
 
 def _at(errors: ReconstructionErrors, components: int) -> int:
-    """Look up the curve at so many components, or at its end."""
+    """Find the index of a number of components in the errors; the last index if there are fewer."""
     return min(components, len(errors.components) - 1)
 
 

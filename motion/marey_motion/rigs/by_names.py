@@ -50,7 +50,7 @@ class NameMatch:
 def best_match(skeleton: Skeleton) -> NameMatch | None:
     """Find the known rig whose names fit best.
 
-    Of equals, the one listed first, and a tool's before everyday words.
+    Ties in essential joints go to a tool's rig before everyday words; full ties go to the rig listed first.
 
     Parameters
     ----------

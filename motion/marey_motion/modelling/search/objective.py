@@ -46,7 +46,7 @@ class Rows(NamedTuple):
     Parameters
     ----------
     kinds : (m,) see `objective_kernels`
-    items : (m,) which tracked point, or which clock
+    items : (m,) index of the tracked point or of the clock
     targets : (m, 4) place, quaternion, direction, heading or time
     axes : (m, 3) for positions 1 where the coordinate counts, for directions the joint's own axis
     """

@@ -41,7 +41,8 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
 
     All children of all candidates of a level are evaluated at once, nodes by the mean of their samples, nodes of one
     sample and the samples of leaves by themselves. The result is samples, never means, which need not be likely
-    motions. Equal costs go by place. With as many candidates as there are nodes it is an exhaustive search.
+    motions. Of samples with equal costs, the first in the tree is preferred. With as many candidates as there are nodes
+    it is an exhaustive search.
 
     Parameters
     ----------

@@ -24,9 +24,9 @@ class Tracked(NamedTuple):
 
     Parameters
     ----------
-    frame : canonical
-    joints : whose positions are added; the rotation tracked is that of the first
-    minus : whose positions are subtracted, as many as are added; none for a joint alone
+    frame : canonical frame
+    joints : joints whose positions are added; the rotation of the first one is tracked
+    minus : joints whose positions are subtracted, as many as are added; empty for a single joint
     """
 
     frame: float
@@ -70,7 +70,7 @@ class Clocks(NamedTuple):
     frame_s : seconds of one frame
     range_s : (2,) how long motions last, at least and at most; what would last longer or shorter is played faster or
         slower as a whole
-    log_slope_bounds : (2,) what logarithms of steps are cut off at
+    log_slope_bounds : (2,) limits to which logarithms of steps are clipped
     """
 
     mean: Floats
