@@ -82,5 +82,5 @@ def facts(pairs: Iterable[tuple[str, Content, str]]) -> Html:
 
 
 def folded(summary: str, content: Content) -> Html:
-    """Return HTML that shows its content after a click."""
+    """Make an HTML element that shows its content after a click."""
     return element("details", element("summary", summary), content)

@@ -33,9 +33,9 @@ class CoverageGap(NamedTuple):
 
 
 def find_holes(coverage: Coverage) -> list[CoverageGap]:
-    """Combine the missing cells to few rectangles, the largest deficit first.
+    """Combine the missing cells into few rectangles, the largest deficit first.
 
-    Cells are joined along the turn rate within one side (left, straight on, right), then runs that are alike along the
+    Cells of one side (left, straight on, right) are joined along the turn rate; equal runs are then joined along the
     speed. A rectangle is described by the centres of its outermost cells, which are trials.
     """
     lacking = coverage.deficit_s > 0.0

@@ -38,10 +38,10 @@ class ModelSubject:
     Parameters
     ----------
     primitive : the model
-    examples : that it was trained on
+    examples : aligned examples that it was trained on
     report : its quality
     check : accuracy of searches, if it was measured
-    seed : of the samples that are drawn
+    seed : seed of the drawn samples
     """
 
     primitive: MotionPrimitive
