@@ -115,8 +115,10 @@ def forward_kinematics(
     if poses.ndim != 2 or poses.shape[1] != 3 + 4 * joints:
         raise MotionError(f"shape {poses.shape} where (frames, {3 + 4 * joints}) is needed", where="poses")
     sites = skeleton.end_sites if end_sites else ()
-    parents = np.array([*skeleton.parents, *(site.joint for site in sites)], dtype=np.int32)
-    offsets = np.array([*skeleton.offsets, *(site.offset for site in sites)], dtype=poses.dtype)
+    parents, offsets = skeleton.parents, skeleton.offsets.astype(poses.dtype)
+    if sites:
+        parents = np.concatenate((parents, np.array([site.joint for site in sites], dtype=np.int32)))
+        offsets = np.concatenate((offsets, np.array([site.offset for site in sites], dtype=poses.dtype)))
     points = len(parents)
     slots = np.full(points, -1, dtype=np.int32)
     slots[list(translated_joints)] = np.arange(len(translated_joints), dtype=np.int32)
