@@ -259,7 +259,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(
         (stream, {"poses": poses, "roots": np.zeros((10, 3))}, "not both"),
         (stream, {"poses": poses, "translated_joints": ["Hips"]}, "give translations and translated_joints together"),
         (stream, {"roots": far}, "from the origin"),
-        (stream, {"poses": poses * np.float32(1e30)}, "rotation of length"),
+        (stream, {"poses": poses * np.float32(1e30)}, "has length"),
         (stream, {"poses": np.hstack((poses[:, :3] + 1e30, poses[:, 3:]))}, "from the origin"),
         (stream, {"roots": np.zeros((2, 4))}, "3 columns"),
         (stream, {"roots": np.zeros((0, 3))}, "send frames, or set ends_take"),
