@@ -8,6 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+
 pytestmark = pytest.mark.timeout(300)
 
 
@@ -34,3 +37,15 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(t
     assert again["statuses"] == {"unchanged": again["files"]}
     with open(again["evaluation_report"], encoding="utf-8") as page:
         assert "</html>" in page.read()
+
+
+def test_a_run_with_other_files_reports_on_these_alone(tmp_path: Path) -> None:
+    for name, speed_m_s in (("first", 1.3), ("second", 1.6)):
+        (tmp_path / name).mkdir()
+        walk = write_bvh(generate_gait(speed_m_s, 0.4, 3.0))
+        (tmp_path / name / f"{name}.bvh").write_bytes(walk)
+    reports = [json.loads(demo(tmp_path, name, "--json").stdout) for name in ("first", "second")]
+    for name, report in zip(("first", "second"), reports, strict=True):
+        assert report["retargeted_clips"] == report["evaluated_clips"] == report["tasks"] == 1, name
+        assert [Path(file).stem for file in report["exported"]] == [name]
+        assert report["frames"] == report["retargeted_frames"] > 0

@@ -53,7 +53,9 @@ class TakePair(NamedTuple):
     result: Clip
 
 
-def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6) -> bytes:
+def contact_sheet(
+    takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6, total: int | None = None
+) -> bytes:
     """Draw a PNG with one row per take: at each moment the figure of the source and, on a tinted ground, of the result.
 
     The figures of a take are drawn at one scale and seen from one side, to the left of where the source faces at first.
@@ -64,6 +66,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     takes : takes to draw, at most `MAX_TAKES`
     heading : title of the page
     moments : number of evenly spaced moments of each take, at most `MAX_MOMENTS` and one per frame
+    total : number of takes that the drawn ones were chosen from; default: the drawn ones are all
 
     Raises
     ------
@@ -83,7 +86,7 @@ def contact_sheet(takes: Sequence[TakePair], *, heading: str = "Retargeting", mo
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0.0, PAGE_WIDTH), ylim=(0.0, height))
     axes.axis("off")
-    _draw_header(axes, height, heading, len(rows))
+    _draw_header(axes, height, heading, _take_count(len(rows), total))
     for number, row in enumerate(rows):
         _draw_row(axes, row, height - HEADER - number * ROW, (PAGE_WIDTH - 2 * MARGIN) / moments)
     buffer = io.BytesIO()
@@ -146,11 +149,16 @@ class _SheetCell:
         return seen[..., :2] * self.scale + self.centre
 
 
-def _draw_header(axes: Axes, top: float, heading: str, count: int) -> None:
+def _take_count(shown: int, total: int | None) -> str:
+    """Return the number of takes in words, such as `8 of 24 takes`."""
+    return counted(shown, "take") if total in (None, shown) else f"{shown} of {counted(total, 'take')}"
+
+
+def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
     line = top - 0.50
     _write(axes, (MARGIN, line), heading, 21, weight="bold")
-    takes = f"{counted(count, 'take')}, each moment as source (white) and result (tinted)"
-    _write(axes, (MARGIN, line - 0.31), takes, 10.5, QUIET)
+    legend = f"{takes}, each moment as source (white) and result (tinted)"
+    _write(axes, (MARGIN, line - 0.31), legend, 10.5, QUIET)
     right, middle = PAGE_WIDTH - MARGIN, line + 0.08
     for place, (label, side) in enumerate((("left side", LEFT), ("right side", RIGHT))):
         start = right - 3.75 + 1.30 * place

@@ -15,6 +15,7 @@ from marey_motion.clip import Clip
 from marey_motion.errors import MotionError
 from marey_motion.gait import game_skeleton, generate_gait, studio_skeleton
 from marey_motion.skeleton import EndSite, Skeleton
+from marey_reports.drawing import contact_sheet as sheets
 from marey_reports.drawing.contact_sheet import (
     DPI,
     HEADER,
@@ -89,6 +90,22 @@ def test_source_and_result_are_drawn_at_one_scale(walk: Clip) -> None:
 
 def test_a_title_is_taken_literally_and_a_long_one_is_cut(walk: Clip) -> None:
     contact_sheet([TakePair(r"cost $5 and \frac{1}{0} ^_ {", walk, walk), TakePair("x" * 5000, walk, walk)])
+
+
+@pytest.mark.parametrize(("total", "said"), [(None, "1 take, "), (1, "1 take, "), (24, "1 of 24 takes, ")])
+def test_a_sheet_says_how_many_of_all_takes_it_shows(
+    walk: Clip, monkeypatch: pytest.MonkeyPatch, total: int | None, said: str
+) -> None:
+    texts = []
+    original = sheets._write
+
+    def written(axes: Any, place: Any, text: str, *arguments: Any, **options: Any) -> Any:
+        texts.append(text)
+        return original(axes, place, text, *arguments, **options)
+
+    monkeypatch.setattr(sheets, "_write", written)
+    contact_sheet([TakePair("walk", walk, walk)], moments=1, total=total)
+    assert any(text.startswith(said) for text in texts)
 
 
 def test_the_same_takes_give_the_same_picture_in_many_threads(walk: Clip) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +28,7 @@ from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry
-from marey_schemas.jobs import CollectionInput, Job
+from marey_schemas.jobs import Job
 from marey_schemas.options.imports import ImportOptions
 
 PROJECT = "demo"
@@ -68,15 +68,15 @@ class Story:
             entries = self._import()
         with self._timed("retarget"):
             target = self._target()
-            job = self._retarget(target)
+            sources = self._sources(entries)
+            job = self._retarget(list(sources.values()), target)
         tasks = [job, *self.project.jobs(filters={"parent": job.id})] if job else []
         tasks = [task for task in tasks if task.size is None]
-        sources = {clip.path: clip for clip in self.project.clips.list(collection=TAKES)}
-        results = sorted(self.project.clips.list(collection=RESULTS), key=lambda clip: clip.path)
+        results = self._results(sources)
         with self._timed("files"):
             shown = _evenly(results, SHEET_TAKES)
             exported = [self._export(clip) for clip in shown]
-            sheet = self._contact_sheet([(sources[_source_path(clip)], clip) for clip in shown])
+            sheet = self._contact_sheet([(sources[_source_path(clip)], clip) for clip in shown], len(results))
         with self._timed("evaluate"):
             root = target.hierarchy().joints[0].name
             evaluation = evaluate_locomotion(self.project, results, root, self.data, self.advance)
@@ -105,16 +105,27 @@ class Story:
         options = ImportOptions(collection=TAKES)
         return self.project.imports.upload(self.files.files, options, notice=self.advance)
 
+    def _sources(self, entries: Sequence[ImportEntry]) -> dict[str, ClipHandle]:
+        """Return the clips of this run's files by path; the project may have others, of earlier runs."""
+        imported = {entry.item for entry in entries}
+        clips = self.project.clips.list(collection=TAKES)
+        return {clip.path: clip for clip in clips if clip.id in imported}
+
+    def _results(self, sources: Mapping[str, ClipHandle]) -> list[ClipHandle]:
+        """Return the retargeted clips of the given sources, sorted by path."""
+        clips = self.project.clips.list(collection=RESULTS)
+        return sorted((clip for clip in clips if _source_path(clip) in sources), key=lambda clip: clip.path)
+
     def _target(self) -> SkeletonHandle:
         """Return the second skeleton, created on the first run."""
         found = next(self.project.skeletons.list(path=f"{TAKES}/{SKELETON}"), None)
         return found or self.project.skeletons.create(SKELETON, _game_skeleton_parts(), collection=TAKES)
 
-    def _retarget(self, target: SkeletonHandle) -> Job | None:
-        """Retarget every take to the second skeleton; return None if no take was imported."""
-        if next(self.project.clips.list(collection=TAKES, page_size=1), None) is None:
+    def _retarget(self, sources: Sequence[ClipHandle], target: SkeletonHandle) -> Job | None:
+        """Retarget the takes to the second skeleton; return None if there is no take."""
+        if not sources:
             return None
-        job = self.project.retarget([CollectionInput(collection=TAKES)], target.id, into=RESULTS)
+        job = self.project.retarget(sources, target.id, into=RESULTS)
         return Jobs(self.project.transport).wait(job.id, on_progress=self._show)
 
     def _show(self, job: Job) -> None:
@@ -123,15 +134,15 @@ class Story:
     def _export(self, clip: ClipHandle) -> Path:
         return clip.export(self.data / "files", format="bvh")
 
-    def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]]) -> Path | None:
-        """Draw source and result side by side, as an image."""
+    def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]], total: int) -> Path | None:
+        """Draw pairs of source and result, chosen from `total` pairs, side by side, as an image."""
         if not pairs:
             return None
         figures = embedded.room("marey_reports.drawing.contact_sheet", "all")
         load = _clip_loader(self.project)
         takes = [figures.TakePair(source.name, load(source), load(result)) for source, result in pairs]
         path = self.data / "contact-sheet.png"
-        path.write_bytes(figures.contact_sheet(takes, heading="Takes and their results"))
+        path.write_bytes(figures.contact_sheet(takes, heading="Takes and their results", total=total))
         return path
 
 
