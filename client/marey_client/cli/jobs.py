@@ -223,4 +223,6 @@ def _done(one: Job) -> str:
         return f"{one.children.get('succeeded', 0)}/{one.size}"
     if one.progress is None:
         return ""
+    if one.state == "succeeded":  # the last report of progress is older than the end
+        return f"{one.progress.total:g}/{one.progress.total:g}" if one.progress.total else ""
     return f"{one.progress.done:g}" + (f"/{one.progress.total:g}" if one.progress.total else "")

@@ -26,12 +26,13 @@ from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.files import _items_in
 from marey_client.cli.following import follow, print_ended
 from marey_client.cli.invocation import connect
+from marey_client.cli.jobs import _done
 from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _tell_shortfalls
 from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
-from marey_schemas.jobs import Job, JobState
+from marey_schemas.jobs import Job, JobState, Progress
 from marey_schemas.kinds import Kind
 
 
@@ -258,6 +259,20 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(
     ):
         anyone.project("lab").read()
     assert ("marey login" in sentence(raised.value)) is hinted
+
+
+@pytest.mark.parametrize(
+    ("fields", "shown"),
+    [
+        ({"state": JobState.SUCCEEDED, "progress": Progress(done=185, total=302)}, "302/302"),
+        ({"state": JobState.SUCCEEDED, "progress": Progress(done=185)}, ""),
+        ({"state": JobState.RUNNING, "progress": Progress(done=185, total=302)}, "185/302"),
+        ({"state": JobState.FAILED, "progress": Progress(done=185, total=302)}, "185/302"),
+        ({"state": JobState.QUEUED, "progress": None}, ""),
+    ],
+)
+def test_a_job_that_succeeded_is_listed_with_all_its_work_done(fields: dict[str, Any], shown: str) -> None:
+    assert _done(a_job(size=None, **fields)) == shown
 
 
 def test_what_is_wrong_with_a_file_is_told_without_the_number_of_the_error(tmp_path: Path) -> None:
