@@ -74,8 +74,15 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
     found = find_item(marey, address, kinds)
     if found is None:
         wanted = " or ".join(kind.value for kind in kinds) if len(kinds) <= 2 else "item"
-        raise WrongUsage(f"there is no {wanted} at {address}; marey ls {address.project} shows what there is")
+        raise _missing(marey, address, f"no {wanted}")
     return found
+
+
+def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
+    """Return the error for an address without a wanted item, with the command that lists the folder there or above."""
+    if address.path and marey.project(address.project).collections.at(address.path) is not None:
+        return WrongUsage(f"{address} is a folder; marey ls {address} lists it")
+    return WrongUsage(f"there is {what} at {address}; marey ls {address.project} shows what there is")
 
 
 def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
@@ -225,8 +232,11 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     if len(kinds) > 1:
         raise WrongUsage(f"{address} is the name of a {' and of a '.join(kinds)}; choose one with --kind")
     if not found:
-        what, option = ("nothing deleted", " --deleted") if deleted else ("nothing", "")
-        raise WrongUsage(f"there is {what} at {address}; marey ls{option} {address.project} shows what there is")
+        if not deleted:
+            raise _missing(marey, address, "nothing")
+        raise WrongUsage(
+            f"there is nothing deleted at {address}; marey ls --deleted {address.project} shows what there is"
+        )
     return found[0]
 
 

@@ -1,11 +1,13 @@
 """The command line where no server is needed."""
 
 import contextlib
+import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -19,7 +21,7 @@ from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
 from marey_client.cli import accounts, files, with_global_options_first
-from marey_client.cli.addresses import Address
+from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, print_labelled
 from marey_client.cli.failures import Refused, WrongUsage, sentence
@@ -259,6 +261,32 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(
     ):
         anyone.project("lab").read()
     assert ("marey login" in sentence(raised.value)) is hinted
+
+
+@pytest.mark.parametrize(
+    "find",
+    [
+        lambda marey: require_item(marey, Address("lab", "raw"), [Kind.CLIP]),
+        lambda marey: the_thing(marey, "lab/raw", "clip"),
+    ],
+)
+def test_who_asks_for_an_item_at_a_folder_is_told_that_it_is_one(
+    script: ScriptedServer, find: Callable[[Marey], Any]
+) -> None:
+    folder = {
+        "id": "collection_01m7ysc032mjg6sbhcx9q58xq7", "path": "raw", "rev": 1,
+        "created_at": "2026-01-01T00:00:00Z", "updated_at": "2026-01-01T00:00:00Z",
+    }  # fmt: skip
+
+    def page(*members: Any) -> httpx.Response:
+        return httpx.Response(200, content=json.dumps({"items": members, "next_cursor": None}))
+
+    script.answers = [page(), page(folder)]
+    with pytest.raises(WrongUsage, match=r"^lab/raw is a folder; marey ls lab/raw lists it$"):
+        find(script.marey())
+    script.answers = [page(), page()]
+    with pytest.raises(WrongUsage, match=r"^there is .* at lab/raw; marey ls lab shows what there is$"):
+        find(script.marey())
 
 
 @pytest.mark.parametrize(
