@@ -86,6 +86,11 @@ class Transport:
             trust_env=False,  # no proxy and no .netrc comes between a token and its server
         )
 
+    @property
+    def anonymous(self) -> bool:
+        """Whether requests carry no token."""
+        return self._auth is None
+
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
         """Return the same connections with another token; closing either closes both."""
         other = self.with_retries(retries or self.retries)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from marey_client.cli.failures import ANONYMOUS_HINT
 from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
 from marey_client.cli.output import print_json, print_pairs, print_table, tell
 
@@ -47,6 +48,8 @@ def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
     """Show every project that you may read."""
     with connect(context) as marey:
         projects = list(marey.projects())
+        if not projects and marey.transport.anonymous:
+            tell(ANONYMOUS_HINT)
     if as_json:
         return print_json(projects)
     rows = [(one.name, one.title, one.visibility, one.role, one.updated_at.date()) for one in projects]

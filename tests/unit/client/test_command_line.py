@@ -20,7 +20,7 @@ import typer
 from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client.cli import accounts, files, with_global_options_first
+from marey_client.cli import accounts, files, projects, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, print_labelled
@@ -261,6 +261,20 @@ def test_what_is_hidden_from_a_request_without_a_token_hints_at_that(
     ):
         anyone.project("lab").read()
     assert ("marey login" in sentence(raised.value)) is hinted
+
+
+@pytest.mark.parametrize(("token", "hinted"), [(None, True), ("marey_secret", False)])
+def test_an_empty_list_of_projects_without_a_token_hints_at_that(
+    script: ScriptedServer,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    token: str | None,
+    hinted: bool,
+) -> None:
+    monkeypatch.setattr(projects, "connect", lambda context: answering(script, token))
+    script.answers = [httpx.Response(200, content=b'{"items": [], "next_cursor": null}')]
+    projects.list_projects(NO_OPTIONS)
+    assert ("marey login" in capsys.readouterr().err) is hinted
 
 
 @pytest.mark.parametrize(
