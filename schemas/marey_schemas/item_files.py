@@ -8,6 +8,7 @@ from typing import Any
 
 from marey_schemas.encoding import codecs
 from marey_schemas.kinds import Kind
+from marey_schemas.names import base_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,5 +60,5 @@ def original_of_clip(item: str, info: Mapping[str, Any] | None) -> OriginalFile 
     source = (info or {}).get("source") or {}
     if not source.get("file"):
         return None
-    name = str(source.get("file_name") or item).replace("\\", "/").rpartition("/")[2]
-    return OriginalFile(name, source["file"])
+    name = str(source.get("file_name") or item)  # with its folders if an earlier version imported it
+    return OriginalFile(base_name(name), source["file"])

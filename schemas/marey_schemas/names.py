@@ -49,3 +49,8 @@ _DIGEST = re.compile(DIGEST_PATTERN)
 def is_digest(text: str) -> bool:
     """Return whether a text is the digest of bytes."""
     return _DIGEST.fullmatch(text) is not None
+
+
+def base_name(file: str) -> str:
+    """Return the name of a file without its folders, which end in `/` or `\\`."""
+    return file.replace("\\", "/").rpartition("/")[2]

@@ -8,6 +8,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from tests.support.motion_files import AMC, ASF
 from tests.support.rest_server import Server, running
 
 from marey_motion.formats import read_motion
@@ -120,7 +121,7 @@ def test_good_files_go_in_and_each_bad_one_is_refused_with_its_place(owner: http
     assert made["summary"]["frames"] == entries["take/walk.bvh"]["frames"] == 12
     info = owner.get(f"/projects/lab/clips/{made['id']}/parts/info").json()
     assert info["subject"] == "S1"
-    assert info["source"]["file_name"] == "take/walk.bvh"
+    assert info["source"]["file_name"] == "walk.bvh"
 
 
 def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client) -> None:
@@ -185,6 +186,16 @@ def test_clips_leave_in_other_formats(owner: httpx.Client, file_format: str) -> 
     exported = owner.get(f"/projects/lab/clips/{item}/export", params={"format": file_format})
     assert exported.status_code == 200, exported.text
     assert len(exported.content) > 1000
+
+
+def test_the_same_files_by_another_way_to_the_same_folder_change_nothing(owner: httpx.Client) -> None:
+    files = {"walk.bvh": bvh(), "arm.asf": ASF.encode(), "arm_01.amc": AMC.encode()}
+    first = send(owner, {f"cmu/{name}": data for name, data in files.items()}, collection="raw")
+    assert statuses(first) == {"cmu/walk.bvh": "created", "cmu/arm.asf": "companion", "cmu/arm_01.amc": "created"}
+    again = send(owner, files, collection="raw/cmu")
+    assert statuses(again) == {"walk.bvh": "unchanged", "arm.asf": "companion", "arm_01.amc": "unchanged"}
+    items = [[entry["item"] for entry in answer.json()["entries"]] for answer in (first, again)]
+    assert items[0] == items[1]
 
 
 def test_clips_can_be_made_to_use_a_given_skeleton(owner: httpx.Client) -> None:

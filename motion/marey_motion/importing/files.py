@@ -31,6 +31,7 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
+from marey_schemas.names import base_name
 
 _LONGEST_COLLECTION = 1024
 
@@ -141,11 +142,12 @@ def _check_document(warning: Tree) -> Tree:
 
 def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]) -> Tree:
     details = {key: value for key, value in imported.source.as_dict().items() if key not in ("format", "file")}
+    companion = file.planned.companion
     source = {
         "file": file.digest,
-        "file_name": file.planned.name,
+        "file_name": base_name(file.planned.name),
         "companion": file.companion_digest,
-        "companion_name": file.planned.companion,
+        "companion_name": None if companion is None else base_name(companion),
         "format": imported.source.format,
         "details": details,
     }

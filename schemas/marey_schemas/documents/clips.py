@@ -73,7 +73,7 @@ class ClipSource(Request):
     """Origin of a clip, and the changes made by the importer."""
 
     file: Digest | None = Field(None, description="The imported file, byte for byte.")
-    file_name: str | None = None
+    file_name: str | None = Field(None, description="Name of the file without its folders.")
     companion: Digest | None = Field(
         None, description="A second file that the format needs, such as the ASF of an AMC."
     )

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.names import Digest
+from marey_schemas.names import Digest, base_name
 
 CONTENT = {
     "model": (
@@ -36,5 +36,5 @@ def content_digest(part: str, document: Mapping[str, Any]) -> str:
 
 def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) -> dict[str, Any]:
     """Return the record of the file that a part was imported from."""
-    name = file.replace("\\", "/").rpartition("/")[2]
-    return StoredOriginal(name=name, blob=digest, content=content_digest(part, document)).model_dump()
+    content = content_digest(part, document)
+    return StoredOriginal(name=base_name(file), blob=digest, content=content).model_dump()
