@@ -231,7 +231,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Compute the source's rotations as its bones point, and which bones its translations turned.
+    """Correct the source's rotations so that its bones point to where translations of joints move their ends.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def clip_starts(clips: Sequence[DatabaseClip]) -> NDArray[np.int64]:
 
 
 def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Find the clip of each row.
+    """Find the clip that each database row belongs to.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def clips_of_rows(clips: Sequence[DatabaseClip], rows: NDArray[np.integer]) -> N
 
     Returns
     -------
-    (n,) int64    index of the clip
+    (n,) int64    index in `clips` of each row's clip
     """
     found: NDArray[np.int64] = np.searchsorted(clip_starts(clips)[1:], rows, side="right")
     return found

@@ -270,7 +270,7 @@ def _shoulder_twist(style: GaitStyle, moments: GaitMoments) -> AnyFloats:
 
 
 def _drift(style: GaitStyle, moments: GaitMoments, which: int) -> AnyFloats:
-    """Compute a slow wave (n,) between -1 and 1, each with its own period and phase."""
+    """Compute one of three slow sine waves (n,), chosen by `which`; each has its own period and phase."""
     period_s = (9.1, 6.7, 4.9)[which]
     return np.asarray(np.sin(2.0 * np.pi * moments.times_s / period_s + style.wander_phases_rad[which]))
 

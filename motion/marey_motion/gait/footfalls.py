@@ -131,7 +131,14 @@ class FootMotion:
 
 
 class _Foot(NamedTuple):
-    """A foot at n moments, loaded or free: the ball over the floor as z + i·x and above its height at rest."""
+    """Pose of one foot at n moments, in stance or in swing.
+
+    Parameters
+    ----------
+    ground : (n,) complex    place of the ball of the foot on the floor, z + i·x in metres
+    heights : (n,)    metres that the ball is higher than in the rest pose
+    pitches, toe_pitches, yaws, freedom : (n,)    as in `FootMotion`
+    """
 
     ground: Complexes
     heights: AnyFloats
@@ -313,7 +320,10 @@ class Footfalls:
 
 
 def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tuple[Complexes, Complexes]:
-    """Position and velocity of points of the ground in the turning, travelling frame of the root."""
+    """Transform points on the floor, and their velocities, from the world into the root's moving frame.
+
+    The velocities are those seen from that frame: the root's own travel and turning are subtracted.
+    """
     to_root = np.exp(-1j * root.headings)
     local = (points - root.positions) * to_root
     return local, (velocities - root.velocities) * to_root - 1j * root.turn_rates * local

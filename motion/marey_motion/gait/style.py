@@ -32,8 +32,8 @@ class GaitStyle:
     lean : forward lean of the trunk and banking into turns
     sway : counter-rotation of the shoulders against the legs
     arm_swing : amplitude of the arms
-    wander : slow irregular drift of head and arms; each clip's own
-    wander_phases_rad : phases of that drift
+    wander : amplitude of slow sine waves that are added to the angles of trunk, head and arms; 0 for neutral
+    wander_phases_rad : phases of these three waves
     """
 
     stride: float = 1.0

@@ -33,8 +33,9 @@ class SourceMotion:
         in the file's unit
     translated_joints : tuple of int    those k joints
     frame_rate_hz, declared_frame_time_s : float, optional    rate to use, and the frame time as written
-    unit_scale_m, up_axis, declared    unit in metres and axis where the format itself fixes them, with the words for
-        the record
+    unit_scale_m : float, optional    metres per unit of the file; None if format and file do not state it
+    up_axis : str, optional    axis that points up; None if format and file do not state it
+    declared : tuple of str    sentences that say where the file states its unit; kept as evidence in `SourceInfo`
     channels : tuple of tuples of str    names of each joint's channels in the file's order
     warnings : list of CheckWarning    defects that the reader tolerated
     """

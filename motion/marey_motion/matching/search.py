@@ -37,7 +37,8 @@ class SearchIndex(NamedTuple):
     selectable : (N,) bool    rows a search may choose
     blocks : (B, D', 16) float32    the blocks' rows, one dimension after the other
     block_rows : (B, 16) int32    numbers of these rows
-    block_of_row : (N,) int32    the block of a row, or of the selectable one before it
+    block_of_row : (N,) int32    index of each row's block; a row that is not selectable has that of the last
+        selectable row before it, or of the first one if there is none before it
     boxes : (G, D', 2, 16) float32    low and high sides of the boxes about a group's blocks
     group_blocks : (G + 1,) int32    first block of each group, and B
     group_boxes : (⌈G / 16⌉, D', 2, 16) float32    sides of the boxes about groups

@@ -146,7 +146,10 @@ def without_shared_folder(names: Sequence[str]) -> list[str]:
 
 
 def told_apart(names: Sequence[str]) -> list[str]:
-    """Drop the folders and the first words that all names share."""
+    """Shorten names to the parts that differ: drop the folders and the first words that all names share.
+
+    The words are kept if one of the names would be empty without them.
+    """
     within = without_shared_folder(names)
     words = [re.split(r"(?<=[ _-])", name) for name in within]
     shared = sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*words, strict=False)))

@@ -62,9 +62,11 @@ class Linearised(NamedTuple):
 
     Parameters
     ----------
-    points, point_slopes : (n, 3), (n, 3, W) what is tracked, in the world, and its derivatives
-    residuals, slopes : (3 m,), (3 m, W) errors of the constraints in tolerances, multiplied by the roots of their
-        weights
+    points : (n, 3) the tracked points in the world, metres
+    point_slopes : (n, 3, W) their derivatives
+    residuals : (3 m,) three numbers for each of m constraints: its error divided by its tolerance, multiplied by the
+        root of its weight
+    slopes : (3 m, W) derivatives of the residuals
     """
 
     points: Floats

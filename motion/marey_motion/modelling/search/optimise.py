@@ -122,7 +122,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
 
 def _step(curvature: Floats, gradient: Floats) -> Floats | None:
-    """Minimise a quadratic; None where rounding leaves no minimum, so that it must be damped more."""
+    """Compute the step to the minimum of a quadratic; None if rounding makes it singular and it needs more damping."""
     try:
         step = np.asarray(np.linalg.solve(curvature, -gradient))
     except np.linalg.LinAlgError:

@@ -70,13 +70,14 @@ class Measured(NamedTuple):
 
 
 class _Link(NamedTuple):
-    """A step in its place among the others.
+    """One step of a sequence, ready to be evaluated.
 
     Parameters
     ----------
-    objective : where there are several steps, tracks pelvis, facing and transition joints at the start, then at the end
-    beginning : the first two of these at the start alone
-    first : where its latent vector begins
+    objective : the step's constraints; if there are several steps, its first tracked points are pelvis, facing and
+        transition joints at the step's start, then the same at its end
+    beginning : pelvis and facing at the step's start, by which it is placed at the end of the step before it
+    first : index in the stacked latent vectors at which the step's own begins
     """
 
     objective: Objective
@@ -85,7 +86,15 @@ class _Link(NamedTuple):
 
 
 class _Walked(NamedTuple):
-    """A step in the world; jumps (j, 3) of pelvis and transition joints; derivatives are by all latent vectors."""
+    """A step placed in the world after the steps before it; W counts the numbers of the latent vectors of all steps.
+
+    Parameters
+    ----------
+    placement : (3,) heading, x and z of the step's canonical frame
+    found : the step's constraints, linearised
+    jumps : (j, 3) metres from the end of the step before it, for pelvis and transition joints; j is 0 for the first
+    jump_slopes : (j, 3, W) derivatives of the jumps
+    """
 
     placement: Floats
     found: Linearised
@@ -180,15 +189,15 @@ class SeveralSteps:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
-        """Compute the start of the step after given ones, as far as it does not depend on its own motion.
+        """Compute where the step that follows given steps must begin to continue their motion.
 
         Parameters
         ----------
-        latents : sequence of (L,) float64    latent vectors of the steps before it
+        latents : sequence of (L,) float64    latent vectors of the given steps, the first of the sequence
 
         Returns
         -------
-        CarriedOn    placement and transition joints
+        CarriedOn    place and heading of the last given step's end, and its transition joints
         """
         if not latents:
             return CarriedOn(self.start, {})

@@ -44,8 +44,9 @@ class Chains(NamedTuple):
     parents : (V,) place of the parent among the V, -1 for roots
     offsets : (V, 3) metres
     term_starts, term_nodes, term_signs : (n + 1,), (t,), (t,) the joints whose positions make up each point
-    held : (n,) 1 for places, 0 for differences, which no shift changes
-    turned : (n,) the joint whose rotation goes with each point
+    held : (n,) 1 if the point is a position, which moves with the placement; 0 if it is a difference of positions,
+        which is only turned by it
+    turned : (n,) place among the V of the joint whose rotation is tracked with each point
     """
 
     mean: Floats

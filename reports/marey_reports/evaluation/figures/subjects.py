@@ -102,11 +102,11 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """Choose a trial that all subjects have, from the first of the families that has one.
+    """Choose a trial that all subjects have, from the first of the families that contains such a trial.
 
-    Without a name it is the one that the first subject follows worst.
+    If `name` is None, it is the trial of that family that the first subject follows worst.
 
-    Raises `MotionError` when there is none.
+    Raises `MotionError` if the subjects share no such trial.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

@@ -122,7 +122,7 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
-    """Draw the criterion over the number of components of the mixture; None where there was no choice."""
+    """Draw the criterion over the number of components of the mixture; None if the training compared no numbers."""
     candidates = subject.report.candidates
     if not candidates:
         return None
