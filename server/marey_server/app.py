@@ -36,7 +36,7 @@ from marey_server.http.routes import RouteTable
 from marey_server.launchers.local import local_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.process.computing import compute_on_one_thread_each, keep_freed_memory
-from marey_server.process.data_folder import prepare_data_folder
+from marey_server.process.data_folder import BLOB_FOLDER, WORKER_CACHE, prepare_data_folder
 from marey_server.process.housekeeping import keeping_house
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
@@ -175,7 +175,7 @@ def open_database(settings: Settings) -> Database:
 
 def connect_database(settings: Settings) -> Database:
     """Connect to the database without upgrading its tables."""
-    blobs = DirectoryBlobs(settings.data / "blobs") if settings.blobs == "directory" else None
+    blobs = DirectoryBlobs(settings.data / BLOB_FOLDER) if settings.blobs == "directory" else None
     return Database(settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs)
 
 
@@ -219,7 +219,7 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
             settings.local_workers,
             url=running.address,
             token=make_worker_token(database, settings) if settings.local_workers else "",
-            cache=settings.data / "worker-cache",
+            cache=settings.data / WORKER_CACHE,
             log_form=settings.log_form,
             log_level=settings.log_level,
         ),

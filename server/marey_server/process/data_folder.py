@@ -7,31 +7,44 @@ import os
 import stat
 from pathlib import Path
 
+from marey_server.process.administrators import TOKEN_FILE
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import sqlite_file
+
+BLOB_FOLDER = "blobs"
+WORKER_CACHE = "worker-cache"
 
 log = logging.getLogger(__name__)
 
 
 def prepare_data_folder(settings: Settings) -> None:
-    """Create the data folder, and take all rights of other users to it and to the files directly in it.
+    """Create the data folder, and take the rights of other users to the server's own files and folders in it.
 
-    An SQLite file is created here, because SQLite would let everybody read it; its log files get the rights that it
-    has. Rights of a folder that belongs to somebody else stay as they are, with a warning.
+    The folder itself is closed, too, unless it contains anything else. An SQLite file is created here, because SQLite
+    would let everybody read it; SQLite gives its log files the rights of the database.
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    for path in (settings.data, *settings.data.iterdir()):
-        _close_to_others(path)
-    if (file := sqlite_file(settings.resolved_database_url)) is not None and file.parent.is_dir():
+    folder = settings.data.resolve()
+    own = {folder / name for name in (TOKEN_FILE, BLOB_FOLDER, WORKER_CACHE, "marey.toml")}
+    file = sqlite_file(settings.resolved_database_url)
+    if file is not None and file.parent.is_dir():
         os.close(os.open(file, os.O_CREAT | os.O_RDWR, 0o600))
+        file = file.resolve()
+        own |= {file.with_name(file.name + ending) for ending in ("", "-wal", "-shm", "-journal")}
+    for path in own:
+        _close_to_others(path)
+    if own.issuperset(folder.iterdir()):
+        _close_to_others(folder)
+    elif stat.S_IMODE(folder.stat().st_mode) & 0o077:
+        log.warning("%s contains other files, so it stays open to other users; choose a folder for Marey alone", folder)
 
 
 def _close_to_others(path: Path) -> None:
     try:
         mode = stat.S_IMODE(path.lstat().st_mode)
         if mode & 0o077 and not path.is_symlink():
-            path.chmod(mode & 0o700)
-    except FileNotFoundError:  # a file of SQLite that another process has just removed
+            path.chmod(mode & ~0o077)
+    except FileNotFoundError:  # not every server has every file
         pass
-    except PermissionError:
-        log.warning("%s can be used by others, and belongs to another user, who alone can change that", path)
+    except OSError as error:
+        log.warning("%s stays open to other users: %s", path, error.strerror)

@@ -2,6 +2,7 @@
 
 import asyncio
 import sqlite3
+import stat
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -175,20 +176,49 @@ def test_the_server_runs_on_asyncio_where_uvloop_is_not_installed(monkeypatch: p
     loop.close()
 
 
+def modes_in(folder: Path) -> dict[str, int]:
+    return {path.name: stat.S_IMODE(path.stat().st_mode) for path in folder.iterdir()}
+
+
 @pytest.mark.parametrize("start", [lambda folder: open_database(Settings(data=folder)).close(), upgrade_in])
+@pytest.mark.parametrize("through_link", [False, True])
 def test_other_users_may_not_look_into_a_data_folder_whatever_its_rights_were(
-    start: Callable[[Path], None], tmp_path: Path
+    start: Callable[[Path], None], tmp_path: Path, *, through_link: bool
 ) -> None:
-    folder = tmp_path / "data"
-    folder.mkdir(mode=0o755)
+    folder, link = tmp_path / "data", tmp_path / "link"
+    folder.mkdir()
     folder.chmod(0o755)
+    link.symlink_to(folder)
     (folder / "marey.toml").write_text("")
     (folder / "marey.toml").chmod(0o644)
-    start(folder)
+    start(link if through_link else folder)
     with closing(sqlite3.connect(folder / "marey.db")) as server:
         server.execute("PRAGMA journal_mode=WAL")
         server.execute("UPDATE user SET name = name")
-        modes = {path.name: path.stat().st_mode & 0o777 for path in folder.iterdir()}
+        modes = modes_in(folder)
     assert folder.stat().st_mode & 0o777 == 0o700
     assert {"marey.db", "marey.db-wal", "marey.db-shm", "marey.toml"} <= modes.keys()
     assert set(modes.values()) == {0o600}
+
+
+def test_a_folder_with_files_of_others_stays_open_and_they_keep_their_rights(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "checkout"
+    folder.mkdir()
+    (folder / "run.sh").write_text("")
+    (folder / "run.sh").chmod(0o755)
+    folder.chmod(0o2775)
+    open_database(Settings(data=folder)).close()
+    modes = modes_in(folder)
+    assert (modes.pop("run.sh"), stat.S_IMODE(folder.stat().st_mode)) == (0o755, 0o2775)
+    assert set(modes.values()) == {0o600}
+    assert "contains other files" in caplog.text
+
+
+def test_a_database_outside_the_data_folder_is_closed_to_others(tmp_path: Path) -> None:
+    file = tmp_path / "elsewhere.db"
+    file.touch()
+    file.chmod(0o644)
+    open_database(Settings(data=tmp_path / "data", database_url=f"sqlite:///{file}")).close()
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600

@@ -39,9 +39,15 @@ def opening(url: str) -> Iterator[None]:
 
 
 def sqlite_file(url: str) -> Path | None:
-    """Return the file of an SQLite database, or None for other databases."""
+    """Return the file of an SQLite database, or None for other databases, in memory for example."""
     parsed = make_url(url)
-    return Path(parsed.database) if parsed.get_backend_name() == "sqlite" and parsed.database else None
+    if (
+        parsed.get_backend_name() != "sqlite"
+        or not parsed.database
+        or parsed.database.startswith((":memory:", "file:"))
+    ):
+        return None
+    return Path(parsed.database)
 
 
 def _shown(url: str) -> str:
