@@ -1,5 +1,6 @@
 """Bodies of callers who may not send them: refused before any of their bytes is decoded."""
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -7,11 +8,12 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
-from tests.support.rest_server import Server
+from tests.support.rest_server import PATIENCE_S, Server
 
 from marey_schemas.access import Role
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.codecs import FREE_ARRAY_BYTES
+from marey_server.access.principal import SYSTEM
 from marey_server.http.validation import decode_body
 
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
@@ -35,9 +37,9 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes of the bodies that the server decodes."""
     sizes: list[int] = []
 
-    def note(data: bytes, media_type: str, *, max_array_bytes: int) -> Any:
+    def note(data: bytes, media_type: str, **options: Any) -> Any:
         sizes.append(len(data))
-        return decode_body(data, media_type, max_array_bytes=max_array_bytes)
+        return decode_body(data, media_type, **options)
 
     monkeypatch.setattr("marey_server.http.resource.decode_body", note)
     return sizes
@@ -90,6 +92,18 @@ def test_a_small_body_unpacks_to_sixteen_megabytes_at_most(owner: httpx.Client) 
     fits, exceeds = (np.zeros((FREE_ARRAY_BYTES // 4 + more, 1), np.float32) for more in (0, 1))
     codes = [owner.post(CLIPS, content=packed(array), headers=MSGPACK).json()["code"] for array in (fits, exceeds)]
     assert codes == ["invalid", "too-large"]
+
+
+def test_callers_are_admitted_or_refused_while_all_threads_for_reads_are_busy(server: Server) -> None:
+    server.make_project()
+    done = threading.Event()
+    reads = [server.database.submit_read(SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for _ in range(16)]
+    try:
+        refused = server.client(INVENTED).post(CLIPS, json={})
+        assert not any(read.done() for read in reads)
+    finally:
+        done.set()
+    assert refused.status_code == 401
 
 
 def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_a_while(server: Server) -> None:

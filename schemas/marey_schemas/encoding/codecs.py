@@ -25,12 +25,12 @@ JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", 
 MAX_BYTES = 1 << 28
 MAX_DEPTH = 64
 MAX_LIST = 1 << 20
-MAX_VALUES = 1 << 20
+MAX_VALUES = 1 << 21
 """Greatest number of values in a document that is decoded; the elements of arrays do not count."""
 FREE_LISTS = 1 << 17
 """Number of objects and lists that a document of any size may contain; larger documents may contain more."""
-BYTES_PER_LIST = 12
-"""Least size in bytes of an object or a list, on average: one takes 70 bytes of memory, and three in JSON."""
+BYTES_PER_LIST = 6
+"""Least size in bytes of an object or a list, on average: one takes 70 bytes of memory, and `[0,0],` six in JSON."""
 FREE_ARRAY_BYTES = 1 << 24
 """Bytes of arrays that a document of any size may unpack to."""
 UNPACKING = 2048

@@ -130,8 +130,7 @@ class ProjectImports(Resource):
         return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
 
     async def _read_request(self) -> ImportRequest:
-        tree = decode_body(bytes(self.body), body_type(self.request.headers.get("Content-Type")), max_array_bytes=0)
-        return validate_body(ImportRequest, tree)
+        return await self.compute(_decode, bytes(self.body), body_type(self.request.headers.get("Content-Type")))
 
     async def _submit(self, project: str, options: ImportOptions) -> Reply:
         for file in self.files:
@@ -201,6 +200,10 @@ class ProjectImports(Resource):
         for file in getattr(self, "files", ()):
             if isinstance(file.content, blobs.Spool):
                 file.content.close()
+
+
+def _decode(data: bytes, media_type: str) -> ImportRequest:
+    return validate_body(ImportRequest, decode_body(data, media_type, max_array_bytes=0))
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:

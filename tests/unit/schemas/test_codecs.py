@@ -235,9 +235,19 @@ def test_a_document_of_any_size_may_contain_some_lists_and_a_large_one_more() ->
     for media_type in (JSON, MSGPACK):
         assert len(decode_tree(encode_tree(fits, media_type), media_type)) == len(fits)
         assert refusal(encode_tree([*fits, []], media_type), media_type).code == "too-large"
-    long = [["twelve bytes"]] * (FREE_LISTS + 1)
+    long = [[0, 0, 0, 0, 0, 0]] * (FREE_LISTS + 1)
     for media_type in (JSON, MSGPACK):
         assert len(decode_tree(encode_tree(long, media_type), media_type)) == len(long)
+
+
+def test_an_array_of_many_short_rows_is_read_from_json_as_programs_write_it() -> None:
+    rows = "[" + ",".join(["[" + ",".join(["[0,0,1]"] * 20) + "]"] * 10_000) + "]"
+    leaf = f'{{"dtype": "<f4", "shape": [10000, 20, 3], "data": {rows}}}'
+    assert decode_tree(f'{{"a": {leaf}}}'.encode(), JSON)["a"].shape == (10_000, 20, 3)
+
+
+def test_a_list_may_have_its_greatest_length_inside_an_object() -> None:
+    assert len(decode_tree(encode_tree({"a": [0] * MAX_LIST}, JSON), JSON)["a"]) == MAX_LIST
 
 
 def test_values_are_limited_beyond_the_length_of_each_list() -> None:

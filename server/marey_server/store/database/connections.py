@@ -43,6 +43,8 @@ WAL_PATIENCE_MS = 250
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
+SHORT_READERS = 2
+"""Number of threads for reads of a few rows; a pool may open connections for them beyond its size."""
 
 _POSTGRES_SETTINGS = {
     "statement_timeout": "120s",
@@ -81,6 +83,7 @@ class Database:
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         self._wal_checked_s = 0.0
         self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
+        self._short_readers = ThreadPoolExecutor(SHORT_READERS, thread_name_prefix="marey-short-read")
         self._write_lane = WriteLane(self.write) if self.is_sqlite else None
 
     @property
@@ -189,6 +192,16 @@ class Database:
         """Run `read` in a thread of the pool, for callers on an event loop."""
         return self._readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
 
+    def submit_short_read(
+        self,
+        principal: Principal,
+        function: Callable[Concatenate[Transaction, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Future[T]:
+        """Run a `read` of a few rows in a thread of its own pool, so that it never waits behind long reads."""
+        return self._short_readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
+
     def submit_write(
         self,
         principal: Principal,
@@ -205,6 +218,7 @@ class Database:
         """Finish the running transactions, then close all connections."""
         if self._write_lane is not None:
             self._write_lane.close()
+        self._short_readers.shutdown(wait=True)
         self._readers.shutdown(wait=True)
         self._read_engine.dispose()
         self.engine.dispose()
