@@ -219,7 +219,10 @@ def import_annotation(
         str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
     ] = None,
     end_index: Annotated[
-        EndIndex, typer.Option(help="Whether a section includes its frame end_idx, as in the predecessor's editor.")
+        EndIndex,
+        typer.Option(
+            help="inclusive: end_idx is the last frame of a section, as in the predecessor; exclusive: the next."
+        ),
     ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
     as_json: AsJson = False,
@@ -247,7 +250,7 @@ def export_annotation(
         typer.Option(help="Form of the file: sections by label, a list of sections, or frames by label."),
     ] = DEFAULT_FORM,
     end_index: Annotated[
-        EndIndex, typer.Option(help="Whether a section includes its frame end_idx.")
+        EndIndex, typer.Option(help="inclusive: end_idx is the last frame of a section; exclusive: the frame after it.")
     ] = DEFAULT_END_INDEX,
 ) -> None:
     """Write an annotation to a file for Marey's predecessor."""

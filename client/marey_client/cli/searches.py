@@ -70,7 +70,7 @@ def search(
     face: Annotated[
         Many, typer.Option(help="Turn the body to a heading: WHEN=degrees from +z, positive to the left.")
     ] = None,
-    time: Annotated[Many, typer.Option(help="Set the time of a keyframe: WHEN=seconds.")] = None,
+    time: Annotated[Many, typer.Option(help="Set the time of a keyframe in seconds: KEYFRAME=seconds.")] = None,
     start: Annotated[str | None, typer.Option(help="Position and heading of the motion's start: x,z,degrees.")] = None,
     tolerance_cm: Annotated[
         float | None, typer.Option(help="Tolerance of positions, in centimetres; default: 1.")

@@ -1,4 +1,4 @@
-"""Rows of a matching database for one clip, on its simulation root and with its features."""
+"""Rows that a clip adds to a matching database: poses relative to the simulation root, and features."""
 
 from __future__ import annotations
 

@@ -25,11 +25,11 @@ class ProjectPipelines(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
-        """Submit jobs, some of which read outputs of others, all or none.
+        """Submit several jobs, all or none; jobs can read the outputs of others.
 
-        An input `{"step": name}` stands for all outputs of that step that have the input's kind, at the revisions it
-        creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects are
-        computed.
+        An input `{"step": name}` stands for all outputs of that step that have the input's kind, at the revisions that
+        the step creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects
+        are computed.
         """
         return await self.answer_with(
             lambda made: Reply(made, headers={"Retry-After": "1"}), submit_pipeline, project, body

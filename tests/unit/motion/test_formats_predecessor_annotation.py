@@ -91,8 +91,8 @@ def test_labels_that_overlap_can_be_read_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("document", "told"),
     [
-        ({}, "neither 'sections'"),
-        ({"sections": 3}, "neither 'sections'"),
+        ({}, "must have 'sections'"),
+        ({"sections": 3}, "must have 'sections'"),
         ({"sections": [{"start_idx": 1}]}, "'end_idx' must be int"),
         ({"sections": {"a": {"start_idx": 1}}}, "'a' must be list"),
         ({"sections": "{"}, "'sections' cannot be read"),

@@ -252,7 +252,7 @@ def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int)
         raise _wrong(
             other,
             "neighbour-in-the-way",
-            f"moving the {edge} of {segment} to {to} would leave this neighbour without frames",
+            f"moving the {edge} of {segment} to {to} would leave its neighbour {other} without frames",
         )
     first = min(index, beside)
     return layer._with(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))

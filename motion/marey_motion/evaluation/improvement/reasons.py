@@ -28,7 +28,7 @@ def why_unused_clip(clip: UnusedClip) -> str:
 def why_unused_range(part: UnusedRange) -> str:
     """Explain why a range of a clip can be removed.
 
-    A recording that is cut there is filtered again, so nothing exact is promised.
+    The sentence states no exact effect: after a cut, the clip is filtered again, which changes frames near the cut.
 
     Parameters
     ----------

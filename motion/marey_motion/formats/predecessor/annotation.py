@@ -154,7 +154,7 @@ def _sections(sections: Any, end_index: EndIndex, file: str) -> list[Segment]:
             _section(one, label, end_index, file) for label in sections for one in field_of(sections, label, list, file)
         ]
     raise FormatError(
-        f"the document has neither {SECTIONS!r}, a list or an object by label, nor {SEMANTIC!r}, an object by label",
+        f"the document must have {SECTIONS!r}, a list or an object by label, or {SEMANTIC!r}, an object by label",
         code="document-unknown",
         file=file,
     )

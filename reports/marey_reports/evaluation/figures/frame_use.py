@@ -44,7 +44,10 @@ class _Strip(NamedTuple):
 
 
 def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw one strip per clip from beginning to end, the most used first; two subjects share the rows."""
+    """Draw one strip per clip from beginning to end, the most used first.
+
+    If two evaluations are compared, each row shows both.
+    """
     usage = [{subject.result.clips[each.clip].uid: each for each in subject.usage(trial)} for subject in subjects]
     uids = _most_used(usage, options.most_clips)
     strips = [_strips(subject, each, uids) for subject, each in zip(subjects, usage, strict=True)]

@@ -36,7 +36,7 @@ ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c
 
 
 def as_ended(row: Row[Any]) -> Ended:
-    """Return the ended job in a row that has `ENDED_COLUMNS`."""
+    """Convert a database row with the columns `ENDED_COLUMNS` to an ended job."""
     return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure)
 
 

@@ -193,7 +193,7 @@ def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[
 def _check_makers(submission: Submission, upstream: Mapping[str, Upstream], to_be: Collection[str], at: str) -> None:
     """Check that each source job of an input creates items of the input's kind.
 
-    In the pointer of an error, a source job of the same request is a `step`.
+    If the source job belongs to the same request, the JSON Pointer of an error ends in `step`, otherwise in `job`.
     """
     for place, name, maker in late_inputs(submission.request, at):
         wanted = submission.kind.inputs[name].kind
