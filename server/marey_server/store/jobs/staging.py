@@ -122,7 +122,7 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
     if source.revision in given:
         return [source.item, source.revision]
     asked = "" if source.revision is None else f" at revision {source.revision}"
-    known = f"; the job has its revision {', '.join(map(str, given))}" if given else ""
+    known = f"; the job has its {', '.join(f'revision {one}' for one in given)}" if given else ""
     raise InvalidProblem(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
 
 
