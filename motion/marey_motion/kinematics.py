@@ -113,7 +113,9 @@ def forward_kinematics(
 
     joints = skeleton.joint_count
     if poses.ndim != 2 or poses.shape[1] != 3 + 4 * joints:
-        raise MotionError(f"shape {poses.shape} where (frames, {3 + 4 * joints}) is needed", where="poses")
+        raise MotionError(
+            f"the poses have shape {poses.shape}; this skeleton needs (frames, {3 + 4 * joints})", where="poses"
+        )
     sites = skeleton.end_sites if end_sites else ()
     parents, offsets = skeleton.parents, skeleton.offsets.astype(poses.dtype)
     if sites:
@@ -159,7 +161,8 @@ def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
 
     if rotations.ndim != 3 or rotations.shape[1:] != (skeleton.joint_count, 4):
         raise MotionError(
-            f"shape {rotations.shape} where (frames, {skeleton.joint_count}, 4) is needed", where="rotations"
+            f"the rotations have shape {rotations.shape}; this skeleton needs (frames, {skeleton.joint_count}, 4)",
+            where="rotations",
         )
     flat = rotations.reshape(len(rotations), -1)
     out = np.empty(flat.shape, dtype=rotations.dtype)
@@ -268,7 +271,10 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
     length = np.linalg.norm(forward, axis=1)
     known = length >= SHORTEST_LATERAL_M
     if not known.any():
-        raise MotionError("left and right joints are never apart on the ground", code="heading-undefined")
+        raise MotionError(
+            "the left and right joints lie above each other in every frame, so the body has no forward direction",
+            code="heading-undefined",
+        )
     last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     frames = np.where(last_known < 0, int(np.argmax(known)), last_known)
     directions: NDArray[np.float64] = forward[frames] / length[frames, None]

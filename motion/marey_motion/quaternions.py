@@ -134,7 +134,7 @@ def from_matrix(matrix: ArrayLike) -> AnyFloats:
     """
     (m,), dtype = _widened((matrix, 3))
     if m.shape[-2:] != (3, 3):
-        raise RotationError(f"shape {m.shape} where (..., 3, 3) is needed", where="matrix")
+        raise RotationError(f"the matrices have shape {m.shape}; expected (..., 3, 3)", where="matrix")
     _check_orthonormal(m)
     outer = np.empty((*m.shape[:-2], 4, 4))
     trace = np.einsum("...ii->...", m)
@@ -488,7 +488,7 @@ def _widened(*arguments: tuple[ArrayLike, int]) -> tuple[list[Floats], np.dtype[
     arrays = [np.asarray(values) for values, _ in arguments]
     for array, (_, size) in zip(arrays, arguments, strict=True):
         if array.ndim == 0 or array.shape[-1] != size:
-            raise RotationError(f"shape {array.shape} where (..., {size}) is needed")
+            raise RotationError(f"the array has shape {array.shape}; expected (..., {size})")
     floating = [a.dtype if np.issubdtype(a.dtype, np.floating) else np.dtype(np.float64) for a in arrays]
     return [array.astype(np.float64, copy=False) for array in arrays], np.result_type(*floating)
 

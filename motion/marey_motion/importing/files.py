@@ -67,7 +67,10 @@ def import_file(file: FileToImport) -> ImportedFile:
     """
     try:
         if len(file.collection) > _LONGEST_COLLECTION:
-            raise FormatError(f"its collection has over {_LONGEST_COLLECTION} characters", code="name-invalid")
+            raise FormatError(
+                f"the path of its collection is longer than {_LONGEST_COLLECTION} characters; choose a shorter one",
+                code="name-invalid",
+            )
         return _imported(file)
     except MotionError as error:
         return ImportedFile(file.planned.name, refusal=refusal_of(error))
@@ -168,7 +171,7 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])
         raise FormatError(
-            f"its joints are not those of the skeleton asked for ({odd}); leave the skeleton out and retarget instead",
+            f"its joints differ from those of the given skeleton ({odd}); import without a skeleton, then retarget",
             code="skeleton-mismatch",
             file=file,
         )

@@ -130,7 +130,10 @@ def run_trial(
     last = database.starts[1:] - 1
     ends = last[database.selectable[last] & (rows.successors[last] < 0)]
     if len(ends):
-        raise MotionError(f"row {ends[0]} may be chosen but is the last of its clip", where="selectable")
+        raise MotionError(
+            f"row {ends[0]} is the last of its clip, so playback cannot go on from it; make it not selectable",
+            where="selectable",
+        )
     ticks = guide.tick_count
     played = _Arrays(
         rows=np.empty(ticks, np.int32),

@@ -211,7 +211,10 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
         random_state=seed % SEEDS,
     )
     if count > examples:
-        raise ModelError(f"{count} components for {examples} examples", code="too-many-components")
+        raise ModelError(
+            f"a mixture of {count} components needs at least {count} examples; there are {examples}",
+            code="too-many-components",
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # told by the second result
         model.fit(latents)

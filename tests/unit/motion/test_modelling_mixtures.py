@@ -177,7 +177,7 @@ def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example() -> N
 
 def test_the_choice_can_be_made_by_hand() -> None:
     assert len(fit_mixture(two_kinds(), MixtureOptions(mixture_components=3)).mixture.weights) == 3
-    with pytest.raises(MotionError, match="9 components for 8 examples"):
+    with pytest.raises(MotionError, match="9 components needs at least 9 examples; there are 8"):
         fit_mixture(two_kinds(8), MixtureOptions(mixture_components=9))
 
 

@@ -80,10 +80,13 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
     first = steps[0].primitive
     for number, step in enumerate(steps):
         if not same_hierarchy(step.primitive.skeleton, first.skeleton, tolerance_m=SAME_OFFSET_M):
-            raise InvalidConstraint("the models of the steps move different skeletons", where=f"steps[{number}]")
+            raise InvalidConstraint(
+                "the model of this step was made for another skeleton than the model of the first step",
+                where=f"steps[{number}]",
+            )
         if step.primitive.frame_rate_hz != first.frame_rate_hz:
-            rates = f"{first.frame_rate_hz:g} and {step.primitive.frame_rate_hz:g} Hz"
-            raise InvalidConstraint(f"the models of the steps have frame rates of {rates}", where=f"steps[{number}]")
+            rates = f"{step.primitive.frame_rate_hz:g} Hz, the first step's {first.frame_rate_hz:g} Hz"
+            raise InvalidConstraint(f"the model of this step has {rates}", where=f"steps[{number}]")
     placed = [
         _placed(step.primitive.motions(latent[None])[0], placement)
         for step, latent, placement in zip(steps, sequel.latents, sequel.measured.placements, strict=True)
