@@ -165,14 +165,14 @@ class Imports:
         self, files: Sequence[LocalFile], options: ImportOptions | None = None, *, notice: Notice | None = None
     ) -> list[ImportEntry]:
         """Import files; return one entry for each file, in order. A refused file does not affect others."""
-        tell = notice or _say_nothing
+        notify = notice or _ignore_notice
         named = [file for file in files if _may_travel(file.name)]
         entries = {file.name: _refused_name(file.name) for file in files if not _may_travel(file.name)}
-        sent = {file.name: file for file in self.send(named, notice=tell)}
+        sent = {file.name: file for file in self.send(named, notice=notify)}
         for portion in batches(named):
             for entry in self.run(tuple(sent[file.name] for file in portion), options):
                 entries.setdefault(entry.name, entry)
-            tell("importing", len(entries), len(files))
+            notify("importing", len(entries), len(files))
         return list(entries.values())
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
@@ -196,18 +196,18 @@ class Imports:
         for file in files:
             if not _may_travel(file.name):
                 raise BadFileName(refusal_text(_refused_name(file.name)))
-        tell = notice or _say_nothing
+        notify = notice or _ignore_notice
         digests: dict[str, str] = {}
         with ThreadPoolExecutor(UPLOADS_AT_ONCE, thread_name_prefix="marey-upload") as pool:
             for file, digest in zip(files, pool.map(lambda file: digest_of_file(file.path), files), strict=True):
                 digests[file.name] = digest
-                tell("hashing", len(digests), len(files))
+                notify("hashing", len(digests), len(files))
             lacking = self.blobs.missing(digests.values())
             by_digest = {digests[file.name]: file for file in files if digests[file.name] in lacking}
             sending = (pool.submit(self.blobs.put_file, file.path, digest=digest) for digest, file in by_digest.items())
             for done, upload in enumerate(list(sending), start=1):
                 upload.result()
-                tell("sending", done, len(by_digest))
+                notify("sending", done, len(by_digest))
         return tuple(ImportFile(name=file.name, blob=digests[file.name]) for file in files)
 
 
@@ -254,7 +254,7 @@ def left_out_text(paths: Sequence[Path]) -> str:
     return f"left out what is no motion: {paths[0].name}{others}"
 
 
-def _say_nothing(_stage: str, _done: int, _total: int) -> None:
+def _ignore_notice(_stage: str, _done: int, _total: int) -> None:
     pass
 
 

@@ -11,7 +11,7 @@ import typer
 
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, UserName, connect
-from marey_client.cli.output import print_json, print_pairs, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
@@ -56,7 +56,7 @@ def login(
         me = marey.me()
     path = logins_path(os.environ)
     store_login(path, url, secret)
-    tell(f"logged in to {url} as {me.user.name if me.user else 'nobody'}; the token is in {path}")
+    print_message(f"logged in to {url} as {me.user.name if me.user else 'nobody'}; the token is in {path}")
 
 
 def logout(context: typer.Context) -> None:
@@ -66,7 +66,7 @@ def logout(context: typer.Context) -> None:
     with connect(context, anonymous=True) as marey:
         url = marey.transport.url
     known = forget_login(logins_path(os.environ), url)
-    tell(f"forgot the token for {url}" if known else f"no token is stored for {url}")
+    print_message(f"forgot the token for {url}" if known else f"no token is stored for {url}")
 
 
 # -- tokens --
@@ -102,11 +102,11 @@ def create_token(
     with connect(context) as marey:
         made = marey.tokens.create(wanted) if output is None else _token_in_file(marey, wanted, output)
     if output is not None:
-        tell(f"token {made.id} is in {output}")
+        print_message(f"token {made.id} is in {output}")
     elif as_json:
         print_json(made)
     else:
-        tell(f"token {made.id}, scopes {', '.join(made.scopes)}; it is not shown again:")
+        print_message(f"token {made.id}, scopes {', '.join(made.scopes)}; it is not shown again:")
         typer.echo(made.secret)
 
 
@@ -140,7 +140,7 @@ def revoke_token(
     """Revoke a token, at once."""
     with connect(context) as marey:
         marey.tokens.revoke(token_id)
-    tell(f"{token_id} is revoked")
+    print_message(f"{token_id} is revoked")
 
 
 # -- users --
@@ -173,7 +173,7 @@ def create_user(
         made = marey.users.create(wanted)
     if as_json:
         return print_json(made)
-    return tell(f"user {made.name} exists now")
+    return print_message(f"user {made.name} exists now")
 
 
 @user.command("ls")
@@ -222,7 +222,7 @@ def change_password(
         if me is not None and who == me.name:
             change["current_password"] = _ask_secret("Current password")
         marey.users.change(who, UserChange.model_validate(change))
-    tell(f"the password of {who} is changed")
+    print_message(f"the password of {who} is changed")
 
 
 @user.command("disable")
@@ -230,7 +230,7 @@ def disable_user(context: typer.Context, name: UserName) -> None:
     """Disable a user; the user's data stays."""
     with connect(context) as marey:
         marey.users.disable(name)
-    tell(f"{name} is disabled; marey user enable {name} undoes it")
+    print_message(f"{name} is disabled; marey user enable {name} undoes it")
 
 
 @user.command("enable")
@@ -238,7 +238,7 @@ def enable_user(context: typer.Context, name: UserName) -> None:
     """Enable a disabled user again, with the same password and tokens."""
     with connect(context) as marey:
         marey.users.enable(name)
-    tell(f"{name} is enabled")
+    print_message(f"{name} is enabled")
 
 
 @user.command("change")
@@ -260,7 +260,7 @@ def change_user(
         changed = marey.users.change(name, change)
     if as_json:
         return print_json(changed)
-    return tell(f"user {changed.name} is changed")
+    return print_message(f"user {changed.name} is changed")
 
 
 def _ask_name() -> str:

@@ -9,7 +9,7 @@ import typer
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.following import JOB, Into, Sources, Wait, clips_at, follow, input_at, print_ended
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_table, tell
+from marey_client.cli.output import print_message, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
@@ -130,7 +130,7 @@ def print_labelled(result: dict[str, Any]) -> None:
     counts = result.get("segments") or result.get("labels") or {}
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
     if empty := result.get("empty"):
-        tell(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
+        print_message(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
 
 
 def _reference(marey: Marey, text: str) -> str:

@@ -11,7 +11,7 @@ from marey_client.cli.addresses import Address, addresses_in_one_project, find_i
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.following import JOB, Sources, Wait, clips_at, follow
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.typed_values import is_frame
 from marey_schemas.wording import counted
@@ -95,7 +95,7 @@ def evaluate(
             found.save_report(out)
         _print_evaluation(found, as_json)
     if out is not None:
-        tell(f"report: {out}")
+        print_message(f"report: {out}")
 
 
 def report(
@@ -129,9 +129,9 @@ def report(
         drawn = found.save_figures(figures) if figures is not None else []
     typer.echo(out)
     if walk_graph is not None:
-        tell(f"walk graph: {walk_graph}")
+        print_message(f"walk graph: {walk_graph}")
     if figures is not None:
-        tell(f"{counted(len(drawn), 'file')} of figures in {figures}")
+        print_message(f"{counted(len(drawn), 'file')} of figures in {figures}")
     if open_it:
         import webbrowser
 
@@ -177,7 +177,7 @@ def _print_evaluation(found: EvaluationHandle, as_json: bool) -> None:
             for row in worst]  # fmt: skip
     columns = ("worst trials", "offset m", "speed error m/s", "turn error deg/s")
     print_table(columns, rows, right=columns[1:])
-    return tell(f"{found.path}: marey report {found.project}/{found.path} --out report.html")
+    return print_message(f"{found.path}: marey report {found.project}/{found.path} --out report.html")
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -12,7 +12,7 @@ import typer
 from marey_client.cli.addresses import Address, find_item, kind_named, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_pairs, print_table, progress, tell
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table, progress
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of
@@ -54,7 +54,7 @@ def upload(
         options["handedness"] = "left"
     found = find_files(places)
     if found.left_out:
-        tell(left_out_text(found.left_out))
+        print_message(left_out_text(found.left_out))
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a missing project is an error before any bytes are sent
@@ -62,7 +62,7 @@ def upload(
             with progress() as advance:
                 entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
         except KeyboardInterrupt:
-            tell("interrupted; what was imported stays, and the same command again sends only what is missing")
+            print_message("interrupted; what was imported stays, and the same command again sends only what is missing")
             raise
     if as_json:
         print_json(entries)
@@ -78,14 +78,14 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
     found: dict[str, list[str]] = {}
     for entry in entries:
         if entry.error is not None:
-            tell(refusal_text(entry))
+            print_message(refusal_text(entry))
         for warning in entry.warnings:
             found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
     for code, texts in found.items():
         others = len(texts) - WARNINGS_SHOWN
         more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
         for text in [*texts[:WARNINGS_SHOWN], *more]:
-            tell(f"warning {code}: {text}")
+            print_message(f"warning {code}: {text}")
     counts = Counter(entry.status for entry in entries)
     frames = sum(entry.frames or 0 for entry in entries)
     told = ", ".join(
@@ -151,7 +151,7 @@ def _show_deleted(
     rows = [(f"{one.path}/", "collection", one.deleted_at, one.id) for one in folders]
     rows += [(one.path, one.item.kind, one.item.deleted_at, one.id) for one in items]
     print_table(("name", "kind", "deleted", "id"), rows)
-    return tell(f"marey restore {address.project}/NAME brings one back; an id where a name stands twice")
+    return print_message(f"marey restore {address.project}/NAME brings one back; an id where a name stands twice")
 
 
 def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
@@ -286,7 +286,7 @@ def download(
     else:
         typer.echo(f"wrote {counted(len(written), 'file')} to {output}")
         for name, reason in refused.items():
-            tell(f"{name}: {reason}")
+            print_message(f"{name}: {reason}")
     if refused:
         raise Refused
 

@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.addresses import Address, find_item
 from marey_client.cli.failures import Refused
-from marey_client.cli.output import Advance, print_json, progress, tell, tell_refused
+from marey_client.cli.output import Advance, print_json, print_message, print_refused, progress
 from marey_client.cli.schema_options import OptionsOf
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def follow(
             show(submitted)
             return marey.jobs.wait(submitted.id, on_progress=show)
     except KeyboardInterrupt:
-        tell(f"{seen.id} goes on; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it")
+        print_message(f"{seen.id} goes on; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it")
         raise
 
 
@@ -91,7 +91,7 @@ def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None
     if as_json:
         print_json(ended)
     else:
-        tell_refused(refused)
+        print_refused(refused)
         (show or _shown_counts(ended, refused))(result)
     if refused:
         raise Refused

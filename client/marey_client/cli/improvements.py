@@ -12,7 +12,7 @@ from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.following import JOB, Wait, clips_at, follow
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
@@ -85,7 +85,7 @@ def compare(
             found.save_report(out)
     _print_found(found, document, as_json, _print_comparison)
     if out is not None and not as_json:
-        tell(f"report: {out}")
+        print_message(f"report: {out}")
 
 
 def suggest(
@@ -116,7 +116,7 @@ def suggest(
     if remove_out is not None:
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
-        tell(f"{counted(len(names), 'clip')} that can go: {remove_out}")
+        print_message(f"{counted(len(names), 'clip')} that can go: {remove_out}")
     _print_found(found, document, as_json, _print_suggestions)
 
 
@@ -248,7 +248,9 @@ def _print_suggestions(document: Mapping[str, Any]) -> None:
                 typer.echo(f"  … and {len(entries) - SHOWN} more; --json has all.")
             typer.echo("")
     for one in document["unusable"]:
-        tell(f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})")
+        print_message(
+            f"{one['folder']}: {counted(one['clips'], 'clip')} cannot be matched: {one['detail']} ({one['code']})"
+        )
     if not any(entries for _, entries in sections):
         typer.echo("Every clip is needed, and nothing was found that would fill a hole.")
 

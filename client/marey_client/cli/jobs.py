@@ -11,7 +11,7 @@ from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.failures import Refused, WrongUsage
 from marey_client.cli.following import SEEDED_JOB, Into, Wait, follow, input_at, print_ended
 from marey_client.cli.invocation import AsJson, JobId, ProjectName, connect
-from marey_client.cli.output import print_json, print_pairs, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.schema_options import Chosen, add_command
 from marey_client.cli.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
 
@@ -105,7 +105,7 @@ def submit_job(
         ended = follow(marey, marey.project(project).submit(wanted), wait=wait, as_json=as_json)
     if ended is None:
         return
-    tell(f"{ended.id} {ended.state}")
+    print_message(f"{ended.id} {ended.state}")
     print_json(ended if as_json else ended.result)
     if (ended.result or {}).get("refused"):
         raise Refused
@@ -184,7 +184,7 @@ def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -
         found = marey.jobs.cancel(job_id)
     if as_json:
         return print_json(found)
-    return tell(f"{found.id} is {found.state}" + (", and will stop" if found.cancel_requested else ""))
+    return print_message(f"{found.id} is {found.state}" + (", and will stop" if found.cancel_requested else ""))
 
 
 @job.command("retry")

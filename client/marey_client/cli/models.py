@@ -11,7 +11,7 @@ from marey_client.cli.addresses import Address, addresses_in_one_project, requir
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.following import SEEDED_JOB, Wait, follow, input_at
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import DEFAULT_FORMAT, SAMPLE_FORMATS
 from marey_schemas.wording import one_of
@@ -122,5 +122,5 @@ def _print_model(found: ModelHandle, as_json: bool) -> None:
         ]
         print_table(columns, rows, right=columns)
     for warning in training["warnings"]:
-        tell(f"{warning['code']}: {warning['message']}")
-    return tell(f"{found.path}: marey sample {found.project}/{found.path} -n 10 --out samples")
+        print_message(f"{warning['code']}: {warning['message']}")
+    return print_message(f"{found.path}: marey sample {found.project}/{found.path} -n 10 --out samples")

@@ -11,7 +11,7 @@ import typer
 from marey_client.cli.addresses import FOLDER, Address, Thing, require_apart, the_thing
 from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, tell
+from marey_client.cli.output import print_json, print_message
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def mv(
         def move(thing: Thing) -> Any:
             was = thing.place
             moved = thing.move(folder, name or was.rpartition("/")[2])
-            tell(f"{was} is {to.project}/{moved.path} now")
+            print_message(f"{was} is {to.project}/{moved.path} now")
             return moved
 
         _do_each(things, move, "moved", as_json)
@@ -86,7 +86,7 @@ def rm(
 
         def remove(thing: Thing) -> Any:
             thing.delete()
-            tell(f"{thing.place} is removed; marey restore {_typed(thing)} brings it back")
+            print_message(f"{thing.place} is removed; marey restore {_typed(thing)} brings it back")
             return {"id": thing.id, "kind": thing.kind, "place": thing.place}
 
         _do_each(things, remove, "removed", as_json)
@@ -106,7 +106,7 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             except Conflict as error:
                 error.add_note("first move the item at that place away, with marey mv")
                 raise
-            tell(f"{thing.place} is back")
+            print_message(f"{thing.place} is back")
             return restored
 
         _do_each(things, bring_back, "restored", as_json)
@@ -138,7 +138,7 @@ def tag(
             handle: ItemHandle = thing.handle
             kept = (one for one in (*handle.item.tags, *added) if one not in removed)
             changed = handle.change(ItemChange(tags=tuple(dict.fromkeys(kept))))
-            tell(f"{thing.place}: {' '.join(changed.tags) or 'no tags'}")
+            print_message(f"{thing.place}: {' '.join(changed.tags) or 'no tags'}")
             return changed
 
         _do_each(things, put_tags, "changed", as_json)
@@ -169,7 +169,7 @@ def _ask(question: str) -> None:
     if not sys.stdin.isatty():
         raise WrongUsage(f"{question} there is no terminal to ask at: confirm with --yes")
     if not typer.confirm(question, err=True):
-        tell("nothing is removed")
+        print_message("nothing is removed")
         raise Refused
 
 
@@ -187,7 +187,7 @@ def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_
             if error.status >= 500 or error.status == 401:
                 raise
             refused[place] = sentence(error)
-            tell(f"{place}: {refused[place]}")
+            print_message(f"{place}: {refused[place]}")
     if as_json:
         report: Mapping[str, Any] = {done: results, "refused": refused}
         print_json(report)

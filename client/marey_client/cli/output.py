@@ -66,18 +66,18 @@ def print_pairs(pairs: Iterable[tuple[str, object]]) -> None:
         typer.echo(f"{name:<{width}}  {value}")
 
 
-def tell(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a message that is not a result to standard error."""
     typer.echo(text, err=True)
 
 
-def tell_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:
+def print_refused(refused: Sequence[Mapping[str, Any]], *, most: int | None = None) -> None:
     """Print the refused inputs of a job with their reasons to standard error, at most `most` lines."""
     for one in refused[:most]:
         name, detail = str(one.get("name")), str(one.get("detail"))
-        tell(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
+        print_message(f"{detail if detail.startswith(name) else f'{name}: {detail}'} ({one.get('code')})")
     if most is not None and len(refused) > most:
-        tell(f"and {len(refused) - most} more")
+        print_message(f"and {len(refused) - most} more")
 
 
 Advance = Callable[[str, float, float | None], None]

@@ -14,7 +14,7 @@ from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.failures import INTERRUPTED, Refused, WrongUsage
 from marey_client.cli.following import SEEDED_JOB, clips_at
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, progress, tell, tell_refused
+from marey_client.cli.output import print_json, print_message, print_refused, print_table, progress
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.typed_values import json_or_text, read_json
 
@@ -153,7 +153,7 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
 
     found = find_files(map(Path, takes))
     if found.left_out:
-        tell(left_out_text(found.left_out))
+        print_message(left_out_text(found.left_out))
     return project, {"takes": found.files, "options": ImportOptions.model_validate(options)}
 
 
@@ -179,7 +179,9 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
             run.wait(on_progress=show)
     except KeyboardInterrupt:
         first = next((job.id for job in run.steps.values() if not job.state.terminal), "JOB")
-        tell(f"the jobs go on without you; marey job ls {project} shows them, marey job cancel {first} stops them")
+        print_message(
+            f"the jobs go on without you; marey job ls {project} shows them, marey job cancel {first} stops them"
+        )
         raise typer.Exit(INTERRUPTED) from None
     finally:
         print_steps(run, as_json)
@@ -201,14 +203,14 @@ def _tell_shortfalls(run: PipelineRun) -> None:
     """Print refused and empty inputs of the steps, and the notes of their jobs."""
     for step, job in run.steps.items():
         if refused := _refused(job):
-            tell(f"{step} refused {len(refused)}:")
-            tell_refused(refused, most=REFUSED_SHOWN)
+            print_message(f"{step} refused {len(refused)}:")
+            print_refused(refused, most=REFUSED_SHOWN)
         result = job.result or {}
         if empty := result.get("empty"):
             places = empty[0] if len(empty) == 1 else f"{len(empty)} clips, such as {empty[0]}"
-            tell(f"{step} found nothing in {places}")
+            print_message(f"{step} found nothing in {places}")
         for note in result.get("notes", ()):
-            tell(f"{step}: {note}")
+            print_message(f"{step}: {note}")
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:

@@ -8,7 +8,7 @@ import typer
 
 from marey_client.cli.failures import ANONYMOUS_HINT
 from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
-from marey_client.cli.output import print_json, print_pairs, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
 member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
@@ -40,7 +40,7 @@ def create_project(
         made = marey.create_project(wanted).read()
     if as_json:
         return print_json(made)
-    return tell(f"project {made.name} exists now")
+    return print_message(f"project {made.name} exists now")
 
 
 @project.command("ls")
@@ -49,7 +49,7 @@ def list_projects(context: typer.Context, as_json: AsJson = False) -> None:
     with connect(context) as marey:
         projects = list(marey.projects())
         if not projects and marey.transport.anonymous:
-            tell(ANONYMOUS_HINT)
+            print_message(ANONYMOUS_HINT)
     if as_json:
         return print_json(projects)
     rows = [(one.name, one.title, one.visibility, one.role, one.updated_at.date()) for one in projects]
@@ -84,7 +84,7 @@ def change_project(
         changed = marey.project(name).change(change)
     if as_json:
         return print_json(changed)
-    return tell(f"project {changed.name} is changed")
+    return print_message(f"project {changed.name} is changed")
 
 
 @project.command("delete")
@@ -92,7 +92,7 @@ def delete_project(context: typer.Context, name: ProjectName) -> None:
     """Hide a project; `marey project restore` brings it back."""
     with connect(context) as marey:
         marey.project(name).delete()
-    tell(f"project {name} is deleted; marey project restore {name} brings it back")
+    print_message(f"project {name} is deleted; marey project restore {name} brings it back")
 
 
 @project.command("restore")
@@ -100,7 +100,7 @@ def restore_project(context: typer.Context, name: ProjectName) -> None:
     """Bring a deleted project back."""
     with connect(context) as marey:
         marey.project(name).restore()
-    tell(f"project {name} is back")
+    print_message(f"project {name} is back")
 
 
 @member.command("ls")
@@ -126,7 +126,7 @@ def put_member(
     wanted = MemberChange.model_validate({"role": role}).role
     with connect(context) as marey:
         marey.project(project_name).members.put(user, wanted)
-    tell(f"{user} is {wanted} of {project_name}")
+    print_message(f"{user} is {wanted} of {project_name}")
 
 
 @member.command("remove")
@@ -134,4 +134,4 @@ def remove_member(context: typer.Context, project_name: ProjectName, user: UserN
     """Remove a user from a project."""
     with connect(context) as marey:
         marey.project(project_name).members.remove(user)
-    tell(f"{user} is no member of {project_name} any more")
+    print_message(f"{user} is no member of {project_name} any more")

@@ -12,7 +12,7 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.following import SEEDED_JOB, Wait, follow, print_ended
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.models import model_at
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_table
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_client.cli.typed_values import read_json
 from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
@@ -212,6 +212,6 @@ def _print(answer: SearchAnswer) -> None:
         told = "" if likely is None else f", likelier than {likely:.0f} % of the examples"
         typer.echo(f"step {number}: {step.duration_s:.2f} s{told}")
         if step.tree == "drawn":
-            tell("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
+            print_message("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
     for place in answer.out_of_reach:
-        tell(f"constraint {place}: out of the model's reach; it was not trained on such motions.")
+        print_message(f"constraint {place}: out of the model's reach; it was not trained on such motions.")

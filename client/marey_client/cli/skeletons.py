@@ -9,7 +9,7 @@ import typer
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_table, tell
+from marey_client.cli.output import print_json, print_message, print_table
 
 skeleton = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Edit the joint mapping and the joint axes of skeletons."
@@ -46,11 +46,11 @@ def map_joints(
             chosen = {standard: joint for standard, joint in joints.items() if joint}
             mapping = mapping.model_copy(update={"joints": chosen, "method": "manual", "confidence": 1.0})
             item = found.put_mapping(mapping)
-            tell(f"{place}: revision {item.revision}")
+            print_message(f"{place}: revision {item.revision}")
     if as_json:
         return print_json(mapping)
     rig = mapping.rig or "no known rig"
-    tell(f"{rig}; found by {mapping.method}, confidence {mapping.confidence:.2f}")
+    print_message(f"{rig}; found by {mapping.method}, confidence {mapping.confidence:.2f}")
     return print_table(("standard joint", "joint"), sorted(mapping.joints.items()))
 
 
@@ -79,7 +79,7 @@ def joint_axes(
             new = JointAxesDocument(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
             mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})
             item = found.put_mapping(mapping)
-            tell(f"{place}: revision {item.revision}")
+            print_message(f"{place}: revision {item.revision}")
     shown = {name: axes for name, axes in mapping.axes.items() if joint in (None, name)}
     if as_json:
         return print_json(shown)

@@ -90,15 +90,15 @@ def run_suite(
     require_names(wanted)
     records = dict(done or {})
     ahead = [trial for trial in wanted if trial.name not in records]
-    tell = progress or (lambda _done, _total, _note: None)
-    tell(len(wanted) - len(ahead), len(wanted), "")
+    report = progress or (lambda _done, _total, _note: None)
+    report(len(wanted) - len(ahead), len(wanted), "")
     numbers = count(len(wanted) - len(ahead) + 1)
 
     def keep(trial: Trial, record: TrialRecord) -> None:
         records[trial.name] = record
         if finished is not None:
             finished(trial, record)
-        tell(next(numbers), len(wanted), trial.name)
+        report(next(numbers), len(wanted), trial.name)
 
     if ahead:
         run = _runner(database, index, options)

@@ -28,7 +28,7 @@ REPEATED_STEPS = 0.2
 OPEN_STEPS = 3.0
 STILL_RAD = 1e-4
 
-_Tell = Callable[[str, str], None]
+_Warn = Callable[[str, str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +78,13 @@ def prepare_clip(
     """
     notes: list[DatabaseNote] = []
 
-    def tell(code: str, message: str) -> None:
+    def warn(code: str, message: str) -> None:
         notes.append(DatabaseNote(code, f"{source.name}: {message}", source.uid))
 
-    clip, first, in_place = _wanted_frames(source, body, options, landmarks, tell)
+    clip, first, in_place = _wanted_frames(source, body, options, landmarks, warn)
     motion, seam = Motion.of(clip), None
     if source.loop and options.end_policy == "loop":
-        motion = _closed(motion, tell)
+        motion = _closed(motion, warn)
         bone = options.root_mode == "bone"
         seam = loop_seam(*(bone_root(motion, body) if bone else raw_root(motion.positions(body.skeleton), body)))
     motion = resample_motion(motion, clip.frame_rate_hz, options.rate_hz, seam=seam)
@@ -112,7 +112,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 
 
 def _wanted_frames(
-    source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, tell: _Tell
+    source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, warn: _Warn
 ) -> tuple[Clip, int, bool]:
     """Cut a clip to its range without rest poses at its ends; return it, its first frame, whether it walks in place."""
     clip, first = source.clip, 0
@@ -124,11 +124,11 @@ def _wanted_frames(
         clip, first = clip.sliced(*source.frames), source.frames[0]
     warnings = check_clip(clip, landmarks)
     if not options.keep_rest_poses:
-        start, stop = _without_rest_poses(clip, warnings, tell)
+        start, stop = _without_rest_poses(clip, warnings, warn)
         clip, first = clip.sliced(start, stop), first + start
     in_place = [warning for warning in warnings if warning.code == "in-place-gait"]
     for warning in in_place:
-        tell(warning.code, warning.message)
+        warn(warning.code, warning.message)
     return clip, first, bool(in_place)
 
 
@@ -145,13 +145,13 @@ def _moves(clip: Clip, skeleton: Skeleton) -> bool:
     return same_hierarchy(alike, skeleton, tolerance_m=SAME_OFFSET_M)
 
 
-def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _Tell) -> tuple[int, int]:
+def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], warn: _Warn) -> tuple[int, int]:
     """Find the range of frames between the rest poses at a clip's ends."""
     start, stop = 0, clip.frame_count
     for warning in warnings:
         if warning.code == "rest-pose-frame" and warning.frames is not None:
             if warning.frames == (0, clip.frame_count):
-                tell("only-a-rest-pose", "all of it is a rest pose; it was kept")
+                warn("only-a-rest-pose", "all of it is a rest pose; it was kept")
                 return 0, clip.frame_count
             if warning.frames[0] == 0:
                 start = warning.frames[1]
@@ -159,11 +159,11 @@ def _without_rest_poses(clip: Clip, warnings: tuple[CheckWarning, ...], tell: _T
                 stop = warning.frames[0]
     if stop - start < clip.frame_count:
         ending = clip.frame_count - stop
-        tell("rest-pose-dropped", f"a rest pose takes {counted(start, 'frame')} at its start and {ending} at its end")
+        warn("rest-pose-dropped", f"a rest pose takes {counted(start, 'frame')} at its start and {ending} at its end")
     return start, stop
 
 
-def _closed(motion: Motion, tell: _Tell) -> Motion:
+def _closed(motion: Motion, warn: _Warn) -> Motion:
     """Drop the last frame of a loop where it repeats the first one."""
     if motion.frame_count < 3 or motion.rotations.shape[1] < 2:
         return motion
@@ -171,10 +171,10 @@ def _closed(motion: Motion, tell: _Tell) -> Motion:
     steps = quaternions.angle_between(inner[1:], inner[:-1]).max(axis=1)
     gap = float(quaternions.angle_between(inner[-1], inner[0]).max())
     if gap < REPEATED_STEPS * float(np.median(steps)):
-        tell("loop-end-repeated", "its last frame repeats its first one and was left out")
+        warn("loop-end-repeated", "its last frame repeats its first one and was left out")
         return motion.at_frames(np.arange(motion.frame_count - 1))
     if gap > OPEN_STEPS * max(float(steps.max()), STILL_RAD):
-        tell(
+        warn(
             "loop-does-not-close",
             f"it is marked as a loop, but a joint turns {np.degrees(gap):.0f}° from its last frame to its first one",
         )

@@ -9,7 +9,8 @@ from marey_server.process.services import Services
 from marey_server.store.blobs import Spool
 
 BATCH_BYTES = 1024 * 1024
-INLINE_BYTES = 64 * 1024
+WRITTEN_AT_ONCE_BYTES = 64 * 1024
+"""Greatest end of a body that is written on the event loop; more is written in a thread."""
 
 
 class Receiver:
@@ -28,7 +29,7 @@ class Receiver:
 
     async def finish(self) -> Spool:
         """Return the received body with its digest. The caller must close it."""
-        if len(self._pending) <= INLINE_BYTES:
+        if len(self._pending) <= WRITTEN_AT_ONCE_BYTES:
             self._write(bytes(self._pending))
             self._pending.clear()
         else:

@@ -14,7 +14,7 @@ from typing import Any
 import typer
 
 from marey_client.cli.demo.evaluation import DemoEvaluation
-from marey_client.cli.output import print_rows, tell
+from marey_client.cli.output import print_message, print_rows
 from marey_client.credentials import ADMIN_TOKEN
 from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
@@ -94,19 +94,19 @@ def print_report(report: DemoReport) -> None:
     typer.echo(f"{report.evaluation.sentence}\n")
     print_rows(_rows(report))
     for step, reason in report.refused[:REASONS_SHOWN]:
-        tell(f"refused at {step}: {reason}")
+        print_message(f"refused at {step}: {reason}")
     if len(report.refused) > REASONS_SHOWN:
-        tell(f"... and {len(report.refused) - REASONS_SHOWN} more")
-    tell(f"\nserver data       {report.data.absolute()}")
+        print_message(f"... and {len(report.refused) - REASONS_SHOWN} more")
+    print_message(f"\nserver data       {report.data.absolute()}")
     if report.exported:
-        tell(f"retargeted files  {report.exported[0].parent.absolute()}")
+        print_message(f"retargeted files  {report.exported[0].parent.absolute()}")
     if report.sheet:
-        tell(f"contact sheet     {report.sheet.absolute()}")
+        print_message(f"contact sheet     {report.sheet.absolute()}")
     if report.evaluation.report:
-        tell(f"evaluation        {report.evaluation.report.absolute()}")
+        print_message(f"evaluation        {report.evaluation.report.absolute()}")
     marey, data = _command(), shlex.quote(str(report.data))
     token = shlex.quote(str(report.data / ADMIN_TOKEN))
-    tell(f"look around       {marey} serve --data {data}   and then   {marey} ls demo --token-file {token}")
+    print_message(f"look around       {marey} serve --data {data}   and then   {marey} ls demo --token-file {token}")
 
 
 def _command() -> str:

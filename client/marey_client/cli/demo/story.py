@@ -16,7 +16,7 @@ from typing import Any
 from marey_client import embedded
 from marey_client.cli.demo.evaluation import evaluate_locomotion
 from marey_client.cli.demo.report import DemoReport, print_report
-from marey_client.cli.output import Advance, print_json, progress, tell
+from marey_client.cli.output import Advance, print_json, print_message, progress
 from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import NotFound
 from marey_client.handles.clips import ClipHandle
@@ -42,7 +42,7 @@ def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json:
     with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
         with progress() as advance:
-            report = Story(_demo_project(marey), files, data, advance).tell()
+            report = Story(_demo_project(marey), files, data, advance).run()
         report.server = url
         if as_json:
             print_json(report.as_dict())
@@ -62,7 +62,7 @@ class Story:
     advance: Advance
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def tell(self) -> DemoReport:
+    def run(self) -> DemoReport:
         """Run all steps and return their results."""
         with self._timed("import"):
             entries = self._import()
@@ -212,9 +212,9 @@ def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:
 
 
 def _serve_on(url: str, data: Path) -> None:
-    tell(f"serving at {url}; the administrator's token is in {data / ADMIN_TOKEN}; stop with Ctrl-C")
+    print_message(f"serving at {url}; the administrator's token is in {data / ADMIN_TOKEN}; stop with Ctrl-C")
     try:
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
-        tell("stopping")
+        print_message("stopping")

@@ -169,10 +169,10 @@ class _Stages:
         """Make the progress callback of a stage."""
         before = 1000 * self.NAMES.index(stage)
 
-        def tell(done: int, total: int, note: str) -> None:
+        def report(done: int, total: int, note: str) -> None:
             self._tell(before + 1000 * done // max(total, 1), 1000 * len(self.NAMES), f"{stage}: {note}")
 
-        return tell
+        return report
 
     def watch(self, stage: str) -> dict[str, Any]:
         """Make the callbacks of a stage, as keyword arguments."""

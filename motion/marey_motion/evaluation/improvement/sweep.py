@@ -108,13 +108,13 @@ def sweep_weights(
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     aim = objective or ObjectiveOptions()
-    tell = progress or (lambda _done, _total, _note: None)
+    report = progress or (lambda _done, _total, _note: None)
     rows = []
     for number, weights in enumerate(settings):
         weighted = reweighted(database, weights)
 
         def told(done: int, _total: int, note: str, before: int = number * len(wanted)) -> None:
-            tell(before + done, len(settings) * len(wanted), note)
+            report(before + done, len(settings) * len(wanted), note)
 
         records = run_suite(weighted, options, trials=wanted, threads=threads, progress=told, cancelled=cancelled)
         rate = database.options.rate_hz
