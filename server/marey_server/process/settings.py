@@ -101,6 +101,13 @@ class Settings(BaseSettings):
     )
     local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
 
+    @field_validator("data")
+    @classmethod
+    def _check_data(cls, data: Path) -> Path:
+        if data.exists() and not data.is_dir():
+            raise ValueError(f"{data} is a file; name a folder, which is created if it does not exist")
+        return data
+
     @field_validator("heartbeat_s")
     @classmethod
     def _check_heartbeat(cls, heartbeat_s: float, others: ValidationInfo) -> float:

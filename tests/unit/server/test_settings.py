@@ -25,6 +25,12 @@ def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: 
         Settings()
 
 
+def test_a_data_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "takes.zip").touch()
+    with pytest.raises(ValueError, match=r"takes\.zip is a file; name a folder"):
+        Settings(data=tmp_path / "takes.zip")
+
+
 @pytest.mark.parametrize("given", [{"lease_ttl_s": 20}, {"heartbeat_s": 31}, {"lease_ttl_s": 1, "heartbeat_s": 0.6}])
 def test_leases_that_would_run_out_between_two_heartbeats_are_refused(given: dict[str, Any]) -> None:
     with pytest.raises(ValidationError, match=r"heartbeat_s\n.* at most half of lease_ttl_s, which is"):
