@@ -1,4 +1,4 @@
-"""Numbers with nouns, and lists of names, for sentences."""
+"""Numbers with nouns, lists of names, and messages of validation, for sentences."""
 
 from __future__ import annotations
 
@@ -19,3 +19,8 @@ def counted(number: int, noun: str) -> str:
 def one_of(names: Sequence[str]) -> str:
     """Return the names of a choice as text: "bvh, npz or json"."""
     return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def without_prefix(message: str) -> str:
+    """Return a message of a pydantic validation without the words that pydantic puts before a `ValueError`'s text."""
+    return message.removeprefix("Value error, ")

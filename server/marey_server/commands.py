@@ -19,6 +19,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_schemas.log_lines import usual_form
+from marey_schemas.wording import without_prefix
 from marey_server.process.settings import Settings
 
 
@@ -63,7 +64,9 @@ def read_settings(**given: Any) -> Settings:
     try:
         return Settings(**given)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
+        wrong = "; ".join(
+            f"{'.'.join(map(str, each['loc']))}: {without_prefix(each['msg'])}" for each in error.errors()
+        )
         raise CommandFailed(f"invalid setting: {wrong}") from None
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import without_prefix
 
 MAX_ERRORS = 50
 
@@ -26,7 +27,7 @@ def field_errors(
         FieldError(
             pointer=pointer(_steps(entry["loc"], tree, may_lack_last=entry["type"] == "missing")),
             code=entry["type"].replace("_", "-"),
-            detail=entry["msg"].removeprefix("Value error, "),
+            detail=without_prefix(entry["msg"]),
         )
         for entry in entries[:MAX_ERRORS]
     ]

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from marey_schemas.wording import without_prefix
+
 FAILED, WRONG_USAGE = 1, 2
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
@@ -45,7 +47,8 @@ def reported(*, verbose: bool) -> Iterator[None]:
         if isinstance(error, ValidationError):
             first = error.errors(include_url=False)[0]
             where = ".".join(str(step) for step in first["loc"])
-            _exit(WRONG_USAGE, f"{where}: {first['msg']}" if where else first["msg"], verbose)
+            text = without_prefix(first["msg"])
+            _exit(WRONG_USAGE, f"{where}: {text}" if where else text, verbose)
         if isinstance(error, BadAddress | CodecError):
             _exit(WRONG_USAGE, str(error), verbose)
         if isinstance(error, UnicodeEncodeError):

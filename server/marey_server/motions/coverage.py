@@ -29,6 +29,7 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
+from marey_schemas.wording import without_prefix
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import items, projects
 from marey_server.store.coverage_streams import NewStream, Stream, StreamStep, answered_before, require_offset
@@ -219,7 +220,7 @@ def refusing(field: str) -> Iterator[None]:
         ) from error
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        detail = ": ".join((*map(str, first["loc"]), first["msg"].removeprefix("Value error, ")))
+        detail = ": ".join((*map(str, first["loc"]), without_prefix(first["msg"])))
         raise InvalidProblem(f"{field}: {detail}", errors=[_fault(f"/{field}", "invalid", detail)]) from error
 
 

@@ -14,6 +14,7 @@ from sqlalchemy import Row, and_, insert, select, update
 
 from marey_schemas.job_kinds import KindDeclaration, UnknownKindError, find_kind
 from marey_schemas.jobs import FailureReason, InputSpec
+from marey_schemas.wording import without_prefix
 from marey_server import faults
 from marey_server.store.jobs import layout, result_cache
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
@@ -73,7 +74,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
     except UnknownKindError as error:
         raise LateInputError("unknown-kind", f"This server no longer knows the kind of the job: {error}.") from error
     except ValidationError as error:
-        detail = f"{kind.name} does not take these parameters any more: {error.errors()[0]['msg']}"
+        detail = f"{kind.name} does not take these parameters any more: {without_prefix(error.errors()[0]['msg'])}"
         raise LateInputError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)
     if (clash := find_clash(kind, params, pins, row.into_path)) is not None:
