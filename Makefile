@@ -5,11 +5,13 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 DATA   ?=
 PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
+PINNED := $(PIP) install --require-hashes --only-binary :all: -r
+MAREY  := $(PIP) install --no-deps --no-build-isolation -e .
 ARGS   ?=
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help installed demo check test soak lint format dev bench docs clean
+.PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -18,13 +20,15 @@ $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Marey needs Python 3.11 or newer; say which with make PYTHON=..."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.installed-all: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install -c constraints.txt -e '.[all]'
+$(VENV)/.installed-all: pyproject.toml pins/build.txt pins/all.txt | $(BIN)/python
+	$(PINNED) pins/all.txt
+	$(MAREY)
 	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@
 
-$(VENV)/.installed-dev: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) install -c constraints.txt -e '.[dev]'
+$(VENV)/.installed-dev: pyproject.toml pins/build.txt pins/all.txt pins/dev.txt | $(BIN)/python
+	$(PINNED) pins/dev.txt
+	$(MAREY)
 	$(BIN)/python -m marey_motion.warm_up --processes 2
 	@touch $@ $(VENV)/.installed-all
 
@@ -57,8 +61,8 @@ format: $(VENV)/.installed-dev ## Put the code in house style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-$(VENV)/.installed-bench: $(VENV)/.installed-dev
-	$(PIP) install -c constraints.txt -e '.[bench]'
+$(VENV)/.installed-%: $(VENV)/.installed-dev pins/%.txt
+	$(PINNED) pins/$*.txt
 	@touch $@
 
 bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
@@ -67,5 +71,15 @@ bench: $(VENV)/.installed-bench ## Speed against peers, as ratios
 docs: $(VENV)/.installed-dev ## Write the reference pages that come from the code
 	$(BIN)/python -m docs.generate
 
+pins: $(VENV)/.installed-audit ## Resolve pyproject.toml again; ARGS="--upgrade-package NAME" for a newer version
+	$(BIN)/python -m lint.pins $(ARGS)
+
+audit: $(VENV)/.installed-audit ## Known weaknesses of the pinned packages; needs the network
+	@$(BIN)/pip-audit --strict --disable-pip --require-hashes -r pins/dev.txt || { echo "A package has a known weakness, or could not be audited because the package index did not answer; see above."; exit 1; }
+
+bom: $(VENV)/.installed-audit ## Bill of materials of what users run, as CycloneDX in marey-bom.json
+	@$(BIN)/python -W ignore::UserWarning -m cyclonedx_py requirements --pyproject pyproject.toml -o marey-bom.json pins/all.txt
+	@echo marey-bom.json
+
 clean: ## Remove the environment and what tools leave behind
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis marey-demo marey-bom.json

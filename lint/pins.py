@@ -1,0 +1,86 @@
+"""Pins: the version and the hashes of every package that is installed, in one file for each layer of packages.
+
+`python -m lint.pins [--upgrade | --upgrade-package NAME]` resolves `pyproject.toml` again and writes the files. Each
+file starts with the one of the layer below, so that every version has one home. Hashes are those of all files of a
+version, for every platform.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOLDER = "pins"
+BELOW = {"build": None, "all": "build", "dev": "all", "bench": "dev", "audit": "dev"}
+"""Layers of packages, each with the one that it extends: the build backend, then extras of `pyproject.toml`."""
+_PIN = re.compile(
+    r"(?P<name>[a-z0-9][a-z0-9.-]*)==(?P<version>[^\s;\\]+)[^\n]*(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
+)
+
+
+def pins_in(text: str) -> dict[str, str]:
+    """Return the pins in a file of requirements: names, each with its versions, markers and hashes."""
+    pins: dict[str, str] = {}
+    for match in _PIN.finditer(text):
+        pins[match["name"]] = f"{pins[match['name']]}\n{match[0]}" if match["name"] in pins else match[0]
+    return pins
+
+
+def layers_of(layer: str | None) -> Iterator[str]:
+    """Yield a layer and those below it."""
+    while layer is not None:
+        yield layer
+        layer = BELOW[layer]
+
+
+def requirements_of(layer: str, pyproject: dict[str, object]) -> list[str]:
+    """Return what a layer requires, with the layers below it."""
+    build: list[str] = pyproject["build-system"]["requires"]  # type: ignore[index]
+    return [*build, *(f"{ROOT}[{extra}]" for extra in layers_of(layer) if extra != "build")]
+
+
+def split(every: dict[str, str], needed: dict[str, set[str]]) -> dict[str, list[str]]:
+    """Return the names that belong to each layer: a package belongs to the highest layer below all that need it."""
+    homes: dict[str, list[str]] = {layer: [] for layer in BELOW}
+    for name in sorted(every):
+        users = [list(layers_of(layer)) for layer, names in needed.items() if name in names]
+        homes[next(layer for layer in users[0] if all(layer in user for user in users))].append(name)
+    return homes
+
+
+def main(options: Sequence[str]) -> int:
+    """Resolve all layers together and write their files."""
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    files = {layer: ROOT / FOLDER / f"{layer}.txt" for layer in BELOW}
+    known = "\n".join(path.read_text("utf-8") for path in files.values() if path.exists())
+    wanted = [one for layer in BELOW for one in requirements_of(layer, pyproject)]
+    every = pins_in(_resolve(wanted, known, "--generate-hashes", *options))
+    chosen = "\n".join(every.values())
+    needed = {layer: set(pins_in(_resolve(requirements_of(layer, pyproject), chosen))) for layer in BELOW}
+    for layer, names in split(every, needed).items():
+        below = BELOW[layer]
+        lines = ["# Written by `make pins`.", *([f"-r {below}.txt"] if below else []), *(every[name] for name in names)]
+        files[layer].write_text("\n".join(lines) + "\n", "utf-8")
+    return 0
+
+
+def _resolve(wanted: Sequence[str], known: str, *options: str) -> str:
+    """Return the pins of requirements as uv resolves them, with the versions in `known` wherever they still fit."""
+    with tempfile.TemporaryDirectory() as folder:
+        pins, requirements = Path(folder) / "pins.txt", Path(folder) / "wanted.in"
+        pins.write_text(re.sub(r"(?m)^(-r|#).*\n", "", known), "utf-8")
+        requirements.write_text("\n".join(dict.fromkeys(wanted)), "utf-8")
+        target = ["--universal", "--python-version", "3.11", "--output-file", str(pins), str(requirements)]
+        quiet = ["--quiet", "--no-header", "--no-annotate"]
+        subprocess.run([sys.executable, "-m", "uv", "pip", "compile", *quiet, *options, *target], check=True)
+        return pins.read_text("utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,66 @@
+"""Pins: every package that is installed has one version with hashes, and the layers add up to the extras."""
+
+import re
+import tomllib
+from typing import Any
+
+import pytest
+from lint.pins import BELOW, FOLDER, ROOT, layers_of, pins_in, split
+
+PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+FILES = {layer: (ROOT / FOLDER / f"{layer}.txt").read_text("utf-8") for layer in BELOW}
+PINS = {layer: pins_in(text) for layer, text in FILES.items()}
+
+
+def name_of(requirement: str) -> str:
+    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+
+
+def required(extra: str) -> set[str]:
+    """Names that an extra requires, with those of the extras that it includes."""
+    names: set[str] = set()
+    for one in PYPROJECT["project"]["optional-dependencies"][extra]:
+        included = re.match(r"marey\[(.*)\]", one)
+        names |= set().union(*map(required, included[1].split(","))) if included else {name_of(one)}
+    return names
+
+
+def test_every_pin_has_a_version_and_a_hash() -> None:
+    unhashed = [name for pins in PINS.values() for name, text in pins.items() if "--hash=sha256:" not in text]
+    assert unhashed == []
+    assert sum(map(len, PINS.values())) > 100
+
+
+def test_a_package_is_pinned_in_one_file() -> None:
+    names = [name for pins in PINS.values() for name in pins]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("layer", [layer for layer in BELOW if layer != "build"])
+def test_a_layer_pins_what_its_extra_requires(layer: str) -> None:
+    pinned = {name for one in layers_of(layer) for name in PINS[one]}
+    assert {*required(layer), *map(name_of, PYPROJECT["project"]["dependencies"])} <= pinned
+    assert FILES[layer].startswith(f"# Written by `make pins`.\n-r {BELOW[layer]}.txt\n")
+
+
+def test_the_build_backend_has_the_pinned_version() -> None:
+    assert all(one in FILES["build"] for one in PYPROJECT["build-system"]["requires"])
+    assert all(re.fullmatch(r"[\w-]+==[\w.]+", one) for one in PYPROJECT["build-system"]["requires"])
+
+
+def test_no_pin_names_a_host() -> None:
+    assert [layer for layer, text in FILES.items() if "//" in text or "--index" in text] == []
+
+
+def test_a_package_belongs_to_the_highest_layer_below_all_that_need_it() -> None:
+    needed = {"all": {"a"}, "dev": {"a", "b"}, "bench": {"a", "b", "c", "d"}, "audit": {"a", "b", "c", "e"}}
+    homes = split(dict.fromkeys("abcde", ""), needed)
+    assert homes == {"build": [], "all": ["a"], "dev": ["b", "c"], "bench": ["d"], "audit": ["e"]}
+
+
+def test_a_pin_keeps_all_its_versions_and_hashes() -> None:
+    older, newer = (
+        f"x-y=={number} \\\n    --hash=sha256:{digit * 64}" for number, digit in (("1.0", "0"), ("2.0", "1"))
+    )
+    two = f"{older}\n{newer}"
+    assert pins_in(f"# note\n-r all.txt\n{two}\n") == {"x-y": two}
