@@ -27,6 +27,7 @@ from tornado.web import RequestHandler
 
 from marey_schemas.access import TokenCreate
 from marey_schemas.names import MAX_NAME_LENGTH
+from marey_schemas.processes.environment import clean_environment
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.docs_page import render_page
@@ -200,7 +201,9 @@ async def serve(settings: Settings) -> None:
 @asynccontextmanager
 async def compiling_kernels() -> AsyncIterator[None]:
     """Compile the kernels of imports in a separate process while the server already answers."""
-    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "marey_motion.warm_up")
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
+    )
     try:
         yield
     finally:

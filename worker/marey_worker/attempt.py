@@ -22,13 +22,14 @@ from typing import Any
 from marey_client.errors import LeaseLost, MareyError, NotFound
 from marey_schemas.items import PartPlace
 from marey_schemas.job_kinds import find_kind
+from marey_schemas.processes.child_process import ChildProcess
 from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
-from marey_worker.child_process import ChildProcess
 from marey_worker.heartbeats import LeaseKeeper
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import (
+    BadMessage,
     ChildReply,
     Done,
     Failed,
@@ -42,6 +43,8 @@ from marey_worker.messages import (
     Request,
     Run,
     Stage,
+    pack,
+    unpack,
 )
 
 LOG_PIECE_BYTES = 256 << 10
@@ -180,7 +183,7 @@ class RunningAttempt:
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
         """Run the job in `child`, which is idle or dead afterwards. The caller then calls `finish`."""
         try:
-            child.send(self._order())
+            child.send(pack(self._order()))
             end = self._attend(child)
             if isinstance(end, Stop):
                 child.kill()
@@ -220,9 +223,13 @@ class RunningAttempt:
         log_due = time.monotonic() + LOG_EVERY_S
         while True:
             try:
-                message = child.receive(WATCH_EVERY_S)
+                data = child.receive(WATCH_EVERY_S)
+                message = None if data is None else unpack(data)
             except EOFError:
                 return self._death(child)
+            except (BadMessage, OSError) as error:
+                child.kill(grace_s=0.0)
+                return Failed("bad-message", str(error), "bad-message", retryable=True)
             if isinstance(message, Done | Failed):
                 return message
             if isinstance(message, Made):
@@ -238,11 +245,12 @@ class RunningAttempt:
     def _serve(self, request: Request, child: ChildProcess) -> None:
         """Carry out one request of the child, and answer it."""
         try:
-            child.send(ChildReply(request.request, self._carried_out(request)))
+            child.send(pack(ChildReply(request.request, self._carried_out(request))))
         except LeaseLost:
             self._keeper.lost.set()
         except Exception as error:  # noqa: BLE001 - whatever happened, the child waits for an answer
-            child.send(ChildReply(request.request, refusal=str(error), missing=isinstance(error, NotFound)))
+            missing = isinstance(error, NotFound)
+            child.send(pack(ChildReply(request.request, refusal=str(error), missing=missing)))
 
     def _carried_out(self, request: Request) -> Any:
         match request:

@@ -4,11 +4,9 @@ once.
 
 from __future__ import annotations
 
-import faulthandler
 import gc
 import importlib
 import os
-import signal
 import sys
 import traceback
 from multiprocessing.connection import Connection
@@ -16,32 +14,31 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic_core import to_jsonable_python
 
 from marey_schemas.job_kinds import KindDeclaration, find_kind
+from marey_schemas.processes.child_process import READY, connect_to_parent
+from marey_schemas.processes.limits import allow_memory
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, NoSuchThing
-from marey_worker.limits import allow_memory, die_with_parent
-from marey_worker.messages import Done, End, Failed, Ready, Run
+from marey_worker.messages import Done, End, Failed, Run, pack, unpack
 
 DETAIL_CHARACTERS = 1000
 
 
 def main() -> None:
     """Serve the pipe whose file descriptor is the first argument, until it closes."""
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the supervisor, which decides
-    faulthandler.enable()
-    pipe = Connection(int(sys.argv[1]))
+    pipe = connect_to_parent()
     process = os.getpid()
     load(sys.argv[2:])
     try:
-        pipe.send(Ready())
+        pipe.send_bytes(READY)
     except BrokenPipeError:  # the supervisor was stopped while this loaded
         return
     garbage = Garbage()
     while True:
         try:
-            run = pipe.recv()
+            run = unpack(pipe.recv_bytes())
         except EOFError:
             return
         if not isinstance(run, Run):  # an answer to a job that did not wait for it
@@ -52,7 +49,7 @@ def main() -> None:
             os._exit(1)
         sys.stdout.flush()
         sys.stderr.flush()
-        pipe.send(end)
+        pipe.send_bytes(pack(end))
         garbage.collect()
 
 
@@ -89,7 +86,7 @@ def run_job(run: Run, pipe: Connection) -> End:
     context = Context(run, pipe)
     allow_memory(run.memory_limit_bytes)
     try:
-        result = _perform(find_kind(run.kind), context, run)
+        result = to_jsonable_python(_perform(find_kind(run.kind), context, run))
         context.finish_staging()
     except JobRefused as error:
         return Failed(error.code, error.detail, None, retryable=False)

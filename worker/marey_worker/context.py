@@ -27,6 +27,8 @@ from marey_worker.messages import (
     Request,
     Run,
     Stage,
+    pack,
+    unpack,
 )
 
 T = TypeVar("T")
@@ -124,13 +126,12 @@ class Context:
     def item(self, kind: Kind, item: str) -> Item:
         """Return an item at its newest revision. Raises `NoSuchThing` if it does not exist."""
         asked = self._send(lambda request: ReadItem(request, kind, item))
-        found: Item = self._value(asked, f"no-{kind}")
-        return found
+        return Item.model_validate(self._value(asked, f"no-{kind}"))
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
         """Find items by name, directly in a collection, or, for None, anywhere in the project."""
-        found: list[Item] = self._ask(lambda request: FindItems(request, kind, name, collection))
-        return found
+        found = self._ask(lambda request: FindItems(request, kind, name, collection))
+        return [Item.model_validate(item) for item in found]
 
     def task_results(self) -> list[dict[str, Any]]:
         """Return the results of the tasks that this job gathers, in order."""
@@ -164,7 +165,7 @@ class Context:
 
     def progress(self, done: float, total: float | None = None, note: str = "") -> None:
         """Report the progress of the job; may be called often."""
-        self._pipe.send(Made(Progress(done=done, total=total, note=note)))
+        self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=note))))
 
     def log(self, text: str) -> None:
         """Write a line to the job's log; `print` does the same."""
@@ -197,13 +198,13 @@ class Context:
 
     def _send(self, make: Callable[[int], Request]) -> int:
         request = next(_numbers)
-        self._pipe.send(make(request))
+        self._pipe.send_bytes(pack(make(request)))
         return request
 
     def _value(self, request: int, missing: str = "not-found") -> Any:
         """Return the value of an answer. Raises `NoSuchThing` with the code `missing`, and `RequestRefused`."""
         while request not in self._replies:
-            reply: ChildReply = self._pipe.recv()
+            reply: ChildReply = unpack(self._pipe.recv_bytes())
             self._replies[reply.request] = reply
         reply = self._replies.pop(request)
         if reply.refusal is not None:

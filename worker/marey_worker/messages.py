@@ -1,4 +1,7 @@
-"""Messages between supervisor and child over their pipe. The child never gets a token or an address."""
+"""Messages between supervisor and child over their pipe. The child never gets a token or an address.
+
+A message is MessagePack: the name of its class and its fields, which the receiver validates.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import msgpack
+from pydantic import TypeAdapter, ValidationError
 
 from marey_schemas.items import PartPlace
 from marey_schemas.jobs import Progress
@@ -35,7 +41,7 @@ class Run:
 
 @dataclass(frozen=True)
 class ChildReply:
-    """Answer to a request: bytes, a digest or nothing; or the reason why it failed."""
+    """Answer to a request: bytes, a digest, documents or nothing; or the reason why it failed."""
 
     request: int
     value: Any = None
@@ -44,11 +50,6 @@ class ChildReply:
 
 
 # From the child
-
-
-@dataclass(frozen=True)
-class Ready:
-    """Message that the child has loaded its modules."""
 
 
 @dataclass(frozen=True)
@@ -138,3 +139,37 @@ class Failed:
 
 Request = ReadParts | ReadItem | FindItems | ReadBlob | ReadResults | PutFile | Stage
 End = Done | Failed
+
+_FORMS = {
+    one.__name__: TypeAdapter(one)
+    for one in (
+        Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, PutFile, Stage, Made, Done, Failed,
+    )
+}  # fmt: skip
+
+
+class BadMessage(Exception):
+    """Bytes that are not a message."""
+
+
+def pack(message: Any) -> bytes:
+    """Return the bytes of a message. Raises `TypeError`, `ValueError` or `OverflowError` for values without a form."""
+    name = type(message).__name__
+    fields = _FORMS[name].dump_python(message, by_alias=True)
+    packed: bytes = msgpack.packb([name, fields], default=_plain)
+    return packed
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a message cannot contain a value of the type {type(value).__name__}")
+
+
+def unpack(data: bytes) -> Any:
+    """Return the message that the bytes contain. Raises `BadMessage`."""
+    try:
+        name, fields = msgpack.unpackb(data, strict_map_key=True)
+        return _FORMS[name].validate_python(fields)
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError, ValidationError) as error:
+        raise BadMessage(f"a child process sent {len(data)} bytes that are no message: {error}") from error

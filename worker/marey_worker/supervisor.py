@@ -18,11 +18,11 @@ from marey_client.retries import ONCE
 from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
 from marey_schemas.job_kinds import job_kinds
+from marey_schemas.processes.child_process import ChildBroken, ChildProcess
 from marey_schemas.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim
-from marey_worker.child_process import ChildBroken, ChildProcess
 from marey_worker.job_io.input_cache import InputCache
 from marey_worker.messages import Done, Failed
 
@@ -33,6 +33,7 @@ PAUSES = Backoff(first_s=0.5, longest_s=15.0)
 INTERRUPTED_STATUS = 143
 FAILED_STATUS = 1
 JOBS_PER_CHILD = 1000
+CHILD_MODULE = "marey_worker.child"
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ class _Bench:
             self._child.kill(grace_s=0.0)
             self._child = None
         if self._child is None:
-            self._child = ChildProcess(self._options.kinds, threads=self._options.threads_of_a_slot)
+            self._child = ChildProcess(CHILD_MODULE, self._options.kinds, threads=self._options.threads_of_a_slot)
             self._jobs = 0
             self._child.wait_until_ready()
         self._jobs += 1

@@ -1,23 +1,24 @@
 """Worker processes beside the server, on the same machine.
 
 A worker gets its token through a pipe to its standard input, which stays open: when the server ends, even by a crash,
-the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables.
+the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables, and of the
+server's environment a worker gets only what it needs.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import sys
 import time
 from asyncio.subprocess import Process
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 from marey_schemas.backoff import Backoff
 from marey_schemas.log_lines import LogForm
+from marey_schemas.processes.environment import clean_environment
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +55,7 @@ async def local_workers(
 class _LocalWorker:
     """Worker process that is restarted, with growing pauses, whenever it ends by itself."""
 
-    def __init__(self, name: str, url: str, token: str, cache: Path, environment: Mapping[str, str]) -> None:
+    def __init__(self, name: str, url: str, token: str, cache: Path, environment: dict[str, str]) -> None:
         self._name = name
         self._environment = environment
         self._token = token
@@ -94,7 +95,7 @@ class _LocalWorker:
 
     async def _start(self) -> Process:
         process = await asyncio.create_subprocess_exec(
-            *self._command, stdin=asyncio.subprocess.PIPE, env={**os.environ, **self._environment}
+            *self._command, stdin=asyncio.subprocess.PIPE, env=clean_environment() | self._environment
         )
         assert process.stdin is not None
         process.stdin.write(self._token.encode() + b"\n")

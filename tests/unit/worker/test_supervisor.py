@@ -78,13 +78,16 @@ def test_the_attempts_own_token_is_used_for_the_attempt(server: FakeServer, star
 
 
 def test_no_secret_stands_in_arguments_or_environment(server: FakeServer, start_worker: StartWorker) -> None:
-    worker = start_worker()
+    worker = start_worker(env={"MAREY_DATABASE_URL": "postgresql://marey:hunter2@db/marey", "PGPASSWORD": "hunter2"})
     server.ended(server.submit("add", {"a": 1, "b": 1}))
     process = psutil.Process(worker.process.pid)
-    for member in [process, *process.children(recursive=True)]:
+    children = process.children(recursive=True)
+    for member in [process, *children]:
         seen = " ".join(member.cmdline()) + " ".join(member.environ().values())
         assert "marey_worker_token" not in seen
         assert "mareyjob_" not in seen
+    assert children
+    assert not [child for child in children if "hunter2" in " ".join(child.environ().values())]
 
 
 @pytest.mark.parametrize(

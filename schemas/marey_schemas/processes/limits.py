@@ -1,4 +1,4 @@
-"""Limits of a child process, and its termination together with its supervisor."""
+"""Limits that a child process sets for itself, its termination together with its parent, and its memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import sys
 
 import psutil
 
-MIB = 1 << 20
 PR_SET_PDEATHSIG = 1
 
 

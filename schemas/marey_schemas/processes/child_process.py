@@ -1,0 +1,129 @@
+"""Child process: its start in a clean environment, messages as bytes, and its end by force.
+
+A message is a sequence of bytes with its length in front; what the bytes mean is agreed between parent and child.
+Nothing is pickled, because a child that reads untrusted files may send anything.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
+
+from marey_schemas.processes.environment import clean_environment
+from marey_schemas.processes.limits import die_with_parent, resident_bytes
+
+READY = b"ready"
+"""First message of a child, after it has loaded its modules."""
+READY_S = 300.0
+"""Longest wait in seconds for that message; after an installation, loading may include compiling."""
+TERMINATE_S = 10.0
+MOST_MESSAGE_BYTES = 1 << 30
+
+
+class ChildBroken(Exception):
+    """Child process that ended before it was ready; `status` is its exit status, a negative number for a signal."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(f"a child process ended with status {status} before it was ready; its log says why")
+        self.status = status
+
+
+class ChildProcess:
+    """Child process in its own session, which runs `python -m module <file descriptor> <arguments>`.
+
+    One thread starts, uses and kills it; the child is killed when this thread ends. Other threads may send messages.
+    """
+
+    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env=clean_environment(threads=threads),
+            )
+        self._pipe = Connection(ours.detach())
+        self._sending = threading.Lock()
+
+    def wait_until_ready(self) -> None:
+        """Wait until the child has loaded its modules. Raises `ChildBroken` if it ends before."""
+        deadline = time.monotonic() + READY_S
+        try:
+            while self.receive(max(0.0, deadline - time.monotonic())) != READY:
+                if time.monotonic() > deadline:
+                    self.kill(grace_s=0.0)
+                    raise EOFError
+        except (EOFError, OSError) as error:
+            raise ChildBroken(self.wait()) from error
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is running."""
+        return self._process.poll() is None
+
+    @property
+    def resident_bytes(self) -> int:
+        """Return the memory of the process and its descendants."""
+        return resident_bytes(self.pid)
+
+    def send(self, message: bytes) -> None:
+        """Send a message; if the child has died, the next `receive` reports it."""
+        with self._sending:
+            try:
+                self._pipe.send_bytes(message)
+            except (BrokenPipeError, ConnectionResetError):
+                return
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return the next message, or None if none came in time.
+
+        Raises `EOFError` if the child has died, and `OSError` if the message is too long.
+        """
+        try:
+            return self._pipe.recv_bytes(MOST_MESSAGE_BYTES) if self._pipe.poll(timeout_s) else None
+        except ConnectionResetError as error:
+            raise EOFError from error
+
+    def wait(self) -> int:
+        """Return the exit status of the process; a negative number is a signal."""
+        return self._process.wait()
+
+    def kill(self, *, grace_s: float = TERMINATE_S) -> None:
+        """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
+        if self.alive and grace_s > 0:
+            self._signal(signal.SIGTERM)
+            deadline = time.monotonic() + grace_s
+            while self.alive and time.monotonic() < deadline:
+                time.sleep(0.02)
+        self._signal(signal.SIGKILL)
+        self._process.wait()
+        self._pipe.close()
+
+    def _signal(self, number: signal.Signals) -> None:
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            return
+
+
+def connect_to_parent() -> Connection:
+    """Return the pipe to the parent, whose file descriptor is the first argument of this process."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at a terminal reaches the parent, which decides
+    faulthandler.enable()
+    return Connection(int(sys.argv[1]))
