@@ -141,7 +141,7 @@ class PreconditionRequiredProblem(ApiProblem):
     code = "precondition-required"
 
 
-# 422, 429
+# 422, 429, 499
 
 
 class InvalidProblem(ApiProblem):
@@ -156,6 +156,13 @@ class TooManyRequestsProblem(ApiProblem):
 
     status = 429
     code = "too-many-requests"
+
+
+class ClientGoneProblem(ApiProblem):
+    """The client closed the connection before it was answered."""
+
+    status = 499
+    code = "client-gone"
 
 
 # 5xx: ours

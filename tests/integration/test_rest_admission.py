@@ -15,6 +15,7 @@ from marey_schemas.encoding import blocks
 from marey_schemas.encoding.codecs import FREE_ARRAY_BYTES
 from marey_server.access.principal import SYSTEM
 from marey_server.http.validation import decode_body
+from marey_server.store.database.lanes import SERVER
 
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
 CLIPS = "/projects/lab/clips"
@@ -97,7 +98,7 @@ def test_a_small_body_unpacks_to_sixteen_megabytes_at_most(owner: httpx.Client) 
 def test_callers_are_admitted_or_refused_while_all_threads_for_reads_are_busy(server: Server) -> None:
     server.make_project()
     done = threading.Event()
-    reads = [server.database.submit_read(SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for _ in range(16)]
+    reads = [server.database.queue_read(SERVER, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for _ in range(16)]
     try:
         refused = server.client(INVENTED).post(CLIPS, json={})
         assert not any(read.done() for read in reads)

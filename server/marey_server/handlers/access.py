@@ -46,7 +46,7 @@ class MeResource(Resource):
     path = "/me"
     tag = "Access"
 
-    @reads(access=Access.SIGNED_IN, scope=None, answer=Me)
+    @reads(access=Access.SIGNED_IN, scope=None, answer=Me, reserved=True)
     async def get(self) -> Rendered:
         """Return your user and the scopes of your token."""
         return await self.answer(read_me)
@@ -64,6 +64,7 @@ class LoginResource(Resource):
         body=RequestBody(Login, max_bytes=MAX_LOGIN_BYTES),
         answer=NewToken,
         also=((429, None),),
+        reserved=True,
     )
     async def post(self, body: Login) -> Reply:
         """Sign in with name and password; the answer contains a new token, shown only once."""

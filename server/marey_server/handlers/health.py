@@ -38,7 +38,7 @@ class Readyz(Resource):
     uneventful = True
     tag = "Operations"
 
-    @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),))
+    @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),), reserved=True)
     async def get(self) -> Reply:
         """Answer whether the server is ready: database reachable, schema current, blobs writable, not draining."""
         if self.services.draining.is_set():

@@ -41,7 +41,7 @@ class Leases(Resource):
     path = "/leases"
     tag = "Work"
 
-    @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList)
+    @writes(access=Access.WORKER, scope="work", body=ClaimRequest, answer=LeaseList, reserved=True)
     async def post(self, body: ClaimRequest) -> Reply:
         """Claim jobs; with `wait_s`, wait until there are some. A lease that is not renewed expires."""
         loop = asyncio.get_running_loop()
@@ -71,6 +71,7 @@ class Completions(Resource):
         scope="work",
         body=RequestBody(BatchCompleteRequest, max_bytes=16 * MIB),
         answer=BatchCompleteAnswer,
+        reserved=True,
     )
     async def post(self, body: BatchCompleteRequest) -> Rendered:
         """Complete many jobs that the caller claimed, in one transaction; each is accepted or refused separately."""
@@ -87,7 +88,13 @@ class AttemptHeartbeat(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/heartbeat"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=RequestBody(Heartbeat, max_bytes=64 * KIB), answer=HeartbeatAnswer)
+    @writes(
+        access=Access.ATTEMPT,
+        scope=None,
+        body=RequestBody(Heartbeat, max_bytes=64 * KIB),
+        answer=HeartbeatAnswer,
+        reserved=True,
+    )
     async def post(self, job: str, fence: int, body: Heartbeat) -> Rendered:
         """Renew the lease; the answer says whether the worker must stop."""
         return await self.answer(queue.heartbeat, job, fence, body, self.services.queue_policy)
@@ -148,7 +155,11 @@ class AttemptCompletion(Resource):
     tag = "Work"
 
     @writes(
-        access=Access.ATTEMPT, scope=None, body=RequestBody(CompleteRequest, max_bytes=16 * MIB), answer=CompleteAnswer
+        access=Access.ATTEMPT,
+        scope=None,
+        body=RequestBody(CompleteRequest, max_bytes=16 * MIB),
+        answer=CompleteAnswer,
+        reserved=True,
     )
     async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
         """Publish the staged outputs and end the job; a request with the same `write_id` gets the same answer."""
@@ -161,7 +172,7 @@ class AttemptFailure(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/fail"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer)
+    @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer, reserved=True)
     async def post(self, job: str, fence: int, body: FailRequest) -> Rendered:
         """End the attempt; the job is retried or fails. A request with the same `write_id` gets the same answer."""
         return await self.answer(completion.fail, job, fence, body, self.services.queue_policy)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Request
-from marey_schemas.items import Item, PartPlace, PartsRequest
+from marey_schemas.items import Item, PartsRequest
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Message
 from marey_server.handlers.items import MAX_DOCUMENT_BYTES, kind_of
 from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
-from marey_server.http.negotiation import MediaType
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated
-from marey_server.http.reply import Lasting, Rendered, Reply, encode
+from marey_server.http.reply import Lasting, Loaded, Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import IMMUTABLE
 from marey_server.store import items
@@ -49,12 +48,13 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part; its arrays are returned in blocks if `encoded`. A part of a named revision never changes."""
+    """Read a part; its arrays are cut in blocks if `encoded`. A part of a named revision never changes."""
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
-    arrays: Literal["encoded", "decoded"] = "encoded" if encoded else "decoded"
-    load = partial(items.load_part, tx, found, frames=query.frame_slice(), joints=query.joints, arrays=arrays)
-    whole = query.frames is None and query.joints is None
-    content = Lasting(found.digest, load) if whole else load()
+    load = partial(items.load_part, tx, found)
+    if query.frames is None and query.joints is None:
+        content: Lasting | Loaded = Lasting(found.digest, load)
+    else:
+        content = Loaded(partial(items.cut_part, load(), query.frame_slice(), query.joints, encoded=encoded))
     if query.revision is None:
         return Reply(content, rev=found.rev)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})
@@ -103,11 +103,6 @@ class PartResource(Resource):
         )
 
 
-def _read_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace], media: MediaType) -> bytes:
-    documents = items.load_parts(tx, project, wanted, arrays="encoded" if media.arrays == "blocks" else "decoded")
-    return encode({"documents": documents}, media)
-
-
 class Parts(Resource):
     """Documents of several items."""
 
@@ -115,13 +110,14 @@ class Parts(Resource):
     tag = "Items"
 
     @reads(access=Access.READER, body=PartsRequest, answer=Document)
-    async def post(self, project: str, body: PartsRequest) -> Reply:
+    async def post(self, project: str, body: PartsRequest) -> Rendered:
         """Return documents of several items.
 
         The answer is `{"documents": [...]}` in the order of the request, with null for a document that does not exist.
         If the documents together are too large, the last ones are missing from the list: request them again.
         """
-        return Reply(await self.look_up(_read_parts, project, body.parts, self.media))
+        documents = await self.look_up(items.load_parts, project, body.parts)
+        return await self.render_document(Reply({"documents": documents}))
 
 
 RESOURCES: tuple[type[Resource], ...] = (PartResource, Parts)

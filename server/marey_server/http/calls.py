@@ -1,22 +1,25 @@
 """Execution of a request in one transaction: identifies the caller, runs the function and renders the answer.
 
-All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once.
+All of it runs in one thread of the database's pool, so that an ordinary request leaves the event loop once; only
+documents that were loaded are rendered in another thread.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
-from marey_server.http.reply import AnswerCache, AnswerForm, Rendered, Reply, render
+from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
 from marey_server.store import idempotency, projects, tokens
 from marey_server.store.transaction import Transaction
+
+T = TypeVar("T")
 
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
 
@@ -92,8 +95,8 @@ class Call:
     """Name of the project in the address, if any."""
 
 
-def run_call(tx: Transaction, call: Call) -> Rendered:
-    """Run the function of a request, once per idempotency key, and render the answer."""
+def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
+    """Run the function of a request, once per idempotency key, and render the answer, unless it is a document."""
     call.caller.identify(tx)
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
@@ -102,7 +105,10 @@ def run_call(tx: Transaction, call: Call) -> Rendered:
                 projects.require(tx, call.project)  # the caller's role may have ended since the first request
             headers = {**stored.headers, "Idempotent-Replayed": "true"}
             return Rendered(stored.status, headers, stored.body)
-    rendered = render(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
+    reply = settle(call.to_reply(call.function(tx, *call.args, **call.kwargs)), call.form, call.answers)
+    if isinstance(reply.content, Loaded):
+        return reply
+    rendered = render(reply, call.form, call.answers)
     if call.idempotency_key is not None:
         idempotency.finish(tx, call.idempotency_key, rendered.status, dict(rendered.headers), rendered.body)
     return rendered
@@ -114,7 +120,7 @@ def admit(tx: Transaction, project: str | None) -> None:
         projects.require(tx, project)
 
 
-def run_plain(tx: Transaction, caller: Caller, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transaction) -> T:
     """Run a function on behalf of the caller and return its result."""
     caller.identify(tx)
-    return function(tx, *args, **kwargs)
+    return function(tx)

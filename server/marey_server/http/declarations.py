@@ -98,6 +98,7 @@ class Operation:
     public: bool
     headers: tuple[str, ...]
     stream: bool
+    reserved: bool
 
     @property
     def required_role(self) -> RequiredRole:
@@ -126,17 +127,19 @@ def reads(
     public: bool = True,
     headers: tuple[str, ...] = (),
     stream: bool = False,
+    reserved: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
     `answer` is the type of the answer, or, with `paged`, of one element of a page; `answer_types` are its media types,
     if they differ from those of models and documents. `stream`: the answer is also available as server-sent events.
     `public=False`: guests of a public project are refused. `also` lists further statuses, `headers` further request
-    headers. A `body` is for queries that are too long for an address.
+    headers. A `body` is for queries that are too long for an address. `reserved`: it runs in threads that no other
+    requests occupy.
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
-        answer_types=answer_types, also=also, public=public, headers=headers, stream=stream,
+        answer_types=answer_types, also=also, public=public, headers=headers, stream=stream, reserved=reserved,
     )  # fmt: skip
 
 
@@ -153,19 +156,21 @@ def writes(
     scope: str | None = "write",
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
     headers: tuple[str, ...] = (),
+    reserved: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
     `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts
     either or none. `idempotency`: `key` accepts Idempotency-Key; `nature` means that repeating the request has no
-    further effect. `access` cannot be that of readers, because readers and guests of a project may not change it.
+    further effect. `reserved` is that of `reads`. `access` cannot be that of readers, because readers and guests of a
+    project may not change it.
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
-        etag=etag, also=also, headers=headers,
+        etag=etag, also=also, headers=headers, reserved=reserved,
     )  # fmt: skip
 
 
@@ -186,6 +191,7 @@ def _declare(
     public: bool = True,
     headers: tuple[str, ...] = (),
     stream: bool = False,
+    reserved: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -196,7 +202,7 @@ def _declare(
         taken = body if body is None or isinstance(body, RequestBody) else RequestBody(body)
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
-            status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream,
+            status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
         )  # fmt: skip
         return perform
 

@@ -111,6 +111,10 @@ class Exchange(RequestHandler):
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
         return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
 
+    def is_gone(self) -> bool:
+        """Return whether the client has closed the connection."""
+        return self._gone
+
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server has time to answer."""
         return not self._gone and not self.services.draining.is_set()

@@ -1,9 +1,13 @@
-"""Answers of handlers, and their rendering to bytes, which needs no request and can run in any thread."""
+"""Answers of handlers, and their rendering to bytes, which needs no request and can run in any thread.
+
+A reply is settled in its transaction, which loads the document, and rendered after it: rendering a long document takes
+longer than loading it, and others need the transaction's thread and connection.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -24,12 +28,24 @@ before it takes a body from here.
 """
 
 
+MakeTree = Callable[[], Mapping[str, Any]]
+"""Makes a document from what was loaded, without the database."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lasting:
     """Document that never changes, identified by its digest; `load` is called if its rendered bytes are not cached."""
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """Document that was loaded and must still be made and encoded; one with a digest never changes."""
+
+    make: MakeTree
+    digest: str | None = None
 
 
 Content = BaseModel | Mapping[str, Any] | bytes
@@ -42,7 +58,7 @@ class Reply:
     `rev` is the state for the ETag; `location` is a path below the API's root.
     """
 
-    content: Content | Lasting | None = None
+    content: Content | Lasting | Loaded | None = None
     status: int | None = None
     rev: int | str | None = None
     location: str | None = None
@@ -68,8 +84,25 @@ class AnswerForm:
     status: int
 
 
+def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
+    """Load the content of a lasting reply, unless the client has it or it is cached; call it in the transaction."""
+    content = reply.content
+    if not isinstance(content, Lasting):
+        return reply
+    if reply.rev is not None and matches(form.if_none_match, entity_tag(reply.rev, form.media.form)):
+        return replace(reply, content=None)
+    cached = answers.get((content.digest, form.media.form))
+    if cached is not None:
+        return replace(reply, content=cached, media_type=reply.media_type or str(form.media))
+    return replace(reply, content=Loaded(partial(_itself, content.load()), content.digest))
+
+
+def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
+    return tree
+
+
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Return the bytes of a reply; if the client has this state in this form already, 304 without a body."""
+    """Return the bytes of a settled reply; if the client has this state in this form already, 304 without a body."""
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location
@@ -80,16 +113,18 @@ def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
             return Rendered(304, headers, b"")
     if reply.content is None:
         return Rendered(reply.status or form.status, headers, b"")
-    if isinstance(reply.content, Lasting):
-        body = answers.get_or_make((reply.content.digest, form.media.form), partial(_load, reply.content, form.media))
-    else:
-        body = encode(reply.content, form.media)
     headers["Content-Type"] = reply.media_type or str(form.media)
-    return Rendered(reply.status or form.status, headers, body)
+    return Rendered(reply.status or form.status, headers, _body(reply.content, form.media, answers))
 
 
-def _load(content: Lasting, media: MediaType) -> bytes:
-    return encode(content.load(), media)
+def _body(content: Content | Lasting | Loaded, media: MediaType, answers: AnswerCache) -> bytes:
+    assert not isinstance(content, Lasting), "a reply is settled before it is rendered"
+    if not isinstance(content, Loaded):
+        return encode(content, media)
+    body = encode(content.make(), media)
+    if content.digest is not None:
+        answers.put((content.digest, media.form), body)
+    return body
 
 
 def encode(content: Content, media: MediaType) -> bytes:

@@ -32,6 +32,7 @@ from tornado.web import stream_request_body
 
 from marey_schemas.encoding.codecs import JSON, unpacked_limit
 from marey_server.access.principal import ANONYMOUS, Principal
+from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ApiProblem, BadRequestProblem, TooLargeProblem
 from marey_server.http import negotiation
 from marey_server.http.calls import Call, Caller, admission_of, admit, require_access, run_call, run_plain
@@ -40,6 +41,7 @@ from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
+from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
@@ -88,13 +90,11 @@ class Resource(Exchange):
 
     async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
-        future = self.services.database.submit_read(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
-        return await asyncio.wrap_future(future)
+        return await self._read(partial(run_plain, self.caller, partial(_apply, function, args, kwargs)))
 
     async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function(tx, ...)` on behalf of the caller, commit, and return its result."""
-        future = self.services.database.submit_write(ANONYMOUS, run_plain, self.caller, function, *args, **kwargs)
-        return await asyncio.wrap_future(future)
+        return await self._write(partial(run_plain, self.caller, partial(_apply, function, args, kwargs)))
 
     async def answer(
         self,
@@ -118,13 +118,41 @@ class Resource(Exchange):
         answers = self.services.answers
         project = self.path_kwargs.get("project")
         call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
-        database = self.services.database
-        submit = database.submit_read if self.operation.method == "GET" else database.submit_write
-        return await asyncio.wrap_future(submit(ANONYMOUS, run_call, call))
+        run = self._read if self.operation.method == "GET" else self._write
+        outcome = await run(partial(run_call, call))
+        return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
+
+    async def render_document(self, reply: Reply) -> Rendered:
+        """Render a document that was loaded, in a thread for rendering."""
+        rendering = self.services.compute_threads.rendering
+        return await asyncio.wrap_future(
+            rendering.submit(self.client, render, reply, self.answer_form, self.services.answers)
+        )
+
+    async def _read(self, function: Callable[[Transaction], T]) -> T:
+        reserved = self.operation.reserved
+        return await asyncio.wrap_future(
+            self.services.database.queue_read(self.client, ANONYMOUS, function, reserved=reserved)
+        )
+
+    async def _write(self, function: Callable[[Transaction], T]) -> T:
+        reserved = self.operation.reserved
+        return await asyncio.wrap_future(
+            self.services.database.queue_write(self.client, ANONYMOUS, function, reserved=reserved)
+        )
+
+    @property
+    def client(self) -> Client:
+        """Client whose turn it is when this request is served: a known token, or an address."""
+        token = self.caller.token
+        if token is not None and self.services.knows(token):
+            return Client(hash_secret(token), is_gone=self.is_gone)
+        return Client(self.request.remote_ip or "", known=False, is_gone=self.is_gone)
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function` in a thread, away from the event loop, and return its result."""
-        return await asyncio.wrap_future(self.services.compute_threads.submit(function, *args, **kwargs))
+        future = self.services.compute_threads.submit_for(self.client, function, *args, **kwargs)
+        return await asyncio.wrap_future(future)
 
     async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run a computation that may take seconds, like `compute`; some threads are reserved for short ones."""
@@ -134,8 +162,8 @@ class Resource(Exchange):
     def on_finish(self) -> None:
         """Note the use of the caller's token after the answer was written."""
         super().on_finish()
-        if self.principal is not None:
-            self.services.note_use(self.principal)
+        if self.principal is not None and self.caller.token is not None:
+            self.services.note_use(self.caller.token, self.principal)
 
     async def pause(self, seconds: float) -> bool:
         """Wait for a time; if the server is stopping, return True at once."""
@@ -202,8 +230,8 @@ class Resource(Exchange):
         admission, now = admission_of(self.caller, project), time.monotonic()
         admitted = self.services.admitted.get(admission)
         if admitted is None or now - admitted > ADMISSION_S:
-            database = self.services.database
-            await asyncio.wrap_future(database.submit_short_read(ANONYMOUS, run_plain, self.caller, admit, project))
+            check = partial(run_plain, self.caller, partial(admit, project=project))
+            await asyncio.wrap_future(self.services.database.queue_read(self.client, ANONYMOUS, check, reserved=True))
             self.services.admitted.put(admission, now)
 
     def _check_head(self) -> None:
@@ -326,6 +354,10 @@ class Resource(Exchange):
         digest.update(self.request.headers.get("Content-Type", "").encode() + b"\n")
         digest.update(self._received)
         return f"sha256:{digest.hexdigest()}"
+
+
+def _apply(function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any], tx: Transaction) -> T:
+    return function(tx, *args, **kwargs)
 
 
 def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int, *, keep_blocks: bool) -> Any:

@@ -15,16 +15,19 @@ import os
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from typing import ParamSpec, TypeVar
 
 from marey_server.errors import UnavailableProblem
+from marey_server.store.database.lanes import SERVER, Client, Lane
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 THREAD_NAME = "marey-compute"
+RENDERING_THREADS = 3
+"""Number of threads that render documents; one client, and all strangers together, may use all but one."""
 LONGEST_WAIT_FOR_PLACE_S = 20.0
 """Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
@@ -37,16 +40,21 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 
 class ComputeThreads:
-    """Pool with a thread for each processor, of which all but one may run long computations."""
+    """Lane with a thread for each processor, of which all but one may run long computations, and one for rendering."""
 
     def __init__(self, threads: int | None = None) -> None:
         count = max(2, threads or os.cpu_count() or 2)
-        self._pool = ThreadPoolExecutor(count, thread_name_prefix=THREAD_NAME)
+        self._lane = Lane(THREAD_NAME, count)
         self._long_places = asyncio.Semaphore(count - 1)
+        self.rendering = Lane(f"{THREAD_NAME}-rendering", RENDERING_THREADS, most_each=RENDERING_THREADS - 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a computation or file access in a thread, away from the event loop."""
-        return self._pool.submit(function, *args, **kwargs)
+        """Run a computation or file access of the server itself in a thread, away from the event loop."""
+        return self._lane.submit(SERVER, function, *args, **kwargs)
+
+    def submit_for(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Run a computation for a client in a thread. Raises `UnavailableProblem` if too many wait."""
+        return self._lane.submit(client, function, *args, **kwargs)
 
     @asynccontextmanager
     async def long_place(self) -> AsyncIterator[None]:
@@ -69,7 +77,8 @@ class ComputeThreads:
 
     def close(self) -> None:
         """Start no more computations; running ones are not awaited, because their clients are gone."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._lane.close(wait=False)
+        self.rendering.close(wait=False)
 
 
 def compute_on_one_thread_each() -> None:

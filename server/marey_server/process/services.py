@@ -6,12 +6,14 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from marey_schemas.lru import LruCache
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.errors import TooManyRequestsProblem
+from marey_server.access.secret_tokens import hash_secret
+from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
 from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
@@ -96,6 +98,7 @@ class Services:
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)
         self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
+        self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
 
@@ -104,8 +107,13 @@ class Services:
         self._tries_by_address.take(address)
         self._tries_by_name.take(name)
 
-    def note_use(self, principal: Principal) -> None:
-        """Record the use of a token, at most once in `NOTE_USE_EVERY_S` for each."""
+    def knows(self, token: str) -> bool:
+        """Return whether a request with this token was accepted before, so that its caller has lines of its own."""
+        return self._tokens_known.get(hash_secret(token)) is not None
+
+    def note_use(self, token: str, principal: Principal) -> None:
+        """Record the use of a token, in the database at most once in `NOTE_USE_EVERY_S` for each."""
+        self._tokens_known.put(hash_secret(token), True)
         token_id, now = principal.token_id, time.monotonic()
         if token_id is None:
             return
@@ -113,7 +121,8 @@ class Services:
         if noted is not None and now - noted < tokens.NOTE_USE_EVERY_S:
             return
         self._tokens_noted.put(token_id, now)
-        self.database.submit_write(SYSTEM, tokens.note_use, token_id)
+        with suppress(UnavailableProblem):  # too many writes wait: a later use is recorded
+            self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     def close(self) -> None:
         """Wait for running transactions, then close everything."""

@@ -72,9 +72,19 @@ def test_the_summary_tells_what_lists_show(lab: Lab, rig: Item) -> None:
     assert rig.summary == {"joints": 3}
 
 
-def cut_part(tx: Transaction, kind: Kind, item_id: str, part: str, **cut: Any) -> dict[str, Any]:
+def cut_part(
+    tx: Transaction,
+    kind: Kind,
+    item_id: str,
+    part: str,
+    *,
+    frames: Any = None,
+    joints: Any = None,
+    arrays: str = "encoded",
+) -> dict[str, Any]:
     """Some frames and joints of a part."""
-    return items.load_part(tx, items.find_part(tx, "lab", kind, item_id, part), **cut)
+    tree = items.load_part(tx, items.find_part(tx, "lab", kind, item_id, part))
+    return items.cut_part(tree, frames, joints, encoded=arrays == "encoded")
 
 
 def plain(array: Any) -> AnyFloats:

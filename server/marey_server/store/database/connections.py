@@ -1,5 +1,8 @@
 """Connections and transactions for SQLite and Postgres.
 
+Threads run transactions for clients that take turns (`lanes`). Other threads are reserved for short transactions on
+which the server and its workers depend: heartbeats, claims, completions, readiness, sign-in and admission.
+
 A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that the conditions of an UPDATE
 are checked against the current row once it is locked. SQLite has one writer lane: writes run one after another, each
 starting with `BEGIN IMMEDIATE`, and reads run beside it.
@@ -12,9 +15,10 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -27,6 +31,7 @@ from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableP
 from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
+from marey_server.store.database.lanes import SERVER, Client, Lane
 from marey_server.store.database.write_lane import WriteLane
 from marey_server.store.transaction import Transaction
 
@@ -43,8 +48,8 @@ WAL_PATIENCE_MS = 250
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
-SHORT_READERS = 2
-"""Number of threads for reads of a few rows; a pool may open connections for them beyond its size."""
+RESERVED_THREADS = 4
+"""Number of threads, and of connections, for short transactions that must not wait behind others."""
 
 _POSTGRES_SETTINGS = {
     "statement_timeout": "120s",
@@ -71,9 +76,11 @@ class Database:
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.engine = _sqlite_engine(self.url, 2, echo, begin="BEGIN IMMEDIATE")
-            self._read_engine = _sqlite_engine(self.url, readers, echo, begin="BEGIN", query_only=True)
+            self._read_engine = _sqlite_engine(
+                self.url, readers + RESERVED_THREADS, echo, begin="BEGIN", query_only=True
+            )
         else:
-            self.engine = _postgres_engine(self.url, readers, echo)
+            self.engine = _postgres_engine(self.url, readers + RESERVED_THREADS, echo)
             self._read_engine = self.engine.execution_options(
                 isolation_level="REPEATABLE READ", postgresql_readonly=True
             )
@@ -82,8 +89,8 @@ class Database:
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         self._wal_checked_s = 0.0
-        self._readers = ThreadPoolExecutor(readers, thread_name_prefix="marey-read")
-        self._short_readers = ThreadPoolExecutor(SHORT_READERS, thread_name_prefix="marey-short-read")
+        self._ordinary = Lane("marey-database", readers)
+        self._reserved = Lane("marey-reserved", RESERVED_THREADS, most_each=RESERVED_THREADS - 1)
         self._write_lane = WriteLane(self.write) if self.is_sqlite else None
 
     @property
@@ -182,26 +189,6 @@ class Database:
             driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # answers that it could not, and raises nothing
             driver.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
 
-    def submit_read(
-        self,
-        principal: Principal,
-        function: Callable[Concatenate[Transaction, P], T],
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> Future[T]:
-        """Run `read` in a thread of the pool, for callers on an event loop."""
-        return self._readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
-
-    def submit_short_read(
-        self,
-        principal: Principal,
-        function: Callable[Concatenate[Transaction, P], T],
-        *args: P.args,
-        **kwargs: P.kwargs,
-    ) -> Future[T]:
-        """Run a `read` of a few rows in a thread of its own pool, so that it never waits behind long reads."""
-        return self._short_readers.submit(self.read, principal, function, *args, **kwargs)  # type: ignore[arg-type]
-
     def submit_write(
         self,
         principal: Principal,
@@ -209,19 +196,41 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """Run `write` in a thread of the pool (SQLite: in the writer lane), for callers on an event loop."""
+        """Run `write` in a thread, for the server itself."""
+        return self.queue_write(SERVER, principal, partial(_apply, function, args, kwargs))
+
+    def queue_read(
+        self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
+    ) -> Future[T]:
+        """Run `read` for a client in a thread, or in a reserved one. Raises `UnavailableProblem` if too many wait."""
+        lane = self._reserved if reserved else self._ordinary
+        return lane.submit(client, self.read, principal, function)
+
+    def queue_write(
+        self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
+    ) -> Future[T]:
+        """Run `write` for a client in a thread; on SQLite, reserved writes come before those that wait.
+
+        It also runs if the client has gone. Raises `UnavailableProblem` if too many wait.
+        """
+        client = Client(client.key, client.known)
         if self._write_lane is not None:
-            return self._write_lane.submit(principal, function, *args, **kwargs)
-        return self._readers.submit(self.write, principal, function, *args, **kwargs)  # type: ignore[arg-type]
+            return self._write_lane.submit(client, principal, function, reserved=reserved)
+        lane = self._reserved if reserved else self._ordinary
+        return lane.submit(client, self.write, principal, function)
 
     def close(self) -> None:
         """Finish the running transactions, then close all connections."""
         if self._write_lane is not None:
             self._write_lane.close()
-        self._short_readers.shutdown(wait=True)
-        self._readers.shutdown(wait=True)
+        self._reserved.close()
+        self._ordinary.close()
         self._read_engine.dispose()
         self.engine.dispose()
+
+
+def _apply(function: Callable[..., T], args: tuple[Any, ...], kwargs: Mapping[str, Any], tx: Transaction) -> T:
+    return function(tx, *args, **kwargs)
 
 
 # -- engines ----------------------------------------------------------------------------------------------------------

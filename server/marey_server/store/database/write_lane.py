@@ -6,22 +6,25 @@ savepoint, a refused write rolls back only its own part, and each is answered af
 
 from __future__ import annotations
 
-from collections import deque
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem
+from marey_server.store.database.lanes import Client, FairLine, finish
 from marey_server.store.database.prepared import run_text
 from marey_server.store.transaction import Transaction
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_TOGETHER = 16
 """Greatest number of writes in one transaction; the first of them is answered only after the last has run."""
+MOST_RESERVED = 12
+"""Greatest number of reserved writes in one transaction while others wait, so that these go on, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,34 +35,30 @@ class _Write:
     function: Callable[[Transaction], Any]
     future: Future[Any]
 
-    def end(self, finish: Callable[[], Any]) -> None:
-        """Set the future to the result or the error of `finish`."""
-        try:
-            answer = finish()
-        except BaseException as error:  # noqa: BLE001 - for whoever waits
-            self.future.set_exception(error)
-        else:
-            self.future.set_result(answer)
-
 
 class WriteLane:
-    """Thread that runs writes. `write(principal, function)` runs a function in a transaction and commits."""
+    """Thread that runs writes. `write(principal, function)` runs a function in a transaction and commits.
+
+    Clients take turns, as in every lane; reserved writes, such as heartbeats, come before all others.
+    """
 
     def __init__(self, write: Callable[[Principal, Callable[[Transaction], Any]], Any]) -> None:
         self._write = write
-        self._waiting: deque[_Write] = deque()
+        self._ordinary: FairLine[_Write] = FairLine()
+        self._reserved: FairLine[_Write] = FairLine()
+        self._lock = threading.Lock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="marey-write")
 
     def submit(
-        self,
-        principal: Principal,
-        function: Callable[Concatenate[Transaction, P], T],
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Queue `function(tx, ...)`; the future holds its return value once the transaction is committed."""
-        one = _Write(principal, lambda tx: function(tx, *args, **kwargs), Future())
-        self._waiting.append(one)
+        """Queue `function(tx)`; the future holds its return value once the transaction is committed.
+
+        Raises `UnavailableProblem` if too many writes are waiting.
+        """
+        one = _Write(principal, function, Future())
+        with self._lock:
+            (self._reserved if reserved else self._ordinary).put(client, one)
         self._thread.submit(self._write_waiting)
         return one.future
 
@@ -68,29 +67,40 @@ class WriteLane:
         self._thread.shutdown(wait=True)
 
     def _write_waiting(self) -> None:
-        taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), MOST_TOGETHER))]
-        group = [one for one in taken if one.future.set_running_or_notify_cancel()]
+        group = [one for one in self._take() if one.future.set_running_or_notify_cancel()]
         if len(group) < 2 or not self._write_together(group):
             for one in group:
-                one.end(lambda one=one: self._write(one.principal, one.function))  # type: ignore[misc]
+                finish(one.future, partial(self._write, one.principal, one.function))
+
+    def _take(self) -> list[_Write]:
+        """Remove the next writes from the lines, at most `MOST_TOGETHER`."""
+        taken: list[_Write] = []
+        with self._lock:
+            while len(taken) < MOST_TOGETHER:
+                first = self._reserved.take() if len(taken) < MOST_RESERVED else None
+                one = first or self._ordinary.take() or self._reserved.take()
+                if one is None:
+                    break
+                taken.append(one)
+        return taken
 
     def _write_together(self, group: Sequence[_Write]) -> bool:
         """Run writes in one transaction; return whether it was committed. An unexpected error rolls back all."""
-        finishes: list[Callable[[], Any]] = []
+        completions: list[Callable[[], Any]] = []
 
         def run_all(tx: Transaction) -> None:
-            finishes[:] = [_run(tx, one) for one in group]
+            completions[:] = [_run(tx, one) for one in group]
 
         try:
             self._write(SYSTEM, run_all)
         except Exception as failure:  # noqa: BLE001 - for whoever waits
-            if not finishes:
+            if not completions:
                 return False
             for one in group:  # the commit failed: to write again could write twice
                 one.future.set_exception(failure)
             return True
-        for one, finish in zip(group, finishes, strict=True):
-            one.end(finish)
+        for one, complete in zip(group, completions, strict=True):
+            finish(one.future, complete)
         return True
 
 
@@ -106,15 +116,15 @@ def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
         return _raiser(refusal)
     run_text(tx.connection, "RELEASE this_write")
 
-    def finish() -> Any:
+    def complete() -> Any:
         own.run_after_commit()
         return answer
 
-    return finish
+    return complete
 
 
 def _raiser(refusal: ApiProblem) -> Callable[[], Any]:
-    def finish() -> Any:
+    def complete() -> Any:
         raise refusal
 
-    return finish
+    return complete

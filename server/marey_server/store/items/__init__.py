@@ -21,6 +21,7 @@ from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import (
     FoundPart,
     Part,
+    cut_part,
     find_contents,
     find_part,
     load_part,
@@ -38,6 +39,7 @@ __all__ = [
     "StoredDocument",
     "change_item",
     "create_item",
+    "cut_part",
     "delete_item",
     "find_annotated_clip",
     "find_annotation",

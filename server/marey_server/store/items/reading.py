@@ -168,26 +168,23 @@ def find_part(
 
 
 def load_part(
-    tx: Transaction,
-    found: FoundPart,
-    *,
-    frames: slice | None = None,
-    joints: Sequence[str] | None = None,
-    arrays: Literal["encoded", "decoded", "none"] = "encoded",
+    tx: Transaction, found: FoundPart, *, arrays: Literal["encoded", "decoded", "none"] = "encoded"
 ) -> dict[str, Any]:
-    """Load the document of a part, with its arrays in the form `arrays`.
+    """Load the document of a part, with its arrays in the form `arrays`."""
+    return documents.load_document(tx, found.digest, arrays=arrays)
 
-    `frames` (half-open, clipped to the motion) and `joints` (names, in the order of the result) cut a motion. Raises
-    `InvalidProblem` if they do not fit it.
+
+def cut_part(
+    tree: dict[str, Any], frames: slice | None, joints: Sequence[str] | None, *, encoded: bool
+) -> dict[str, Any]:
+    """Cut a motion, loaded with encoded arrays, to `frames` and `joints`; the arrays of the result are as `encoded`.
+
+    `frames` is half-open and clipped to the motion; `joints` are names, in the order of the result. Raises
+    `InvalidProblem` if they do not fit the document.
     """
-    if frames is None and joints is None:
-        return documents.load_document(tx, found.digest, arrays=arrays)
-    tree = documents.load_document(tx, found.digest)
     if tree["schema"] != "marey/motion@1":
         raise InvalidProblem("frames and joints can only be selected from motions.", code="not-a-motion")
-    if arrays == "none":
-        raise ValueError("an array of which only a part was read cannot be replaced by a reference")
-    return slice_motion(tree, frames, joints, encoded=arrays == "encoded")
+    return slice_motion(tree, frames, joints, encoded=encoded)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,10 +213,8 @@ def read_part(
 MOST_BYTES_AT_ONCE = 32 << 20
 
 
-def load_parts(
-    tx: Transaction, project: str, wanted: Sequence[PartPlace], *, arrays: Literal["encoded", "decoded"] = "encoded"
-) -> list[dict[str, Any] | None]:
-    """Load the documents of parts, in the order of the request; None for a part that does not exist.
+def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> list[dict[str, Any] | None]:
+    """Load the documents of parts with encoded arrays, in the order of the request; None for a part without one.
 
     If the documents together are too large, those at the end are left out; the first one is always loaded.
     """
@@ -238,5 +233,5 @@ def load_parts(
         if chosen and size_bytes > MOST_BYTES_AT_ONCE:
             break
         chosen.append(None if row is None else row.digest)
-    loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None}, arrays=arrays)
+    loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
     return [None if digest is None else loaded[digest] for digest in chosen]

@@ -1,0 +1,180 @@
+"""Lanes: threads with a bounded line of waiting work, in which clients take turns.
+
+Somebody who sends many requests waits longer, but nobody else does: known clients and strangers take turns, and within
+both groups each client does. A line has room for a limited number of calls, and for some of each client.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, ParamSpec, TypeVar
+
+from marey_server.errors import ClientGoneProblem, UnavailableProblem
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+MOST_WAITING = 512
+"""Greatest number of calls that wait in a line for known clients, and the same for strangers."""
+MOST_WAITING_EACH = 256
+"""Greatest number of calls that wait in a line for one client."""
+RETRY_AFTER_S = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Client:
+    """Owner of a call: a token that the server has accepted before, or the address of a stranger."""
+
+    key: str
+    known: bool = True
+    is_gone: Callable[[], bool] = bool
+    """Whether nobody waits for the result any more; then the call is not begun."""
+
+
+SERVER = Client("server")
+"""The server itself, for its housekeeping."""
+
+
+@dataclass(frozen=True, slots=True)
+class _QueuedCall:
+    """Function to be called for a client, and the future of its result."""
+
+    client: Client
+    function: Callable[[], Any]
+    future: Future[Any]
+
+    def run(self) -> None:
+        """_QueuedCall the function and set the future, unless it was cancelled or its client has gone."""
+        if self.future.set_running_or_notify_cancel():
+            finish(self.future, self._call)
+
+    def _call(self) -> Any:
+        if self.client.is_gone():
+            raise ClientGoneProblem("The client closed the connection before this was begun.")
+        return self.function()
+
+
+def finish(future: Future[Any], function: Callable[[], Any]) -> None:
+    """Set a future to the result or the error of a function.
+
+    Event loops refuse `StopIteration` as an error of a future, so that its request would wait for ever.
+    """
+    try:
+        result = function()
+    except StopIteration as error:
+        fault = RuntimeError("a function ended with StopIteration")
+        fault.__cause__ = error
+        future.set_exception(fault)
+    except BaseException as error:  # noqa: BLE001 - for whoever waits
+        future.set_exception(error)
+    else:
+        future.set_result(result)
+
+
+class FairLine(Generic[T]):
+    """Waiting line in which clients take turns. It is not thread-safe."""
+
+    def __init__(self, most_waiting: int = MOST_WAITING, most_each: int = MOST_WAITING_EACH) -> None:
+        self._most_waiting = most_waiting
+        self._most_each = most_each
+        self._groups: dict[bool, OrderedDict[str, deque[tuple[Client, T]]]] = {
+            True: OrderedDict(), False: OrderedDict()
+        }  # fmt: skip
+        self._lengths: Counter[bool] = Counter()
+        self._next_group = True
+
+    def __len__(self) -> int:
+        return self._lengths.total()
+
+    def put(self, client: Client, one: T) -> None:
+        """Add an element at the end of a client's own line. Raises `UnavailableProblem` if there is no room."""
+        own = self._groups[client.known].get(client.key, ())
+        if self._lengths[client.known] >= self._most_waiting or len(own) >= self._most_each:
+            raise UnavailableProblem(
+                f"{len(self)} calls are waiting already, {len(own)} of them yours; try again in a few seconds.",
+                code="busy",
+                headers={"Retry-After": str(RETRY_AFTER_S)},
+            )
+        self._groups[client.known].setdefault(client.key, deque()).append((client, one))
+        self._lengths[client.known] += 1
+
+    def take(self, may_run: Callable[[Client], bool] = lambda _client: True) -> T | None:
+        """Remove and return the next element of a client that may run, or None if there is none."""
+        for group in (self._next_group, not self._next_group):
+            for key, line in self._groups[group].items():
+                client, one = line[0]
+                if may_run(client):
+                    line.popleft()
+                    self._lengths[group] -= 1
+                    del self._groups[group][key]
+                    if line:
+                        self._groups[group][key] = line  # at the end: it is the turn of the others
+                    self._next_group = not group
+                    return one
+        return None
+
+
+class Lane:
+    """Threads that run the calls of a `FairLine`.
+
+    `most_each` limits the calls of one client, and those of all strangers, that run at the same time.
+    """
+
+    def __init__(self, name: str, threads: int, *, most_each: int | None = None) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix=name)
+        self._most_each = most_each or threads
+        self._idle = threads
+        self._line: FairLine[_QueuedCall] = FairLine()
+        self._running: Counter[str] = Counter()
+        self._strangers = 0
+        self._lock = threading.Lock()
+
+    def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Queue a call for a client. Raises `UnavailableProblem` if the line is full."""
+        future: Future[T] = Future()
+        with self._lock:
+            self._line.put(client, _QueuedCall(client, partial(function, *args, **kwargs), future))
+            start = self._idle > 0
+            self._idle -= start
+        if start:
+            self._pool.submit(self._run_waiting)
+        return future
+
+    def close(self, *, wait: bool = True) -> None:
+        """Begin no further calls; with `wait`, first run those that are queued."""
+        if not wait:
+            with self._lock:
+                while (call := self._line.take()) is not None:
+                    call.future.cancel()
+        self._pool.shutdown(wait=wait, cancel_futures=not wait)
+
+    def _run_waiting(self) -> None:
+        call = self._begin_next()
+        while call is not None:
+            call.run()
+            call = self._begin_next(ended=call.client)
+
+    def _begin_next(self, ended: Client | None = None) -> _QueuedCall | None:
+        with self._lock:
+            if ended is not None:
+                self._running[ended.key] -= 1
+                if not self._running[ended.key]:
+                    del self._running[ended.key]
+                self._strangers -= not ended.known
+            call = self._line.take(self._may_run)
+            if call is None:
+                self._idle += 1
+                return None
+            self._running[call.client.key] += 1
+            self._strangers += not call.client.known
+            return call
+
+    def _may_run(self, client: Client) -> bool:
+        if not client.known and self._strangers >= self._most_each:
+            return False
+        return self._running[client.key] < self._most_each

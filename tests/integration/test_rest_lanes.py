@@ -1,0 +1,81 @@
+"""Lanes of requests: what servers and workers depend on never waits behind the long work of others."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import pytest
+from tests.support.rest_server import PATIENCE_S, Server
+
+from marey_schemas.encoding.codecs import encode_tree
+from marey_server.access.principal import SYSTEM
+from marey_server.store.database.lanes import Client
+
+STUDY = {"schema": "marey/document@1", "answer": 42}
+
+
+@contextmanager
+def busy(server: Server) -> Iterator[None]:
+    """Keep every thread for ordinary reads, and the line before them, busy with many clients' reads."""
+    done = threading.Event()
+    clients = [Client(f"192.0.2.{number}", known=False) for number in range(40)]
+    reads = [server.database.queue_read(one, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for one in clients]
+    try:
+        yield
+        assert not any(read.done() for read in reads)
+    finally:
+        done.set()
+
+
+def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server: Server) -> None:
+    server.make_project()
+    worker = server.client(server.make_user("wanda", administrator=True, scopes=("work", "read")))
+    claim = {"worker": "w", "kinds": ["export"]}
+    with busy(server):
+        answers = {
+            "ready": httpx.get(f"{server.address}/readyz", timeout=PATIENCE_S),
+            "me": worker.get("/me"),
+            "claim": worker.post("/leases", json=claim),
+            "sign-in": server.client().post("/login", json={"name": "olga", "password": "guess"}),
+            "heartbeat": worker.post("/jobs/job_1/attempts/1/heartbeat", json={}),
+        }
+    assert {name: answer.status_code for name, answer in answers.items()} == {
+        "ready": 200, "me": 200, "claim": 200, "sign-in": 401, "heartbeat": 403
+    }  # fmt: skip
+
+
+def test_documents_are_rendered_after_their_transactions(
+    server: Server, owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads: list[str] = []
+
+    def noting(*args: Any, **options: Any) -> bytes:
+        threads.append(threading.current_thread().name)
+        return encode_tree(*args, **options)
+
+    made = owner.post("/projects/lab/studies", json={"name": "s", "parts": {"study": STUDY}}).json()
+    monkeypatch.setattr("marey_server.http.reply.encode_tree", noting)
+    place = {"kind": "study", "item": made["id"], "revision": 1, "part": "study"}
+    answers = [
+        owner.get(f"/projects/lab/studies/{made['id']}/parts/study"),
+        owner.post("/projects/lab/parts", json={"parts": [place]}),
+    ]
+    assert [answer.status_code for answer in answers] == [200, 200]
+    assert len(threads) == 2
+    assert all(name.startswith("marey-compute-rendering") for name in threads), threads
+
+
+def test_a_function_that_ends_with_stop_iteration_is_a_failure_of_its_request(
+    owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_args: Any, **_options: Any) -> Any:
+        raise StopIteration
+
+    monkeypatch.setattr("marey_server.handlers.projects.projects.read_project", stop)
+    monkeypatch.setattr("marey_server.handlers.collections.collections.create_collection", stop)
+    answers = [owner.get("/projects/lab"), owner.post("/projects/lab/collections", json={"path": "x"})]
+    assert [answer.status_code for answer in answers] == [500, 500]
