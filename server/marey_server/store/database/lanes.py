@@ -49,7 +49,7 @@ class _QueuedCall:
     future: Future[Any]
 
     def run(self) -> None:
-        """_QueuedCall the function and set the future, unless it was cancelled or its client has gone."""
+        """Call the function and set the future, unless it was cancelled or its client has gone."""
         if self.future.set_running_or_notify_cancel():
             finish(self.future, self._call)
 
