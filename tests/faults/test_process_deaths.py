@@ -108,6 +108,14 @@ def assert_published_once(lab: ProjectHandle, jobs: list[Job]) -> None:
     assert results == [1] * len(jobs)
 
 
+def assert_made_from_their_clips(marey: Marey, jobs: list[Job]) -> None:
+    """Every job has one result, which was made from the clip of this job."""
+    for job in jobs:
+        [output] = marey.jobs.outputs(job.id)
+        [clip] = job.inputs["clips"]
+        assert clip["item"] in {edge.item for edge in marey.project("lab").clips.get(output.item).lineage().inputs}
+
+
 def wait_until(condition: Callable[[], bool], seconds: float = 60) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
@@ -261,6 +269,73 @@ def test_a_job_of_a_killed_worker_is_finished_by_another_with_one_result(
         outcomes = [attempt.outcome for attempt in marey.jobs.attempts(job.id)]
         assert sorted(filter(None, outcomes)) == (["succeeded"] if place == "after_complete" else ["lost", "succeeded"])
         assert [revision for path, (_, revision) in clips_by_name(lab).items() if path.startswith("game/")] == [1]
+    server.check_database()
+
+
+@pytest.mark.parametrize("place", ["after_claim@2", "before_complete@2"])
+def test_jobs_of_a_worker_killed_while_it_stores_one_and_runs_another_are_published_once(
+    server: ServerProcess,
+    takes: list[LocalFile],
+    tmp_path: Path,
+    start_worker: Callable[..., WorkerProcess],
+    place: str,
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:4])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        jobs = submit_retargets(lab, entries, skeleton, into="game")
+        dying = start_worker("dying", fault=f"worker.{place}:kill")
+        assert dying.wait_until_dead() == -signal.SIGKILL
+        start_worker("healthy")
+        finished = ended(marey, jobs)
+        assert_published_once(lab, finished)
+        assert_made_from_their_clips(marey, finished)
+    server.check_database()
+
+
+def test_a_server_killed_while_a_worker_stores_one_job_and_runs_another_publishes_each_once(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:4])
+        skeleton = import_game_skeleton(lab, tmp_path)
+    server.stop()
+    server.start(fault="stage.before_commit@2:kill")
+    with server.client() as marey:
+        jobs = submit_retargets(marey.project("lab"), entries, skeleton, into="game")
+    start_worker("steady")
+    assert server.wait_until_dead() == -signal.SIGKILL
+    server.start()
+    with server.client() as marey:
+        finished = ended(marey, jobs)
+        assert_published_once(marey.project("lab"), finished)
+        assert_made_from_their_clips(marey, finished)
+    server.check_database()
+
+
+def test_a_worker_that_slept_with_one_job_stored_and_another_running_publishes_neither_again(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    server.start()
+    with server.client() as marey:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:4])
+        skeleton = import_game_skeleton(lab, tmp_path)
+        jobs = submit_retargets(lab, entries, skeleton, into="game")
+        sleeper = start_worker("sleeper", fault="worker.after_blob@2:stop")
+        wait_until(lambda: sleeper.process is not None and _is_stopped(sleeper.process.pid))
+        start_worker("awake")
+        finished = ended(marey, jobs)
+        assert_published_once(lab, finished)
+        before = clips_by_name(lab)
+        sleeper.send(signal.SIGCONT)
+        wait_until(lambda: any(text in sleeper.log.read_text() for text in ("given up", "the lease was lost")))
+        assert clips_by_name(lab) == before
+        assert_made_from_their_clips(marey, finished)
     server.check_database()
 
 

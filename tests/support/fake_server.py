@@ -50,7 +50,8 @@ class FakeServer:
     """Jobs to claim, documents to read, and everything that workers sent, by job.
 
     A job in `lost` has lost its lease; requests about one in `silent` get the answer that the server is away, and are
-    counted in `refused`.
+    counted in `refused`. Results of a job in `slow` are not answered while it is there; those of one in `unwelcome` are
+    refused. `order` lists claims and ends of jobs.
     """
 
     def __init__(self) -> None:
@@ -66,6 +67,9 @@ class FakeServer:
         self.cancelled: set[str] = set()
         self.lost: set[str] = set()
         self.silent: set[str] = set()
+        self.slow: set[str] = set()
+        self.unwelcome: set[str] = set()
+        self.order: list[tuple[str, str]] = []
         self.refused: defaultdict[str, int] = defaultdict(int)
         self.leased: dict[str, FakeJob] = {}
         self.completing: set[str] = set()
@@ -101,6 +105,7 @@ class FakeServer:
                     if job.kind in wanted["kinds"]:
                         self.jobs.remove(job)
                         self.leased[job.name] = job
+                        self.order.append(("claimed", job.name))
                         return [job.lease(fence=len(self.leased))]
             time.sleep(0.01)
         return []
@@ -181,17 +186,24 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
             return self.reply(200, json.dumps({"offset": len(server.logs[job])}).encode())
 
         def on_outputs(self, job: str, body: bytes) -> None:
+            server.until(lambda: job not in server.slow)
+            if job in server.lost:
+                return self.problem(409, "lease-lost")
+            if job in server.unwelcome:
+                return self.problem(422, "invalid")
             server.staged[job] += decode_tree(body, MSGPACK)["outputs"]
-            self.reply(204)
+            return self.reply(204)
 
         def on_complete(self, job: str, body: bytes) -> None:
             server.completing.add(job)
             server.may_complete.wait(60)
             server.completed[job] = json.loads(body)
+            server.order.append(("ended", job))
             self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
 
         def on_fail(self, job: str, body: bytes) -> None:
             server.failed[job] = json.loads(body)
+            server.order.append(("ended", job))
             self.reply(200, json.dumps({"job": job, "state": "queued"}).encode())
 
         def do_GET(self) -> None:

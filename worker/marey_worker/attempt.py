@@ -10,10 +10,10 @@ import threading
 import time
 import uuid
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import accumulate
 from pathlib import Path
@@ -125,8 +125,8 @@ class Watch:
     started: float
     weighed: float = 0.0
 
-    def verdict(self, child: ChildProcess) -> Stop | None:
-        """Return the reason to stop the attempt now, or None."""
+    def verdict(self, child: ChildProcess | None) -> Stop | None:
+        """Return the reason to stop the attempt now, or None; `child` is None once it has computed all results."""
         if self.keeper.lost.is_set():
             return Stop.LEASE_LOST
         if self.keeper.cancelled.is_set():
@@ -135,7 +135,7 @@ class Watch:
             return Stop.INTERRUPTED
         if time.monotonic() - self.started > self.lease.resources.time_limit_s:
             return Stop.TIME
-        if time.monotonic() - self.weighed > WEIGH_EVERY_S:
+        if child is not None and time.monotonic() - self.weighed > WEIGH_EVERY_S:
             self.weighed = time.monotonic()
             if child.resident_bytes > self.lease.resources.memory_limit_mb * MIB:
                 return Stop.MEMORY
@@ -178,7 +178,9 @@ class RunningAttempt:
         self._job_log = LogUploader(api, self._scratch / "log")
         self._keeper = LeaseKeeper(api, lease)
         self._watch = Watch(lease, self._keeper, stopping, self._job_log, time.monotonic())
+        self._log_due = time.monotonic() + LOG_EVERY_S
         self._transfers = ThreadPoolExecutor(TRANSFERS_AT_ONCE, thread_name_prefix="marey-transfer")
+        self._staging: list[Future[ChildReply | None]] = []
 
     def run(self, child: ChildProcess) -> Done | Failed | Stop:
         """Run the job in `child`, which is idle or dead afterwards. The caller then calls `finish`."""
@@ -192,9 +194,14 @@ class RunningAttempt:
             raise
         return end
 
-    def finish(self, end: Done | Failed | Stop) -> None:
-        """Report the end to the server; the child may run the next job meanwhile."""
+    def finish(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
+        """Wait until all results are stored, report the end to the server, and return it.
+
+        The child may run the next job meanwhile. A success becomes a failure or a stop if results cannot be stored.
+        """
         try:
+            if isinstance(end, Done):
+                end = self._when_staged(end)
             self._report(end)
         except LeaseLost as error:
             log.warning("%s: given up: %s", self._lease.job, error)
@@ -202,6 +209,7 @@ class RunningAttempt:
             log.error("%s: its end could not be reported: %s", self._lease.job, error)
         finally:
             self._close()
+        return end
 
     def _close(self) -> None:
         self._keeper.stop()
@@ -220,7 +228,6 @@ class RunningAttempt:
 
     def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
         """Answer the requests of the child until the job ends."""
-        log_due = time.monotonic() + LOG_EVERY_S
         while True:
             try:
                 data = child.receive(WATCH_EVERY_S)
@@ -235,22 +242,34 @@ class RunningAttempt:
             if isinstance(message, Made):
                 self._keeper.tell(message.progress)
             elif message is not None:
-                self._transfers.submit(self._serve, message, child)
-            if (stop := self._watch.verdict(child)) is not None:
+                self._serve(message, child)
+            if (stop := self._check(child)) is not None:
                 return stop
-            if time.monotonic() > log_due:
-                self._transfers.submit(self._try_to_send_log)
-                log_due = time.monotonic() + LOG_EVERY_S
+
+    def _check(self, child: ChildProcess | None) -> Stop | None:
+        """Send new output if it is due; return the reason to stop the attempt now, or None."""
+        if time.monotonic() > self._log_due:
+            self._transfers.submit(self._try_to_send_log)
+            self._log_due = time.monotonic() + LOG_EVERY_S
+        return self._watch.verdict(child)
 
     def _serve(self, request: Request, child: ChildProcess) -> None:
-        """Carry out one request of the child, and answer it."""
+        """Carry out one request of the child in a separate thread, and answer it."""
+        carrying_out = self._transfers.submit(self._reply_to, request)
+        if isinstance(request, Stage):
+            self._staging = [*filter(_not_stored, self._staging), carrying_out]
+        # A child that runs the next job may take long to read this reply: `carrying_out` is done before it is sent.
+        carrying_out.add_done_callback(partial(_send_reply, child))
+
+    def _reply_to(self, request: Request) -> ChildReply | None:
+        """Carry out one request of the child; return the reply, or None if the lease was lost."""
         try:
-            child.send(pack(ChildReply(request.request, self._carried_out(request))))
+            return ChildReply(request.request, self._carried_out(request))
         except LeaseLost:
             self._keeper.lost.set()
+            return None
         except Exception as error:  # noqa: BLE001 - whatever happened, the child waits for an answer
-            missing = isinstance(error, NotFound)
-            child.send(pack(ChildReply(request.request, refusal=str(error), missing=missing)))
+            return ChildReply(request.request, refusal=str(error), missing=isinstance(error, NotFound))
 
     def _carried_out(self, request: Request) -> Any:
         match request:
@@ -289,6 +308,19 @@ class RunningAttempt:
         return Failed("worker-process-died", signatures.told_exit(status), signatures.of_exit(status), retryable=True)
 
     # -- at the end --
+
+    def _when_staged(self, done: Done) -> Done | Failed | Stop:
+        """Wait until the server has stored all results; return `done`, or the reason why the job has not succeeded."""
+        while wait(self._staging, WATCH_EVERY_S).not_done:
+            if (stop := self._check(None)) is not None:
+                return stop
+        for reply in [staged.result() for staged in self._staging]:
+            if reply is None:
+                return Stop.LEASE_LOST
+            if reply.refusal is not None:
+                detail = f"the results could not be stored: {reply.refusal}"
+                return Failed("exception", detail, signatures.STAGING, retryable=not reply.missing)
+        return done
 
     def _report(self, end: Done | Failed | Stop) -> None:
         """Report the result to the server. Heartbeats continue, because the server may be unreachable for a while."""
@@ -332,3 +364,14 @@ class RunningAttempt:
             self._keeper.lost.set()
         except (MareyError, OSError) as error:
             log.warning("%s: its log could not be sent: %s", self._lease.job, error)
+
+
+def _not_stored(staging: Future[ChildReply | None]) -> bool:
+    """Return whether results are not yet stored, or could not be stored."""
+    reply = staging.result() if staging.done() else None
+    return reply is None or reply.refusal is not None
+
+
+def _send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> None:
+    if not carried_out.cancelled() and (reply := carried_out.result()) is not None:
+        child.send(pack(reply))

@@ -87,7 +87,6 @@ def run_job(run: Run, pipe: Connection) -> End:
     allow_memory(run.memory_limit_bytes)
     try:
         result = to_jsonable_python(_perform(find_kind(run.kind), context, run))
-        context.finish_staging()
     except JobRefused as error:
         return Failed(error.code, error.detail, None, retryable=False)
     except NoSuchThing as error:  # inputs are pinned: what is not there now will not be there at the next try

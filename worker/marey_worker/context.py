@@ -146,7 +146,11 @@ class Context:
     # -- writing --
 
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
-        """Stage results. All of them become visible together when the job completes."""
+        """Stage results. All of them become visible together when the job completes.
+
+        Raises `RequestRefused` if earlier results could not be stored. Nobody waits here for the last ones: the
+        supervisor does, while this process runs the next job.
+        """
         tree = StageRequest(outputs=tuple(outputs)).model_dump(by_alias=True)
         body = encode_tree(tree, MSGPACK, arrays="blocks")
         while len(self._staging) >= STAGED_AT_ONCE:
@@ -157,11 +161,6 @@ class Context:
         """Send a file and return its digest, for a reference in the result."""
         digest: str = self._ask(lambda request: PutFile(request, path))
         return digest
-
-    def finish_staging(self) -> None:
-        """Wait until the server has stored all staged results."""
-        while self._staging:
-            self._value(self._staging.popleft())
 
     def progress(self, done: float, total: float | None = None, note: str = "") -> None:
         """Report the progress of the job; may be called often."""

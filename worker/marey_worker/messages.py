@@ -122,7 +122,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Done:
-    """Message that the job has succeeded and all its staged outputs are acknowledged."""
+    """Message that the job has computed all its results; the last ones may not be stored yet."""
 
     result: dict[str, Any]
 

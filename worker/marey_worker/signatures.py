@@ -6,6 +6,9 @@ import hashlib
 import signal
 import traceback
 
+STAGING = "staging"
+"""Signature of results that the server did not store."""
+
 
 def of_exception(error: BaseException) -> str:
     """Return the type and place of an exception, without its text."""

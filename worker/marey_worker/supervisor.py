@@ -75,7 +75,7 @@ class Supervisor:
         self._options = options
         self._cache = InputCache(options.cache, options.cache_bytes)
         self._stopping = threading.Event()
-        self._running: set[str] = set()
+        self._running: set[tuple[str, int]] = set()
         self._interrupted = self._failed = False
         self._refusal: MareyError | None = None
 
@@ -130,7 +130,7 @@ class Supervisor:
                 for lease in leases:
                     earlier, finishing = finishing, self._attempt(lease, child, finisher)
                     if earlier is not None:
-                        earlier.result()  # one report at a time is under way, and what went wrong with it is raised
+                        earlier.result()  # results of one earlier job at most are kept; raises what went wrong with it
             if finishing is not None:
                 finishing.result()
 
@@ -145,8 +145,9 @@ class Supervisor:
         return claim(self._claims, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
-        """Run a job; its success is reported while the child runs the next one."""
-        self._running.add(lease.job)
+        """Run a job; its last results are stored, and its success is reported, while the child runs the next one."""
+        place = (lease.job, lease.fence)  # a lost job may run again before its former attempt has ended
+        self._running.add(place)
         try:
             faults.point("worker.after_claim")
             log.info("%s: %s, attempt %d", lease.job, lease.kind, lease.attempt)
@@ -156,19 +157,18 @@ class Supervisor:
             )
             end = attempt.run(child)
         except BaseException:
-            self._running.discard(lease.job)
+            self._running.discard(place)
             raise
-        self._interrupted |= end is Stop.INTERRUPTED
-        finishing = finisher.submit(self._finish, attempt, end, lease.job)
+        finishing = finisher.submit(self._finish, attempt, end, place)
         if not isinstance(end, Done):
             finishing.result()
         return finishing
 
-    def _finish(self, attempt: RunningAttempt, end: Done | Failed | Stop, job: str) -> None:
+    def _finish(self, attempt: RunningAttempt, end: Done | Failed | Stop, place: tuple[str, int]) -> None:
         try:
-            attempt.finish(end)
+            self._interrupted |= attempt.finish(end) is Stop.INTERRUPTED
         finally:
-            self._running.discard(job)
+            self._running.discard(place)
 
 
 class _Bench:

@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from marey_schemas.processes.environment import clean_environment
@@ -43,7 +44,7 @@ class ChildProcess:
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
-        ours, theirs = socket.socketpair()
+        self._socket, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
@@ -52,7 +53,7 @@ class ChildProcess:
                 start_new_session=True,
                 env=clean_environment(threads=threads),
             )
-        self._pipe = Connection(ours.detach())
+        self._pipe = Connection(os.dup(self._socket.fileno()))
         self._sending = threading.Lock()
 
     def wait_until_ready(self) -> None:
@@ -84,6 +85,8 @@ class ChildProcess:
     def send(self, message: bytes) -> None:
         """Send a message; if the child has died, the next `receive` reports it."""
         with self._sending:
+            if self._pipe.closed:
+                return
             try:
                 self._pipe.send_bytes(message)
             except (BrokenPipeError, ConnectionResetError):
@@ -112,7 +115,15 @@ class ChildProcess:
                 time.sleep(0.02)
         self._signal(signal.SIGKILL)
         self._process.wait()
-        self._pipe.close()
+        self._close()
+
+    def _close(self) -> None:
+        """Close the pipe, but not while another thread sends: the number of its descriptor may be reused at once."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)  # ends a `send` that waits for room
+        with self._sending:
+            self._pipe.close()
+            self._socket.close()
 
     def _signal(self, number: signal.Signals) -> None:
         try:

@@ -11,7 +11,7 @@ from typing import Any
 from marey_schemas.base import Request
 from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 
 
@@ -39,6 +39,7 @@ def misbehave(context: Context, params: MisbehaveParams) -> dict[str, Any]:
         "fork-and-raise": _fork_and_raise,
         "sleep": lambda: _sleep(params.seconds),
         "give-up-early": lambda: _give_up_early(context), "put": lambda: _put(context),
+        "read-late": lambda: _read_late(context, Path(params.folder)),
         "miss": lambda: context.document(Kind.SKELETON, "skeleton_gone", 1, "hierarchy"),
     }[params.how]()  # fmt: skip
 
@@ -110,6 +111,25 @@ def _put(context: Context) -> dict[str, str]:
     return {"digest": context.put_file(path)}
 
 
+def _read_late(context: Context, folder: Path) -> dict[str, bool]:
+    """Ask for more documents than the pipe holds, and leave the second answer there until the file `go` is made."""
+    pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
+    reading = context.documents([pin] * 20, "motion")
+    next(reading)
+    return _wait(folder)
+
+
+class MakeParams(Request):
+    results: int
+
+
+def make(context: Context, params: MakeParams) -> dict[str, int]:
+    for number in range(params.results):
+        context.log(f"making {number}")
+        context.stage([StagedOutput(name=f"made-{number}", kind=Kind.CLIP, item_name="made", parts={"info": {}})])
+    return {"made": params.results}
+
+
 class TallyParams(Request):
     tasks: int
 
@@ -128,3 +148,4 @@ TALLY = KindDeclaration(
 )  # fmt: skip
 ADD = KindDeclaration("add", "Adds.", AddParams, "marey_test_kinds:add", 1, {})
 MISBEHAVE = KindDeclaration("misbehave", "Fails.", MisbehaveParams, "marey_test_kinds:misbehave", 1, {})
+MAKE = KindDeclaration("make", "Makes clips.", MakeParams, "marey_test_kinds:make", 1, {"clips": Kind.CLIP})
