@@ -135,6 +135,24 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
         raise CommandFailed(f"{len(findings)} faults were found and are listed above")
 
 
+def clock(*, set_now: bool = False, **settings: Any) -> None:
+    """Compare the clock that an SQLite database keeps with that of this machine; with `set_now`, set it to this one."""
+    from sqlalchemy.exc import OperationalError
+
+    from marey_server.store.clock_setting import alone, read_clock, set_clock
+
+    file = _sqlite_file(read_settings(**settings), must_exist=True)
+    try:
+        with alone(file) as connection:
+            state = read_clock(connection)
+            moved = set_clock(connection) if set_now else None
+    except OperationalError as error:
+        raise CommandFailed(f"{file} is in use or cannot be read ({error.orig}); stop the server first") from None
+    _say(str(state))
+    if moved is not None:
+        _say(f"the database now uses the time of this machine; {moved:,} times that were later were set back")
+
+
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
     """Create an administrator's token, and write it to `admin.token` in the data folder in place of a lost one."""
     from marey_server.access.principal import SYSTEM

@@ -141,6 +141,26 @@ def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as
     _database("fsck", data, database_url, as_json=as_json)
 
 
+@db.command("clock")
+def set_clock(
+    set_now: Annotated[
+        bool, typer.Option("--set", help="Set the clock of the database to that of this machine, even back.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the clock is set.")] = False,
+    data: DataFolder = None,
+) -> None:
+    """Compare the clock that an SQLite database keeps with that of this machine. The server must be stopped.
+
+    A database never goes back in time by itself. If a server has run with a clock that was wrong by years, its tokens
+    have expired and no lease ever ends: --set mends that. It moves every stored time that is later than now back to
+    now, ends all leases, and lets tokens and time limits that were made in that future keep their duration.
+    """
+    if set_now and not yes:
+        _database("clock", data, None)
+        typer.confirm("Set the clock of the database to the time of this machine?", abort=True)
+    _database("clock", data, None, set_now=set_now)
+
+
 @db.command("admin-token")
 def make_admin_token(
     user: Annotated[

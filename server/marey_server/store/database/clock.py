@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from datetime import UTC, datetime, timedelta
@@ -11,9 +12,21 @@ from sqlalchemy import Connection, insert, select, text, update
 
 from marey_server.store.tables import server_state
 
+FAR_AHEAD_DAYS = 366
+"""A clock that is further ahead of the stored mark is assumed to be wrong until somebody confirms it."""
+NOTABLY_AHEAD_S = 60
+"""A database that is further ahead of its machine is named in the log."""
+_DAY_US = 86400 * 1_000_000
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+log = logging.getLogger(__name__)
+
+
+class ClockFarAhead(Exception):
+    """The clock of this machine is far ahead of the time at which the database was last used."""
 
 
 class Clock(Protocol):
@@ -28,7 +41,8 @@ class DatabaseClock:
     """Clock of the database: on Postgres the time of the Postgres server, on SQLite a clock that never goes back.
 
     On SQLite it starts at the wall clock or the stored high-water mark, whichever is later, and is then advanced by the
-    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease.
+    monotonic clock, so that a jump of the wall clock neither extends nor ends a lease. A start with a clock that is far
+    ahead is refused, because the database would keep that time.
     """
 
     def __init__(self) -> None:
@@ -37,15 +51,32 @@ class DatabaseClock:
         self._start_monotonic_ns = 0
 
     def now_us(self, connection: Connection) -> int:
-        """Return the time in microseconds since the epoch."""
+        """Return the time in microseconds since the epoch. Raises `ClockFarAhead` at a start with an unlikely time."""
         if connection.dialect.name == "postgresql":
             now = text("SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint")
             return int(connection.execute(now).scalar_one())
         with self._lock:
             if self._start_us is None:
-                self._start_us = max(time.time_ns() // 1000, stored_high_water_us(connection))
+                stored_us, wall_us = stored_high_water_us(connection), wall_clock_us()
+                if stored_us and wall_us - stored_us > FAR_AHEAD_DAYS * _DAY_US:
+                    raise ClockFarAhead(
+                        f"the clock of this machine says {datetime_of(wall_us):%Y-%m-%d}, but the database was last "
+                        f"used on {datetime_of(stored_us):%Y-%m-%d}; mend the clock, or confirm it with "
+                        "`marey db clock --set`"
+                    )
+                if (ahead_s := (stored_us - wall_us) / 1e6) > NOTABLY_AHEAD_S:
+                    log.warning(
+                        "the database was last used %.0f s after the time of this machine and goes on from there; "
+                        "stop the server and see `marey db clock`", ahead_s,
+                    )  # fmt: skip
+                self._start_us = max(wall_us, stored_us)
                 self._start_monotonic_ns = time.monotonic_ns()
             return self._start_us + (time.monotonic_ns() - self._start_monotonic_ns) // 1000
+
+
+def wall_clock_us() -> int:
+    """Return the time of this machine in microseconds since the epoch."""
+    return time.time_ns() // 1000
 
 
 def stored_high_water_us(connection: Connection) -> int:
@@ -64,11 +95,15 @@ def save_high_water(connection: Connection, now_us: int) -> int:
     if now_us < stored:
         return stored
     ahead = now_us + _SAVE_EVERY_US
-    if stored == 0:
-        connection.execute(insert(server_state).values(key=_HIGH_WATER, value=ahead))
-    else:
-        connection.execute(update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=ahead))
+    set_high_water(connection, ahead)
     return ahead
+
+
+def set_high_water(connection: Connection, us: int) -> None:
+    """Store the latest time that processes may have used."""
+    changed = update(server_state).where(server_state.c.key == _HIGH_WATER).values(value=us)
+    if connection.execute(changed).rowcount == 0:
+        connection.execute(insert(server_state).values(key=_HIGH_WATER, value=us))
 
 
 def datetime_of(us: int) -> datetime:

@@ -10,6 +10,7 @@ from alembic.util import CommandError
 from sqlalchemy import exc, make_url
 
 from marey_server.errors import StorageFullProblem, UnavailableProblem
+from marey_server.store.database.clock import ClockFarAhead
 
 
 class DatabaseUnusable(Exception):
@@ -32,6 +33,8 @@ def opening(url: str) -> Iterator[None]:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be opened for writing: {error.detail}") from error
     except exc.DBAPIError as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be used: {_reason(error)}") from error
+    except ClockFarAhead as error:
+        raise DatabaseUnusable(str(error)) from None
     except CommandError as error:
         raise DatabaseUnusable(
             f"the tables of the database {_shown(url)} belong to another, perhaps newer, version of Marey: {error}"

@@ -1,0 +1,80 @@
+"""Setting of the clock that an SQLite database keeps, after a server ran while the clock of its machine was wrong.
+
+The database never goes back in time by itself. After a start with a clock that was years ahead, leases, tokens and ages
+would count from then on; here the mark is set to the time of this machine, and with it every time that is stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import sqlalchemy
+from sqlalchemy import Connection, NullPool, update
+
+from marey_server.store.database.clock import datetime_of, set_high_water, stored_high_water_us, wall_clock_us
+from marey_server.store.tables import job, metadata, token
+
+PAST = frozenset(
+    {
+        "at_us", "cancel_requested_us", "created_us", "deleted_us", "ended_us", "finished_us", "last_used_us",
+        "since_us", "started_us", "updated_us",
+    }
+)  # fmt: skip
+"""Columns of moments that have passed; none may lie in the future."""
+WAITING = frozenset({"expires_us", "lease_expires_us", "run_at_us"})
+"""Columns of moments to wait for: leases and leaders are renewed, and jobs may run, as soon as a server starts."""
+MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.started_us}
+"""Columns of moments that keep their distance from another column of the row if that one lies in the future."""
+
+
+@dataclass(frozen=True)
+class StoredClock:
+    """The latest time that a database has used, 0 if none, and the time of this machine; microseconds of the epoch."""
+
+    stored_us: int
+    wall_us: int
+
+    def __str__(self) -> str:
+        stored, wall = (f"{datetime_of(us):%Y-%m-%d %H:%M:%SZ}" for us in (self.stored_us, self.wall_us))
+        return f"the database was last used at {stored if self.stored_us else 'no time'}; this machine says {wall}"
+
+
+def read_clock(connection: Connection) -> StoredClock:
+    """Return the clock of a database."""
+    return StoredClock(stored_high_water_us(connection), wall_clock_us())
+
+
+@contextmanager
+def alone(file: Path) -> Iterator[Connection]:
+    """Connect to an SQLite file that no other process has open, in one transaction.
+
+    Raises `sqlalchemy.exc.OperationalError` if another process has it open.
+    """
+    engine = sqlalchemy.create_engine(f"sqlite:///{file}", poolclass=NullPool, connect_args={"timeout": 1.0})
+    with engine.connect() as connection:
+        connection.exec_driver_sql("PRAGMA locking_mode = EXCLUSIVE")  # also excludes those that only have it open
+        connection.exec_driver_sql("BEGIN EXCLUSIVE")
+        yield connection
+        connection.commit()
+
+
+def set_clock(connection: Connection) -> int:
+    """Set the stored mark to the time of this machine, and move later times back; return how many were moved.
+
+    Later moments of the past become now. Leases end now, so that running jobs go on if their workers report, and wait
+    for a worker again if not. Tokens and time limits that were made in the future keep their duration.
+    """
+    now_us = wall_clock_us()
+    moved = 0
+    for column, origin in MOVED.items():
+        later = update(column.table).where(origin > now_us, column.is_not(None))
+        moved += connection.execute(later.values({column: column - origin + now_us})).rowcount
+    for table in metadata.sorted_tables:
+        for column in table.columns:
+            if column.name in PAST | WAITING and column not in MOVED:
+                moved += connection.execute(update(table).where(column > now_us).values({column: now_us})).rowcount
+    set_high_water(connection, now_us)
+    return moved
