@@ -38,6 +38,7 @@ from marey_server.launchers.local import local_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
 from marey_server.process.computing import compute_on_one_thread_each, keep_freed_memory
 from marey_server.process.data_folder import BLOB_FOLDER, WORKER_CACHE, prepare_data_folder
+from marey_server.process.feed import following_feed
 from marey_server.process.housekeeping import keeping_house
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
@@ -141,7 +142,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
     host, port = sockets[0].getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     try:
-        async with keeping_house(app.services):
+        async with keeping_house(app.services), following_feed(app.services):
             yield Running(app, f"http://{shown}:{port}", server)
     finally:
         await _drain(app.services, server)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from marey_schemas.access import MemberChange, ProjectChange, ProjectCreate, Role, UserCreate, Visibility
-from marey_schemas.items import Item, ItemCreate
+from marey_schemas.items import Event, Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.store import items, members, projects, users
+from marey_server.store import events, items, members, projects, users
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
@@ -109,6 +109,12 @@ class Lab:
     ) -> Any:
         """Run a write as the owner or as `who`, by an operation that declares `required`."""
         return self.database.write(who or self.owner, requiring(required, function), *args, **kwargs)
+
+    def events(self, after: int = 0, **kwargs: Any) -> list[Event]:
+        """Return the events after the one numbered `after`."""
+        self.database.write(SYSTEM, events.number_events)
+        found: list[Event] = self.read(events.list_events, self.name, after=after, **kwargs)
+        return found
 
     def make_public(self) -> None:
         """Let everybody read the project."""

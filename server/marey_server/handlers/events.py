@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from pydantic import Field
 
 from marey_schemas.base import Request
@@ -13,10 +11,13 @@ from marey_server.http.declarations import Access, reads
 from marey_server.http.negotiation import EVENT_STREAM
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
-from marey_server.store import events
+from marey_server.store import events, projects
+from marey_server.store.wakeups import Listener, events_topic, wakeups
 
-POLL_S = 1.0
 KEEP_ALIVE_S = 15.0
+LOOK_AGAIN_EVERY = 4
+"""Number of keep-alive comments after which a follower reads the feed, in case a wake-up is lost."""
+
 WRITE_TIMEOUT_S = 30.0
 
 
@@ -45,13 +46,16 @@ class Events(Resource):
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
         """Return events in the order of their commits; as text/event-stream, also future events."""
         after = self._last_received(query)
-        found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
+        await self.services.number_events()
         if self.media is not EVENT_STREAM:
+            found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
             return Reply(Page(items=tuple(found)))
+        project_id = (await self.look_up(projects.require, project)).id
         self.set_header("Content-Type", "text/event-stream")
         self.set_header("Cache-Control", "no-store")
         if self.request.method != "HEAD":
-            await self._follow(project, after, found)
+            with wakeups.listen([events_topic(project_id)]) as listener:
+                await self._follow(project, after, listener)
         return None
 
     def _last_received(self, query: EventsQuery) -> int:
@@ -62,22 +66,23 @@ class Events(Resource):
             raise BadRequestProblem("Last-Event-ID must be the number of an event.", code="bad-event-id")
         return int(text)
 
-    async def _follow(self, project: str, after: int, found: list[Event]) -> None:
+    async def _follow(self, project: str, after: int, listener: Listener) -> None:
         """Send events as they occur, until the client disconnects or the server stops."""
         self.write(": follow\n\n")
-        sent_at = time.monotonic()
-        while True:
+        silences = 0
+        while self.is_awaited():
+            found = []
+            if silences % LOOK_AGAIN_EVERY == 0:
+                found = await self.look_up(events.list_events, project, after=after, limit=events.MAX_EVENTS)
             for event in found:
                 self.write(f"id: {event.seq}\nevent: {event.kind}\ndata: {event.model_dump_json()}\n\n")
                 after = event.seq
-            if not found and time.monotonic() - sent_at >= KEEP_ALIVE_S:
+            if silences and not found:
                 self.write(": still here\n\n")
             if self._write_buffer:
                 await self.flush_within(WRITE_TIMEOUT_S)
-                sent_at = time.monotonic()
-            if not found and await self.pause(POLL_S):
-                return
-            found = await self.look_up(events.list_events, project, after=after, limit=events.MAX_EVENTS)
+            woken = len(found) == events.MAX_EVENTS or await listener.wait(KEEP_ALIVE_S)
+            silences = 0 if woken else silences + 1
 
 
 RESOURCES: tuple[type[Resource], ...] = (Events,)

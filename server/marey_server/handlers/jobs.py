@@ -20,11 +20,11 @@ from marey_server.store import events
 from marey_server.store.jobs import reading, retrying, submission
 from marey_server.store.jobs.logs import MOST_READ_BYTES, LogPage
 from marey_server.store.jobs.reading import JobFilters
-from marey_server.store.wakeups import wakeups
+from marey_server.store.wakeups import job_topic, wakeups
 
 LONGEST_WAIT_S = 30.0
-LOOK_AGAIN_S = 2.0
-"""Interval in seconds at which a waiting request polls the job, which another process may have ended."""
+LOOK_AGAIN_S = 15.0
+"""Interval in seconds at which a waiting request polls the job, in case a wake-up is lost."""
 
 MAX_SUBMISSION_BYTES = 32 * MIB
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,4})(?:$|[,;\s])")
@@ -166,7 +166,7 @@ async def wait_for_end(resource: Resource, job_id: str, wait_s: float) -> Job:
     """Return the job when it has ended, the time is over, the client has disconnected, or the server is stopping."""
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
-    with wakeups.listen([f"job:{job_id}"]) as listener:
+    with wakeups.listen([job_topic(job_id)]) as listener:
         while True:
             job = await resource.look_up(reading.read_job, job_id)
             left_s = deadline - loop.time()
@@ -227,6 +227,7 @@ class JobEvents(Resource):
     @reads(access=Access.READER, query=JobEventsQuery, answer=Event, paged=True, public=False)
     async def get(self, job: str, query: JobEventsQuery) -> Rendered:
         """Return the events of a job in the order of their commits."""
+        await self.services.number_events()
         return await self.answer(reading.list_job_events, job, query.after, query.limit)
 
 

@@ -26,10 +26,10 @@ from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs import completion, logs, queue, reaper, staging
 from marey_server.store.jobs.staging import PreparedOutput
-from marey_server.store.wakeups import wakeups
+from marey_server.store.wakeups import wakeups, work_topic
 
-LOOK_FOR_WORK_S = 2.0
-"""Interval in seconds at which a waiting claim polls the queue: retries become due, other processes submit jobs."""
+LOOK_FOR_WORK_S = 15.0
+"""Interval in seconds at which a waiting claim polls the queue, in case a wake-up is lost."""
 
 MAX_STAGED_BYTES = 256 * MIB
 MAX_LOG_BYTES = MIB
@@ -46,7 +46,7 @@ class Leases(Resource):
         """Claim jobs; with `wait_s`, wait until there are some. A lease that is not renewed expires."""
         loop = asyncio.get_running_loop()
         deadline = loop.time() + body.wait_s
-        with wakeups.listen([f"work:{kind}" for kind in body.kinds]) as listener:
+        with wakeups.listen([work_topic(kind) for kind in body.kinds]) as listener:
             while True:
                 leases = await self.change(
                     reaper.claim_after_reaping, body, self.services.start_grace, self.services.queue_policy

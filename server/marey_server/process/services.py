@@ -21,7 +21,7 @@ from marey_server.motions.searching import size_bytes as searchable_bytes
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
-from marey_server.store import tokens
+from marey_server.store import events, tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
@@ -123,6 +123,12 @@ class Services:
         self._tokens_noted.put(token_id, now)
         with suppress(UnavailableProblem):  # too many writes wait: a later use is recorded
             self.database.submit_write(SYSTEM, tokens.note_use, token_id)
+
+    async def number_events(self) -> None:
+        """Make all events that are committed by now visible in the feed; SQLite does so by itself."""
+        numbered = 0 if self.database.is_sqlite else events.NUMBERED_AT_ONCE
+        while numbered == events.NUMBERED_AT_ONCE:
+            numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
     def close(self) -> None:
         """Wait for running transactions, then close everything."""

@@ -1,18 +1,35 @@
-"""Feed of events, in the order in which they became visible."""
+"""Feed of events, in the order in which their transactions became visible.
+
+SQLite has one writer, so that `event.seq`, given at the insertion, already follows the order of commits. On Postgres
+transactions overlap, so that events get their number after the commit, in `number_events`: whoever numbers holds a lock
+until its own commit, sees only committed events, and continues after the last number. So no event gets a lower number
+than one that was already listed, writers do not wait for each other, and the order depends on nothing but the tables.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Row, and_, or_, select, text
+from sqlalchemy import BigInteger, ColumnElement, Row, and_, cast, exists, func, select, text, update
 
 from marey_schemas.items import Event
 from marey_server.store import projects, users
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.tables import event, project
+from marey_server.store.jobs.fencing import QUEUED
+from marey_server.store.tables import event, job, project, server_state
 from marey_server.store.transaction import Transaction
+from marey_server.store.wakeups import events_topic, job_topic, work_topic
 
 MAX_EVENTS = 1000
+NUMBERED_AT_ONCE = 10_000
+"""Greatest number of events that get their numbers in one transaction."""
+
+CHANNEL = "marey_events"
+"""Channel of Postgres on which servers announce to each other that events got numbers."""
+
+_LAST_NUMBER = "last_event_number"
+_UNNUMBERED = event.c.number.is_(None)
 
 
 def list_events(
@@ -20,37 +37,119 @@ def list_events(
 ) -> list[Event]:
     """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
-    With `subject`, only events of that object are listed.
-
-    Numbers follow the order of the feed, but on Postgres they do not always ascend: continue after the last one
-    received. Events of a transaction are held back while an older transaction is running, so that no event is later
-    inserted before one that was already listed.
+    With `subject`, only events of that object are listed. On Postgres, call `number_events` before.
     """
-    statement = select(event, project.c.name.label("project")).outerjoin(project, project.c.id == event.c.project_id)
+    number = _number(tx)
+    statement = select(*_COLUMNS, number.label("number"), project.c.name.label("project")).select_from(
+        event.outerjoin(project, project.c.id == event.c.project_id)
+    )
     if project_name is None:
         users.require_administrator(tx.principal)
     else:
         statement = statement.where(event.c.project_id == projects.require(tx, project_name).id)
     if subject is not None:
         statement = statement.where(event.c.subject == subject)
-    statement = statement.where(_behind(tx, after))
-    if tx.is_postgres:
-        statement = statement.where(event.c.xid < text("pg_snapshot_xmin(pg_current_snapshot())::text::bigint"))
-    rows = tx.execute(statement.order_by(event.c.xid, event.c.seq).limit(min(limit, MAX_EVENTS)))
+    rows = tx.execute(statement.where(_follows(tx, after)).order_by(number).limit(min(limit, MAX_EVENTS)))
     return [_shown(row) for row in rows]
 
 
-def _behind(tx: Transaction, after: int) -> ColumnElement[bool]:
-    last = tx.execute(
-        select(event.c.xid, event.c.seq).where(event.c.seq <= after).order_by(event.c.seq.desc()).limit(1)
-    ).first()
-    if last is None:
-        return event.c.seq > 0
-    return or_(event.c.xid > last.xid, and_(event.c.xid == last.xid, event.c.seq > last.seq))
+_COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c.body)
+
+
+def _number(tx: Transaction) -> ColumnElement[int]:
+    return event.c.number if tx.is_postgres else event.c.seq
+
+
+def _follows(tx: Transaction, after: int) -> ColumnElement[bool]:
+    if tx.is_postgres:
+        return event.c.number > after
+    return and_(_UNNUMBERED, event.c.seq > after)  # the first condition makes the index of the feed usable
 
 
 def _shown(row: Row[Any]) -> Event:
     return Event(
-        seq=row.seq, at=datetime_of(row.at_us), project=row.project, kind=row.kind, subject=row.subject,
+        seq=row.number, at=datetime_of(row.at_us), project=row.project, kind=row.kind, subject=row.subject,
         actor=row.actor, body=row.body,
     )  # fmt: skip
+
+
+# -- numbers on Postgres -----------------------------------------------------------------------------------------------
+
+
+def number_events(tx: Transaction) -> int:
+    """Give numbers to the oldest committed events that have none, and return how many there were; 0 on SQLite.
+
+    Other transactions that number events wait until this one has committed.
+    """
+    if not tx.is_postgres or not tx.execute(select(exists().where(_UNNUMBERED))).scalar():
+        return 0
+    of_counter = server_state.c.key == _LAST_NUMBER
+    last = int(tx.execute(select(server_state.c.value).where(of_counter).with_for_update()).scalar_one())
+    oldest = (
+        select(event.c.seq, func.row_number().over(order_by=event.c.seq).label("place"))
+        .where(_UNNUMBERED)
+        .order_by(event.c.seq)
+        .limit(NUMBERED_AT_ONCE)
+        .subquery()
+    )
+    numbered = tx.execute(
+        update(event).where(event.c.seq == oldest.c.seq).values(number=cast(last + oldest.c.place, BigInteger))
+    ).rowcount
+    tx.execute(update(server_state).where(of_counter).values(value=last + numbered))
+    tx.execute(text(f"NOTIFY {CHANNEL}"))
+    return numbered
+
+
+# -- what a server announces -------------------------------------------------------------------------------------------
+
+
+class News(NamedTuple):
+    """Topics to announce, and the number of the last event that they result from."""
+
+    topics: frozenset[str]
+    last: int
+    complete: bool
+    """Whether there were no further events."""
+
+
+def newest_number(tx: Transaction) -> int:
+    """Return the number of the newest event in the feed, 0 if there is none."""
+    return int(tx.execute(select(func.max(_number(tx)))).scalar() or 0)
+
+
+def read_news(tx: Transaction, after: int) -> News:
+    """Return which waiting requests the events after the one numbered `after` concern."""
+    number = _number(tx)
+    rows = tx.execute(
+        select(number.label("number"), event.c.project_id, event.c.subject)
+        .add_columns(job.c.kind, job.c.state, job.c.run_at_us, job.c.finished_us, job.c.concurrency_key)
+        .select_from(event.outerjoin(job, job.c.id == event.c.subject))
+        .where(_follows(tx, after))
+        .order_by(number)
+        .limit(MAX_EVENTS)
+    ).all()
+    topics = {events_topic(row.project_id) for row in rows if row.project_id is not None}
+    topics |= {job_topic(row.subject) for row in rows if row.finished_us is not None}
+    topics |= {work_topic(row.kind) for row in rows if row.state == "queued" and row.run_at_us <= tx.now_us}
+    keys = {(row.project_id, row.concurrency_key) for row in rows if row.finished_us and row.concurrency_key}
+    topics |= {work_topic(kind) for kind in _waiting_for_key(tx, keys)}
+    return News(frozenset(topics), rows[-1].number if rows else after, len(rows) < MAX_EVENTS)
+
+
+def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[str]:
+    """Return the kinds of jobs that can run once a job with the same concurrency key has ended."""
+    return {
+        kind
+        for project_id, key in keys
+        for kind in tx.execute(
+            select(job.c.kind)
+            .where(job.c.state == QUEUED, job.c.project_id == project_id, job.c.concurrency_key == key)
+            .distinct()
+        ).scalars()
+    }
+
+
+def kinds_due(tx: Transaction, since_us: int) -> tuple[set[str], int]:
+    """Return the kinds of the queued jobs whose wait for a retry ended after `since_us`, and the present time."""
+    due = (job.c.state == QUEUED, job.c.run_at_us > since_us, job.c.run_at_us <= tx.now_us)
+    return set(tx.execute(select(job.c.kind).where(*due).distinct()).scalars()), tx.now_us

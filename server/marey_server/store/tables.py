@@ -381,14 +381,15 @@ event = Table(
     "event",
     metadata,
     Column("seq", Sequence64, primary_key=True, autoincrement=True),
-    Column("xid", BigInteger, nullable=False, default=0),  # Postgres transaction: readers order by (xid, seq)
+    Column("number", BigInteger),  # place in the feed, given after the commit; on SQLite that is `seq`
     Column("at_us", Micros, nullable=False),
     Column("project_id", ID),
     Column("kind", String(64), nullable=False),
     Column("subject", String(64), nullable=False, index=True),
     Column("actor", String(255)),
     Column("body", Document, nullable=False),
-    Index("ix_event_feed", "project_id", "xid", "seq"),
+    Index("uq_event_number", "number", unique=True),
+    Index("ix_event_feed", "project_id", "number", "seq"),
     sqlite_autoincrement=True,
 )
 

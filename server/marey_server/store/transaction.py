@@ -15,6 +15,7 @@ from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking
 from marey_server.store.database.clock import Clock
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups
 
 IN_LIST = 1000
 """Maximum number of list values in one statement; longer lists are split, because databases limit the parameters."""
@@ -23,9 +24,6 @@ Event = tuple[str, str | None, str, dict[str, Any]]
 """Kind of an event, project id, id of its subject, and body."""
 
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
-_INSERT_EVENT_WITH_XID = Prepared(
-    sqlalchemy.insert(tables.event).values(xid=sqlalchemy.text("pg_current_xact_id()::text::bigint"))
-)
 
 
 class Transaction:
@@ -42,6 +40,7 @@ class Transaction:
         self._clock = clock
         self._now_us: int | None = None
         self._after_commit: list[Callable[[], None]] = []
+        self._has_emitted = False
 
     @property
     def now_us(self) -> int:
@@ -105,13 +104,17 @@ class Transaction:
             {**common, "kind": kind, "project_id": project_id, "subject": subject, "body": body}
             for kind, project_id, subject, body in events
         ]
-        self.run_each(_INSERT_EVENT_WITH_XID if self.is_postgres else _INSERT_EVENT, rows)
+        if rows:
+            self.run_each(_INSERT_EVENT, rows)
+            self._has_emitted = True
 
     def after_commit(self, action: Callable[[], None]) -> None:
         """Run `action` after the transaction has committed, but not if it rolls back."""
         self._after_commit.append(action)
 
     def run_after_commit(self) -> None:
-        """Run the actions registered with `after_commit`."""
+        """Run the actions registered with `after_commit`, and announce that there are events."""
         for action in self._after_commit:
             action()
+        if self._has_emitted:
+            wakeups.announce([COMMITTED_EVENTS])

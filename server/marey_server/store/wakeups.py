@@ -1,6 +1,6 @@
 """Wake-ups for request handlers of this process that wait for an event, such as the end of a job.
 
-A wake-up is only a hint: the handler then reads the database. Changes by other processes are found by polling.
+A wake-up is only a hint: the handler then reads the database. `process.feed` announces what other processes changed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,24 @@ import asyncio
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+
+COMMITTED_EVENTS = "committed events"
+"""Topic that is announced whenever a transaction with events was committed, in this process or in another."""
+
+
+def events_topic(project_id: str) -> str:
+    """Return the topic of new events of a project."""
+    return f"events:{project_id}"
+
+
+def job_topic(job_id: str) -> str:
+    """Return the topic of the end of a job."""
+    return f"job:{job_id}"
+
+
+def work_topic(kind: str) -> str:
+    """Return the topic of jobs of a kind that can be claimed."""
+    return f"work:{kind}"
 
 
 class Wakeups:
@@ -75,4 +93,4 @@ class Listener:
 
 
 wakeups = Wakeups()
-"""Wake-ups of this process. `work:<kind>`: a job of the kind can be claimed; `job:<id>`: a job has ended."""
+"""Wake-ups of this process."""

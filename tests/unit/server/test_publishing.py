@@ -15,7 +15,7 @@ from tests.support.tiers import examples
 from marey_schemas.items import Staleness
 from marey_schemas.kinds import Kind
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import documents, events, items, projects
+from marey_server.store import documents, items, projects
 from marey_server.store.database import prepared
 from marey_server.store.items import Draft, StoredDocument, publishing, references
 from marey_server.store.items.drafts import Published
@@ -288,7 +288,7 @@ def test_who_still_uses_an_earlier_revision_of_such_an_item_is_stale(lab: Lab) -
 
 def test_the_event_of_a_revision_names_it_and_its_place(lab: Lab) -> None:
     (clip, _), _ = (publish(lab, clip_draft(seed=seed), rig_draft()) for seed in range(2))
-    told = [(one.kind, one.body) for one in lab.read(events.list_events, "lab", after=0) if one.subject == clip.item]
+    told = [(one.kind, one.body) for one in lab.events() if one.subject == clip.item]
     body = {"item_kind": "clip", "name": "walk", "collection": "raw", "job": None}
     assert told == [("item.created", {**body, "revision": 1}), ("item.revised", {**body, "revision": 2})]
 

@@ -15,7 +15,7 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -218,6 +218,23 @@ class Database:
             return self._write_lane.submit(client, principal, function, reserved=reserved)
         lane = self._reserved if reserved else self._ordinary
         return lane.submit(client, self.write, principal, function)
+
+    async def notifications(self, channel: str) -> AsyncIterator[None]:
+        """Yield after each notification of a channel of Postgres, and once before them, when it is listened to.
+
+        Raises `UnavailableProblem` if the connection, which is outside of the pool, breaks.
+        """
+        arguments, options = self.engine.dialect.create_connect_args(self.url)
+        driver = self.engine.dialect.loaded_dbapi
+        try:
+            connection = await driver.AsyncConnection.connect(*arguments, **options, autocommit=True)
+            async with connection:
+                await connection.execute(f"LISTEN {channel}")
+                yield
+                async for _ in connection.notifies():
+                    yield
+        except driver.Error as error:
+            raise _no_answer("The connection for notifications has ended.") from error
 
     def close(self) -> None:
         """Finish the running transactions, then close all connections."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from marey_server.store.transaction import Transaction
-from marey_server.store.wakeups import wakeups
+from marey_server.store.wakeups import job_topic, wakeups, work_topic
 
 EventOfJob = tuple[str, str, dict[str, Any]]
 """Project id, job id and body of an event."""
@@ -19,13 +19,13 @@ def emit_job_events(tx: Transaction, kind: str, events: Sequence[EventOfJob]) ->
 
 def wake_workers(tx: Transaction, kinds: Iterable[str]) -> None:
     """Wake requests that wait for work of these kinds, after the commit."""
-    topics = {f"work:{kind}" for kind in kinds}
+    topics = {work_topic(kind) for kind in kinds}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))
 
 
 def wake_watchers(tx: Transaction, job_ids: Iterable[str]) -> None:
     """Wake requests that wait for the end of these jobs, after the commit."""
-    topics = {f"job:{job_id}" for job_id in job_ids}
+    topics = {job_topic(job_id) for job_id in job_ids}
     if topics:
         tx.after_commit(lambda: wakeups.announce(topics))

@@ -1,0 +1,105 @@
+"""Wake-ups of waiting requests from the feed of events, which shows the changes of every server process.
+
+One task per process reads the feed after a commit, after a notification of Postgres, and at an interval in case one was
+lost. So requests that wait cost nothing while nothing happens, however many they are.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+from marey_schemas.backoff import Backoff
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import ApiProblem
+from marey_server.process.services import Services
+from marey_server.store import events
+from marey_server.store.database.lanes import SERVER
+from marey_server.store.transaction import Transaction
+from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups, work_topic
+
+T = TypeVar("T")
+
+LOOK_EVERY_S = 2.0
+"""Interval in seconds at which the feed is read without a reason: retries become due, and wake-ups may be lost."""
+
+PAUSE_S = 0.05
+"""Least time in seconds between two reads of the feed; under load, one read serves many commits."""
+
+RECONNECT = Backoff(first_s=0.5, longest_s=30.0)
+
+log = logging.getLogger(__name__)
+
+
+@asynccontextmanager
+async def following_feed(services: Services) -> AsyncIterator[None]:
+    """Announce to this process's waiting requests what any process changes, inside the block."""
+    tasks = [asyncio.create_task(_follow(services))]
+    if not services.database.is_sqlite:
+        tasks.append(asyncio.create_task(_listen(services)))
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _follow(services: Services) -> None:
+    """Read the feed again and again; a failure is logged, and the next reading continues where the last one ended."""
+    position = _FeedPosition(services)
+    with wakeups.listen([COMMITTED_EVENTS]) as listener:
+        while True:
+            try:
+                await position.announce_news()
+            except ApiProblem as error:
+                log.warning("the feed of events cannot be read: %s", error.detail)
+            except Exception:
+                log.exception("the feed of events cannot be read")
+            await asyncio.sleep(PAUSE_S)
+            await listener.wait(LOOK_EVERY_S)
+
+
+class _FeedPosition:
+    """Position of this process in the feed and in the times at which retries become due."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._last: int | None = None
+        self._due_until_us = 0
+
+    async def announce_news(self) -> None:
+        """Announce what the events since the last call concern, and kinds of which a retry has become due."""
+        await self._services.number_events()
+        if self._last is None:
+            self._last = await self._read(events.newest_number)
+        complete = False
+        while not complete:
+            news = await self._read(events.read_news, self._last)
+            wakeups.announce(news.topics)
+            self._last, complete = news.last, news.complete
+        kinds, self._due_until_us = await self._read(events.kinds_due, self._due_until_us)
+        wakeups.announce(map(work_topic, kinds))
+
+    async def _read(self, function: Callable[..., T], *args: Any) -> T:
+        def run(tx: Transaction) -> T:
+            return function(tx, *args)
+
+        return await asyncio.wrap_future(self._services.database.queue_read(SERVER, SYSTEM, run, reserved=True))
+
+
+async def _listen(services: Services) -> None:
+    """Announce commits of other processes, as Postgres notifies of them; reconnect if the connection breaks."""
+    failures = 0
+    while True:
+        try:
+            async for _ in services.database.notifications(events.CHANNEL):
+                failures = 0
+                wakeups.announce([COMMITTED_EVENTS])
+        except ApiProblem as error:
+            failures += 1
+            log.warning("no notifications from the database: %s", error.detail)
+        await asyncio.sleep(RECONNECT.delay_s(max(failures, 1)))
