@@ -25,14 +25,12 @@ PATIENCE_S = 240
 
 
 @dataclass
-class Server:
-    """A running server, and the people who use it."""
+class People:
+    """The people who use the server at an address, and their clients."""
 
     address: str
-    app: Application
     database: Database
-    stop: Any
-    _clients: dict[str | None, httpx.Client] = field(default_factory=dict)
+    _clients: dict[str | None, httpx.Client] = field(default_factory=dict, init=False)
 
     @property
     def api(self) -> str:
@@ -66,6 +64,17 @@ class Server:
     def close(self) -> None:
         for client in self._clients.values():
             client.close()
+
+
+@dataclass
+class Server(People):
+    """A running server in this process, and the people who use it."""
+
+    app: Application
+    stop: Any
+
+    def close(self) -> None:
+        super().close()
         self.stop()
 
 
@@ -91,7 +100,7 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
     thread.start()
     assert ready.wait(20), "the server did not start"
     assert started, "the server failed to start"
-    server = Server(started["address"], started["app"], database, started["stop"])
+    server = Server(started["address"], database, started["app"], started["stop"])
     try:
         yield server
     finally:

@@ -1,0 +1,188 @@
+"""A private project full of canaries, one token per kind of caller, and a right request for every route."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import update
+from tests.support.rest_server import People
+from tests.support.who_may import PEOPLE
+
+from marey_server.access.principal import SYSTEM
+from marey_server.handlers.catalogue import RESOURCES
+from marey_server.http.routes import Route, RouteTable
+from marey_server.store.tables import token
+
+CANARY = "canary-5e0f2b"
+ROUTES = tuple(RouteTable(None, RESOURCES))
+INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
+
+HIERARCHY = {"schema": "marey/skeleton@1", "joints": [{"name": CANARY, "parent": -1, "offset": [0, 1, 0]}]}
+MOTION = {
+    "schema": "marey/motion@1",
+    "frame_rate_hz": 30,
+    "joints": [CANARY],
+    "poses": {"dtype": "<f4", "shape": [1, 7], "data": [[0, 1, 0, 1, 0, 0, 0]]},
+}
+SECRET_BYTES = f"{CANARY} bytes".encode()
+SECRET_DIGEST = f"sha256:{hashlib.sha256(SECRET_BYTES).hexdigest()}"
+OTHER_BYTES = b"bytes of anybody"
+OTHER_DIGEST = f"sha256:{hashlib.sha256(OTHER_BYTES).hexdigest()}"
+MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\r\n\r\nno motion\r\n--b--\r\n"
+
+BODIES = {
+    "Login": {"name": "nobody", "password": "wrong wrong wrong"},
+    "TokenCreate": {"name": "t", "scopes": ["read"]},
+    "UserCreate": {"name": "new-user"},
+    "UserChange": {"display_name": "D"},
+    "ProjectCreate": {"name": "lab"},  # taken: 409 tells that the caller was let through
+    "ProjectChange": {"title": "T"},
+    "MemberChange": {"role": "reader"},
+    "CollectionCreate": {"path": CANARY},
+    "CollectionChange": {"path": "elsewhere"},
+    "ItemCreate": {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}},
+    "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
+    "ItemChange": {"name": "renamed"},
+    "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
+    "JobCreate": {"kind": "no-such-kind"},
+    "JobBatch": {"jobs": [{"kind": "no-such-kind"}]},
+    "PipelineCreate": {"steps": {"only": {"kind": "no-such-kind"}}},
+    "ClaimRequest": {"worker": "w", "kinds": ["no-such-kind"]},
+    "BatchCompleteRequest": {"completions": [{"job": "job_x", "fence": 1, "write_id": "12345678"}]},
+    "Heartbeat": {},
+    "StageRequest": {
+        "outputs": [{"name": "o", "kind": "skeleton", "item_name": "s", "parts": {"hierarchy": HIERARCHY}}]
+    },
+    "CompleteRequest": {"write_id": "12345678"},
+    "FailRequest": {"write_id": "12345678", "code": "x"},
+    "BlobsQuery": {"digests": [SECRET_DIGEST]},
+    "UploadCreate": {"length": 5},
+    "CoverageStreamCreate": {"frame_rate_hz": 60},
+    "CoverageFrames": {"offset": 0, "ends_take": True},
+    "AnnotationChange": {"commands": [{"command": "clear"}]},
+    "AnnotationImport": {"document": {"sections": [{"start_idx": 0, "end_idx": 0}]}},
+    "EditPreviewRequest": {"commands": [{"command": "trim", "start": 0, "stop": 1}]},
+    "SearchRequest": {"constraints": [{"type": "root_heading", "at": "end", "heading_deg": 0}]},
+}
+"""A body for every model that a route takes; a route with a new one fails here until it gets one."""
+
+
+_OTHER_THINGS = {
+    "/commands": {"kind": "annotations", "item": "{annotation}"},
+    "/walk-graph": {"kind": "evaluations", "item": "evaluation_of_nobody"},
+    "/samples": {"kind": "models", "item": "model_of_nobody"},
+    "/search": {"kind": "models", "item": "model_of_nobody"},
+    "{project}/restore": {"project": "gone"},
+}
+"""Variables of routes for other things than the clip, by a piece of their paths."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Request of a route with everything right but perhaps the caller."""
+
+    method: str
+    path: str
+    headers: Mapping[str, str]
+    content: bytes
+
+
+@dataclass
+class House:
+    """A private project full of canaries, one token per kind of caller, and what is in the project."""
+
+    people: People
+    tokens: dict[str, str | None]
+    variables: dict[str, str]
+
+    def plan(self, route: Route, **changed: str) -> Planned:
+        """Return the request of a route; `changed` are other values of the path's variables."""
+        operation, template = route.operation, route.template
+        variables = self.variables | changed
+        for piece, values in _OTHER_THINGS.items():
+            if piece in template:
+                variables |= {name: value.format(**self.variables) for name, value in values.items()}
+        if template.endswith("/{kind}") and operation.method == "POST":
+            variables["kind"] = "skeletons"
+        headers = {} if operation.precondition == "none" else {"If-Match": '"999999.json"'}
+        content = b""
+        if operation.body is not None:
+            name = operation.body.content.__name__
+            if name == "Bytes":
+                variables["digest"] = OTHER_DIGEST
+                content = OTHER_BYTES
+                headers |= {"Upload-Offset": "0", "Content-Type": "application/octet-stream"}
+            elif name == "Files":
+                content = MULTIPART
+                headers["Content-Type"] = "multipart/form-data; boundary=b"
+            else:
+                content = json.dumps(BODIES[name]).encode()
+                headers["Content-Type"] = "application/json"
+        query = "?format=original" if template.endswith("{item}/export") else ""
+        return Planned(operation.method, template.replace(":int", "").format(**variables) + query, headers, content)
+
+
+def build_house(people: People) -> House:
+    """Furnish a server: users, the project `lab`, its contents, and jobs of which one runs and one has ended."""
+    tokens = _tokens_of_users(people)
+    owner, contributor = people.client(tokens["owner"]), people.client(tokens["contributor"])
+    variables = _furnish(owner)
+    stream = contributor.post("/projects/lab/coverage-streams", json=BODIES["CoverageStreamCreate"])
+    clip = {"item": variables["item"]}
+    for cache in ("off", "refresh"):
+        job = contributor.post(
+            "/projects/lab/jobs", json={"kind": "export", "inputs": {"clips": [clip]}, "cache": cache}
+        )
+        assert job.status_code == 202, job.text
+    request = {"worker": "w", "kinds": ["export"], "max": 2}
+    running, ended = people.client(tokens["worker"]).post("/leases", json=request).json()["leases"]
+    tokens |= {"attempt": running["attempt_token"], "ended": ended["attempt_token"]}
+    end = f"/jobs/{ended['job']}/attempts/{ended['fence']}/fail"
+    assert people.client(tokens["ended"]).post(end, json={"write_id": "12345678", "code": "x"}).is_success
+    assert owner.post("/projects", json={"name": "gone"}).is_success
+    for name in ("reader", "contributor", "maintainer"):
+        assert owner.put(f"/projects/gone/members/{name}", json={"role": name}).is_success
+    variables |= {
+        "project": "lab", "kind": "clips", "part": "info", "revision": "1", "user": "reader", "job": running["job"],
+        "fence": str(running["fence"]), "digest": SECRET_DIGEST, "job_kind": "import", "figure": "offsets",
+        "stream": stream.json()["id"], "token": "token_of_nobody", "upload": "upload_of_nobody",
+    }  # fmt: skip
+    return House(people, tokens, variables)
+
+
+def _tokens_of_users(people: People) -> dict[str, str | None]:
+    users = [person for person in PEOPLE.values() if person.standing in ("user", "refused") and person.name != "owner"]
+    tokens: dict[str, str | None] = {"anonymous": None}
+    for person in users:
+        tokens[person.name] = people.make_user(person.name, administrator=person.administrator, scopes=person.scopes)
+    members = {person.name: person.role for person in users if person.role is not None and person.name != "invented"}
+    tokens["owner"] = people.make_project("lab", owner="owner", **members)
+    tokens["invented"] = INVENTED
+    administrator = people.client(tokens["administrator"])
+    assert administrator.delete("/users/disabled", headers={"If-Match": "*"}).is_success
+    prefix = tokens["expired"].split("_")[1]
+    end = update(token).where(token.c.prefix == prefix).values(expires_us=1)
+    people.database.write(SYSTEM, lambda tx: tx.execute(end))
+    return tokens
+
+
+def _furnish(owner: Any) -> dict[str, str]:
+    """Put a skeleton, a clip, a blob and an annotation into `lab`; return their names by the variables of paths."""
+    etag = owner.get("/projects/lab").headers["ETag"]
+    assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": etag}).is_success
+    assert owner.put(f"/blobs/{SECRET_DIGEST}", content=SECRET_BYTES).is_success
+    collection = owner.post("/projects/lab/collections", json={"path": CANARY}).json()["id"]
+    body = {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}}
+    skeleton = owner.post("/projects/lab/skeletons", json=body).json()["id"]
+    info = {"schema": "marey/clip-info@1", "comment": CANARY, "source": {"file": SECRET_DIGEST, "file_name": CANARY}}
+    motion = {**MOTION, "skeleton": {"item": skeleton, "revision": 1}}
+    made = owner.post("/projects/lab/clips", json={"name": CANARY, "parts": {"motion": motion, "info": info}})
+    assert made.status_code == 201, made.text
+    layer = {"schema": "marey/annotation@1", "clip": {"item": made.json()["id"], "revision": 1}, "layer": CANARY}
+    annotation = owner.post("/projects/lab/annotations", json={"name": CANARY, "parts": {"annotation": layer}})
+    assert annotation.status_code == 201, annotation.text
+    return {"collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"]}

@@ -1,0 +1,154 @@
+"""Model of who may do what: the kinds of callers, and how each operation answers each of them.
+
+It repeats the rules of the server on purpose, in a second form, so that tests can compare the two. The table of
+docs/explanation/threat-model.md is compared with it, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from marey_schemas.access import Role
+from marey_server.http.declarations import Access, Operation
+
+ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
+USER_SCOPES = ("read", "write", "jobs")
+ELSEWHERE = tuple(f"{scope}!project=elsewhere" for scope in USER_SCOPES)
+RANK = {role: rank for rank, role in enumerate(Role)}
+
+LET_THROUGH: frozenset[int] = frozenset()
+"""Verdict on callers who are not refused: the answer depends on the request alone."""
+SIGN_IN, FORBIDDEN, HIDDEN = frozenset({401}), frozenset({403}), frozenset({404})
+
+
+@dataclass(frozen=True)
+class Person:
+    """Kind of caller of the project `lab`.
+
+    `standing`: whether the credential is none, one that the server refuses, a user's, or that of an attempt in `lab`
+    that runs or has ended.
+    """
+
+    name: str
+    standing: Literal["none", "refused", "user", "attempt", "ended"]
+    role: Role | None = None
+    administrator: bool = False
+    scopes: tuple[str, ...] = USER_SCOPES
+
+    def has(self, scope: str | None) -> bool:
+        """Return whether the credential includes a scope, in some project at least."""
+        return scope is None or any(held.partition("!")[0] == scope for held in self.scopes)
+
+    def reaches(self, project: str) -> bool:
+        """Return whether a scope of the credential includes the project."""
+        return any(held.partition("!project=")[2] in ("", project) for held in self.scopes)
+
+    @property
+    def rank(self) -> int:
+        """The rank of the caller's role in `lab`, -1 without one."""
+        if not self.reaches("lab"):
+            return -1
+        role = Role.OWNER if self.administrator else self.role
+        return -1 if role is None else RANK[role]
+
+
+PEOPLE = {
+    person.name: person
+    for person in (
+        Person("anonymous", "none"),
+        Person("invented", "refused"),
+        Person("expired", "refused", Role.OWNER),
+        Person("disabled", "refused", Role.OWNER),
+        Person("stranger", "user"),
+        Person("bound", "user", Role.OWNER, scopes=ELSEWHERE),
+        Person("reader", "user", Role.READER),
+        Person("contributor", "user", Role.CONTRIBUTOR),
+        Person("maintainer", "user", Role.MAINTAINER),
+        Person("owner", "user", Role.OWNER),
+        Person("administrator", "user", administrator=True, scopes=ALL_SCOPES),
+        Person("worker", "user", administrator=True, scopes=("work",)),
+        Person("attempt", "attempt", scopes=("read",)),
+        Person("ended", "ended", scopes=()),
+    )
+}
+"""Every kind of caller. `bound`: an owner's token for another project. `worker`: a token that only claims jobs."""
+
+
+def verdict(person: Person, operation: Operation, *, public: bool = False) -> frozenset[int]:
+    """Return the statuses of a refusal of `person` by an operation on `lab`, or `LET_THROUGH`."""
+    access = operation.access
+    if access is Access.ANYONE:
+        return LET_THROUGH
+    if person.standing == "refused":
+        return SIGN_IN
+    if person.standing == "none":
+        return _of_guest(operation, public=public)
+    if person.standing in ("attempt", "ended"):
+        return _of_attempt(person, operation, public=public)
+    return _of_user(person, operation, public=public)
+
+
+def _of_guest(operation: Operation, *, public: bool) -> frozenset[int]:
+    if operation.access is not Access.READER or not operation.public:
+        return SIGN_IN
+    return LET_THROUGH if public else HIDDEN
+
+
+def _of_attempt(person: Person, operation: Operation, *, public: bool) -> frozenset[int]:
+    """An attempt reads its project and writes through its own operations only; an ended one reads like a guest."""
+    if operation.access in (Access.USER, Access.ADMINISTRATOR, Access.WORKER):
+        return FORBIDDEN
+    if operation.access in (Access.ATTEMPT, Access.SIGNED_IN):
+        return LET_THROUGH
+    if operation.access is Access.READER:
+        if person.standing == "attempt":
+            return LET_THROUGH
+        return (LET_THROUGH if operation.public else FORBIDDEN) if public else HIDDEN
+    return FORBIDDEN if person.standing == "attempt" or public else HIDDEN
+
+
+def _of_user(person: Person, operation: Operation, *, public: bool) -> frozenset[int]:
+    access = operation.access
+    if access is Access.ATTEMPT or not person.has(operation.scope):
+        return FORBIDDEN
+    if access is Access.ADMINISTRATOR:
+        return LET_THROUGH if person.administrator else FORBIDDEN
+    if access is Access.USER:
+        themselves = operation.method == "GET" and operation.etag  # the one user that a token always knows
+        return LET_THROUGH if themselves or operation.scope in (None, *person.scopes) else FORBIDDEN
+    if access.role is None:
+        return LET_THROUGH
+    if person.rank < 0:
+        return _of_outsider(operation, public=public)
+    return LET_THROUGH if person.rank >= RANK[access.role] else FORBIDDEN
+
+
+def _of_outsider(operation: Operation, *, public: bool) -> frozenset[int]:
+    if not public:
+        return HIDDEN
+    return LET_THROUGH if operation.access is Access.READER and operation.public else FORBIDDEN
+
+
+def table() -> str:
+    """Return the Markdown table of the page on threats: one line per kind of caller, one column per access."""
+    words = {LET_THROUGH: "yes", SIGN_IN: "401", FORBIDDEN: "403", HIDDEN: "404"}
+    columns = [access for access in Access if access is not Access.ANYONE]
+    lines = ["| caller | " + " | ".join(access.value for access in columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for person in PEOPLE.values():
+        cells = (words[verdict(person, _sample(access))] for access in columns)
+        lines.append(f"| {person.name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+_SCOPES = {Access.ADMINISTRATOR: "admin", Access.WORKER: "work", Access.ATTEMPT: None}
+
+
+def _sample(access: Access) -> Operation:
+    """Return an operation of an access that guests of public projects may perform, with the usual scope."""
+    usual = "read" if access in (Access.READER, Access.SIGNED_IN, Access.USER) else "write"
+    return Operation(
+        "GET", "", "", access, _SCOPES.get(access, usual), None, None, None, 200, paged=False, etag=False,
+        precondition="none", idempotency="nature", answer_types=(), also=(), public=True, headers=(), stream=False,
+        reserved=False,
+    )  # fmt: skip
