@@ -30,6 +30,12 @@ from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.processes.environment import clean_environment
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
+from marey_server.http.accepting import (
+    ADDRESS_SHARE,
+    Connections,
+    default_connections,
+    raise_descriptor_limit,
+)
 from marey_server.http.docs_page import render_page
 from marey_server.http.openapi import build_document
 from marey_server.http.resource import Resource
@@ -138,27 +144,43 @@ async def listening(app: Application) -> AsyncIterator[Running]:
         chunk_size=READ_CHUNK_BYTES,
         max_buffer_size=READ_BUFFER_BYTES,
     )
-    server.add_sockets(sockets)
+    connections = accept_connections(app, server, sockets)
     host, port = sockets[0].getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     try:
         async with keeping_house(app.services), following_feed(app.services):
             yield Running(app, f"http://{shown}:{port}", server)
     finally:
-        await _drain(app.services, server)
+        await _drain(app.services, server, connections)
 
 
-async def _drain(services: Services, server: HTTPServer) -> None:
+def accept_connections(app: Application, server: HTTPServer, sockets: list[socket.socket]) -> Connections:
+    """Begin to accept connections, as many as the settings allow."""
+    settings, in_flight = app.services.settings, app.services.in_flight
+    most = settings.max_connections or default_connections()
+    connections = Connections(
+        server,
+        most=most,
+        most_each=most if settings.trust_proxy else int(most * ADDRESS_SHARE),
+        write_timeout_s=settings.write_timeout_s,
+        busy=lambda: {request.stream for request in in_flight},
+    )
+    connections.accept_from(sockets)
+    return connections
+
+
+async def _drain(services: Services, server: HTTPServer, connections: Connections) -> None:
     services.draining.set()
     services.metrics.draining.set(1)
     wakeups.wake_everybody()
-    server.stop()
+    connections.stop()
     deadline = time.monotonic() + services.settings.drain_s
     while services.in_flight and time.monotonic() < deadline:
         await asyncio.sleep(0.02)
     if services.in_flight:
         log.warning("%d requests were cut off", len(services.in_flight))
     await server.close_all_connections()
+    connections.close()
     services.close()
 
 
@@ -187,6 +209,7 @@ async def serve(settings: Settings) -> None:
     for variable, meant in misspelt_variables(os.environ).items():
         log.warning("%s is no setting and changes nothing; is %s meant?", variable, meant)
     keep_freed_memory()
+    raise_descriptor_limit()
     compute_on_one_thread_each()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()

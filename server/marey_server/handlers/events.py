@@ -18,8 +18,6 @@ KEEP_ALIVE_S = 15.0
 LOOK_AGAIN_EVERY = 4
 """Number of keep-alive comments after which a follower reads the feed, in case a wake-up is lost."""
 
-WRITE_TIMEOUT_S = 30.0
-
 
 class EventsQuery(Request):
     """The position and number of events to read."""
@@ -80,7 +78,7 @@ class Events(Resource):
             if silences and not found:
                 self.write(": still here\n\n")
             if self._write_buffer:
-                await self.flush_within(WRITE_TIMEOUT_S)
+                await self.flush()
             woken = len(found) == events.MAX_EVENTS or await listener.wait(KEEP_ALIVE_S)
             silences = 0 if woken else silences + 1
 

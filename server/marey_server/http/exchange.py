@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import re
+from dataclasses import replace
 from http.client import responses
 from typing import Any, ClassVar
 
@@ -22,8 +22,10 @@ from marey_server.process.services import Services
 
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
-JOINED_BYTES = 256 * 1024
-"""Size of a body above which headers are sent first, because Tornado copies a body that it sends with them."""
+JOINED_BYTES = 64 * 1024
+"""Size of a body above which it is sent in pieces, each after the client took the one before."""
+PIECE_BYTES = 1024 * 1024
+"""Size of a piece of a body: the most that waits in a connection for its client."""
 _LENGTH = re.compile("[0-9]{1,4300}")
 """Pattern of a Content-Length; the number of digits is limited because `int` refuses very long ones."""
 _SECURITY_HEADERS = {
@@ -85,17 +87,15 @@ class Exchange(RequestHandler):
             self.set_header(name, value)
         if rendered.status not in (204, 304):
             self.set_header("Content-Length", str(len(rendered.body) if whole_bytes is None else whole_bytes))
-            if len(rendered.body) > JOINED_BYTES:
-                self.flush()
             self.write(rendered.body)
 
-    async def flush_within(self, seconds: float) -> None:
-        """Wait until the written data is sent; close the connection if the client does not take it in time."""
-        try:
-            await asyncio.wait_for(self.flush(), seconds)
-        except TimeoutError:
-            self.request.connection.close()  # type: ignore[union-attr]
-            raise StreamClosedError from None
+    async def send_in_pieces(self, rendered: Rendered) -> None:
+        """Send a long body in pieces, and wait until the client took it."""
+        self.send(replace(rendered, body=b""), whole_bytes=len(rendered.body))
+        for start in range(0, len(rendered.body), PIECE_BYTES):
+            await self.flush()
+            self.write(rendered.body[start : start + PIECE_BYTES])
+        await self.flush()
 
     async def refuse(self, error: ApiProblem) -> None:
         """Answer before the body is read, then discard the body; closing the connection could lose the answer."""
@@ -110,6 +110,11 @@ class Exchange(RequestHandler):
         """Return the error for a method that the resource does not declare."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
         return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
+
+    @property
+    def stream(self) -> object:
+        """The connection of the request, as `Connections` knows it."""
+        return self.request.connection.stream  # type: ignore[union-attr]
 
     def is_gone(self) -> bool:
         """Return whether the client has closed the connection."""

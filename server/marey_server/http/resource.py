@@ -23,7 +23,7 @@ import hashlib
 import re
 import time
 from collections.abc import Awaitable, Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
 
@@ -38,9 +38,10 @@ from marey_server.http import negotiation
 from marey_server.http.calls import Call, Caller, admission_of, admit, require_access, run_call, run_plain
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
-from marey_server.http.exchange import Exchange
+from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
+from marey_server.process.memory import Holding
 from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
 
@@ -141,7 +142,12 @@ class Resource(Exchange):
             self.services.database.queue_write(self.client, ANONYMOUS, function, reserved=reserved)
         )
 
-    @property
+    @cached_property
+    def holding(self) -> Holding:
+        """Memory that this request holds: its body and its answer."""
+        return Holding(self.services.memory, self.client, reserved=self.operation.reserved)
+
+    @cached_property
     def client(self) -> Client:
         """Client whose turn it is when this request is served: a known token, or an address."""
         token = self.caller.token
@@ -299,8 +305,11 @@ class Resource(Exchange):
             if body is not None and body.streamed:
                 await self.receive(chunk)
             else:
+                self.holding.grow(len(chunk))
                 self._received += chunk
         except ApiProblem as error:
+            self._received = bytearray()
+            self.holding.release()
             await self.refuse(error)
 
     async def perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
@@ -308,6 +317,12 @@ class Resource(Exchange):
         if self.refused:
             return
         self.performing = True
+        try:
+            await self._perform(method)
+        finally:
+            self.holding.release()
+
+    async def _perform(self, method: Callable[..., Awaitable[Reply | Rendered | None]]) -> None:
         arguments = self.path_variables
         if self.query is not None:
             arguments["query"] = self.query
@@ -317,8 +332,19 @@ class Resource(Exchange):
         outcome = await method(self, **arguments)
         if isinstance(outcome, Reply):
             outcome = render(outcome, self.answer_form, self.services.answers)
-        if outcome is not None:
+        if outcome is None:
+            return
+        if len(outcome.body) > JOINED_BYTES and self.request.method != "HEAD":
+            self.holding.grow(len(outcome.body))
+            await self.send_in_pieces(outcome)
+        else:
             self.send(outcome)
+
+    def on_connection_close(self) -> None:
+        """Release the received part of a body whose client has gone; a method that runs does so itself."""
+        super().on_connection_close()
+        if not self.performing and hasattr(self, "operation"):
+            self.holding.release()
 
     async def _read_body(self) -> Any:
         body = self.operation.body

@@ -20,8 +20,6 @@ from marey_server.store.transaction import Transaction
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 PIECE_BYTES = MIB
 IMMUTABLE = "private, max-age=31536000, immutable"
-WRITE_TIMEOUT_S = 60
-"""Time limit for a client to receive one piece; after it, the connection is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +125,7 @@ class BlobSender(Resource):
             return
         position = opened.start + len(first.body)
         while position < opened.stop:
-            await self.flush_within(WRITE_TIMEOUT_S)
+            await self.flush()
             stop = min(opened.stop, position + PIECE_BYTES)
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:

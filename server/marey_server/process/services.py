@@ -19,6 +19,7 @@ from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
 from marey_server.motions.searching import size_bytes as searchable_bytes
 from marey_server.process.computing import ComputeThreads
+from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
 from marey_server.process.settings import Settings
 from marey_server.store import events, tokens
@@ -95,6 +96,7 @@ class Services:
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
         self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
         self.compute_threads = ComputeThreads()
+        self.memory = RequestMemory(settings.request_memory_bytes)
         self._tries_by_name = TryLimit(settings.login_tries_per_minute)
         self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)

@@ -65,6 +65,22 @@ class Settings(BaseSettings):
     upload_timeout_s: float = Field(
         6 * 3600.0, gt=0, description="Greatest number of seconds to receive a streamed request body."
     )
+    write_timeout_s: float = Field(
+        60.0,
+        gt=0,
+        description="Seconds in which a client must take 64 KiB of an answer or its rest; then the server closes.",
+    )
+    max_connections: int | None = Field(
+        None,
+        ge=16,
+        description="Greatest number of open connections, three quarters of them from one address. Absent: 10000, or "
+        "as many as the limit on open files leaves room for.",
+    )
+    request_memory_bytes: int = Field(
+        512 * MIB,
+        ge=MIB,
+        description="Memory for bodies and long answers of all requests together, a quarter of it for strangers.",
+    )
     max_header_bytes: int = Field(
         64 * 1024, ge=4096, description="Greatest size of the request line and the headers, in bytes."
     )

@@ -1,0 +1,237 @@
+"""Accepted connections: bounded in number, in total and for each address, and closed if a client takes no bytes.
+
+When all places are taken, idle connections make room for new ones. Without file descriptors, new connections wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
+
+log = logging.getLogger(__name__)
+
+RESERVED_DESCRIPTORS = 256
+"""File descriptors that are kept for the database, files and child processes."""
+MOST_CONNECTIONS = 10_000
+ADDRESS_SHARE = 0.75
+"""Largest part of all connections that one address may have; a proxy that is trusted is no such address."""
+EVICTED_SHARE = 1 / 16
+"""Part of all connections that is closed at once, if so many are idle, when the last place is taken."""
+ACCEPTED_AT_ONCE = 128
+PAUSE_S = 0.5
+"""Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""
+LOG_EVERY_S = 60.0
+CHECKS_PER_TIMEOUT = 4
+LEAST_TAKEN_BYTES = 64 * 1024
+"""Least number of bytes that a client must take in each write timeout while more are waiting for it."""
+_EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+def raise_descriptor_limit() -> None:
+    """Raise this process's limit on open files to the greatest value that it may have."""
+    if sys.platform == "win32":
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard == resource.RLIM_INFINITY:
+        hard = max(soft, MOST_CONNECTIONS + RESERVED_DESCRIPTORS)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+
+
+def default_connections() -> int:
+    """Return the number of connections for which there are descriptors beside those that are reserved."""
+    if sys.platform == "win32":
+        return MOST_CONNECTIONS
+    import resource
+
+    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if soft == resource.RLIM_INFINITY:
+        return MOST_CONNECTIONS
+    return min(MOST_CONNECTIONS, max(soft - RESERVED_DESCRIPTORS, soft // 2))
+
+
+class _Connection(IOStream):
+    """Connection that notes how many bytes its client has taken since when."""
+
+    def __init__(
+        self, accepted: socket.socket, address: str, forget: Callable[[_Connection], None], server: HTTPServer
+    ) -> None:
+        super().__init__(accepted, max_buffer_size=server.max_buffer_size, read_chunk_size=server.read_chunk_size)
+        self.address = address
+        self.taken_bytes, self.since_s = 0, 0.0
+        self._forget = forget
+
+    def close_fd(self) -> None:
+        """Close the socket, and give its place to another connection."""
+        super().close_fd()
+        self._forget(self)
+
+    def write(self, data: bytes | memoryview) -> asyncio.Future[None]:
+        """Write bytes; from now on, the client must take some."""
+        if not self.writing():
+            self.start_count(time.monotonic())
+        return super().write(data)
+
+    def write_to_fd(self, data: memoryview) -> int:
+        """Pass bytes to the operating system, and count those that it took."""
+        taken = super().write_to_fd(data)
+        self.taken_bytes += taken
+        return taken
+
+    def start_count(self, now_s: float) -> None:
+        """Count the bytes that the client takes from now on."""
+        self.taken_bytes, self.since_s = 0, now_s
+
+
+class Connections:
+    """Connections of a server.
+
+    Parameters
+    ----------
+    server : server that handles the connections
+    most : greatest number of connections
+    most_each : greatest number of connections of one address
+    write_timeout_s : time in seconds in which a client must take `LEAST_TAKEN_BYTES`, or all that waits for it
+    busy : returns the streams on which a request is being answered; others are idle
+    """
+
+    def __init__(
+        self,
+        server: HTTPServer,
+        *,
+        most: int,
+        most_each: int,
+        write_timeout_s: float,
+        busy: Callable[[], Collection[object]],
+    ) -> None:
+        self._server = server
+        self._most = most
+        self._most_each = most_each
+        self._write_timeout_s = write_timeout_s
+        self._busy = busy
+        self._open: dict[_Connection, None] = {}  # in the order of their acceptance
+        self._by_address: Counter[str] = Counter()
+        self._listening: list[socket.socket] = []
+        self._logged_s: dict[str, float] = {}
+        self._check: asyncio.TimerHandle | None = None
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def accept_from(self, sockets: Iterable[socket.socket]) -> None:
+        """Accept connections from listening sockets until `stop`."""
+        self._listening = list(sockets)
+        for one in self._listening:
+            asyncio.get_running_loop().add_reader(one, self._accept, one)
+        self._check_later()
+
+    def stop(self) -> None:
+        """Close the listening sockets; connections stay open, and are still checked."""
+        listening, self._listening = self._listening, []
+        for one in listening:
+            asyncio.get_running_loop().remove_reader(one)
+            one.close()
+
+    def close(self) -> None:
+        """Stop checking connections."""
+        if self._check is not None:
+            self._check.cancel()
+
+    def _accept(self, listening: socket.socket) -> None:
+        for _ in range(ACCEPTED_AT_ONCE):
+            try:
+                accepted, address = listening.accept()
+            except BlockingIOError:
+                return
+            except ConnectionAbortedError:
+                continue
+            except OSError as error:
+                if error.errno not in _EXHAUSTED:
+                    raise
+                self._pause(listening, error)
+                return
+            self._begin(accepted, address)
+
+    def _begin(self, accepted: socket.socket, address: Any) -> None:
+        """Serve a connection, or close it if there is no room for it."""
+        host = str(address[0]) if isinstance(address, tuple) else ""
+        if self._by_address[host] >= self._most_each:
+            self._evict(host)
+        elif len(self._open) >= self._most:
+            self._evict(None)
+        if self._by_address[host] >= self._most_each or len(self._open) >= self._most:
+            accepted.close()
+            self._log("full", "no place for another connection: %d are open, %d of its address",
+                      len(self._open), self._by_address[host])  # fmt: skip
+            return
+        stream = _Connection(accepted, host, self._forget, self._server)
+        self._open[stream] = None
+        self._by_address[host] += 1
+        self._server.handle_stream(stream, address)
+
+    def _evict(self, host: str | None) -> None:
+        """Close the oldest idle connections of an address, or of the address that has the most."""
+        busy = self._busy()
+        idle = [one for one in self._open if one not in busy and not one.writing()]
+        if host is None and idle:
+            host = Counter(one.address for one in idle).most_common(1)[0][0]
+        own = [one for one in idle if one.address == host]
+        for one in own[: max(1, int(self._most * EVICTED_SHARE))]:
+            one.close()
+        if own:
+            self._log("evicted", "closed idle connections of %s to make room for others", host)
+
+    def _forget(self, one: _Connection) -> None:
+        del self._open[one]
+        self._by_address[one.address] -= 1
+        if not self._by_address[one.address]:
+            del self._by_address[one.address]
+
+    def _pause(self, listening: socket.socket, error: OSError) -> None:
+        """Accept nothing for a moment: a failed `accept` would be repeated at once, without end."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(listening)
+        loop.call_later(PAUSE_S, self._resume, listening)
+        self._log("exhausted", "no connection can be accepted: %s; raise the limit on open files (ulimit -n), "
+                  "or lower max_connections", error.strerror)  # fmt: skip
+        self._evict(None)
+
+    def _resume(self, listening: socket.socket) -> None:
+        if listening in self._listening:
+            asyncio.get_running_loop().add_reader(listening, self._accept, listening)
+
+    def _check_later(self) -> None:
+        delay_s = self._write_timeout_s / CHECKS_PER_TIMEOUT
+        self._check = asyncio.get_running_loop().call_later(delay_s, self._check_clients)
+
+    def _check_clients(self) -> None:
+        self._check_later()
+        self.close_slow(time.monotonic())
+
+    def close_slow(self, now_s: float) -> None:
+        """Close connections whose clients have not taken enough of what waits for them until `now_s`."""
+        for one in [one for one in self._open if one.writing() and now_s - one.since_s >= self._write_timeout_s]:
+            if one.taken_bytes < LEAST_TAKEN_BYTES:
+                self._log("slow", "closed a connection of %s, which took %d bytes in %.0f s",
+                          one.address, one.taken_bytes, now_s - one.since_s)  # fmt: skip
+                one.close()
+            else:
+                one.start_count(now_s)
+
+    def _log(self, kind: str, text: str, *args: object) -> None:
+        """Log a warning, at most one of each kind in `LOG_EVERY_S`."""
+        now_s = time.monotonic()
+        if now_s - self._logged_s.get(kind, -LOG_EVERY_S) >= LOG_EVERY_S:
+            self._logged_s[kind] = now_s
+            log.warning(text, *args)

@@ -1,0 +1,76 @@
+"""Memory that all requests together may hold: bodies while they are received and decoded, and answers until sent."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+
+from marey_server.errors import UnavailableProblem
+from marey_server.store.database.lanes import RETRY_AFTER_S, Client
+
+CLIENT_SHARE = 0.75
+"""Largest part of the memory that one client may hold."""
+STRANGERS_SHARE = 0.25
+"""Largest part of the memory that all strangers together may hold."""
+RESERVED_SHARE = 0.125
+"""Part of the memory that is added for reserved operations, such as heartbeats."""
+STRANGERS = "strangers"
+
+
+class RequestMemory:
+    """Count of the bytes that requests hold. It is thread-safe.
+
+    A request that is the only one to hold bytes may exceed the total; its own limits bound it.
+    """
+
+    def __init__(self, total_bytes: int) -> None:
+        self.total_bytes = total_bytes
+        self.held_bytes = 0
+        self._by_owner: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def take(self, owner: str, bytes_now: int, more: int, *, reserved: bool) -> None:
+        """Count `more` bytes of a request that holds `bytes_now`. Raises `UnavailableProblem` above a limit."""
+        with self._lock:
+            others = self.held_bytes > bytes_now
+            share = STRANGERS_SHARE if owner == STRANGERS else CLIENT_SHARE
+            exceeds_share = not reserved and self._by_owner[owner] + more > share * self.total_bytes
+            total = self.total_bytes * (1 + RESERVED_SHARE * reserved)
+            if others and (exceeds_share or self.held_bytes + more > total):
+                whose = "your requests use" if exceeds_share else "requests use"
+                raise UnavailableProblem(
+                    f"All memory that {whose} is taken; try again in a few seconds, with fewer requests at once.",
+                    code="memory",
+                    headers={"Retry-After": str(RETRY_AFTER_S)},
+                )
+            self.held_bytes += more
+            self._by_owner[owner] += more
+
+    def give_back(self, owner: str, held: int) -> None:
+        """Remove bytes of a request from the count."""
+        with self._lock:
+            self.held_bytes -= held
+            self._by_owner[owner] -= held
+            if not self._by_owner[owner]:
+                del self._by_owner[owner]
+
+
+class Holding:
+    """Bytes that one request holds, counted for its client."""
+
+    def __init__(self, memory: RequestMemory, client: Client, *, reserved: bool) -> None:
+        self._memory = memory
+        self._owner = client.key if client.known else STRANGERS
+        self._reserved = reserved
+        self._bytes = 0
+
+    def grow(self, more: int) -> None:
+        """Hold more bytes. Raises `UnavailableProblem` if requests or the client already hold too many."""
+        self._memory.take(self._owner, self._bytes, more, reserved=self._reserved)
+        self._bytes += more
+
+    def release(self) -> None:
+        """Hold nothing any more; may be called again."""
+        held, self._bytes = self._bytes, 0
+        if held:
+            self._memory.give_back(self._owner, held)

@@ -1,0 +1,78 @@
+"""Clients that do not take their answers: they hold a bounded amount of memory, for a bounded time."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.support.rest_server import PATIENCE_S, Server, running
+
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.store.database.connections import Database
+
+MIB = 2**20
+DOCUMENT_BYTES = 6 * MIB
+
+
+@contextmanager
+def reading(server: Server, path: str, token: str) -> Iterator[socket.socket]:
+    """Send a request, and read nothing of its answer."""
+    host, port = server.address.removeprefix("http://").split(":")
+    head = f"GET /api/v1{path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
+    with socket.socket() as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.settimeout(PATIENCE_S)
+        client.connect((host, int(port)))
+        client.sendall(f"{head}Accept: application/msgpack\r\n\r\n".encode())
+        yield client
+
+
+def add_long_document(server: Server, token: str) -> str:
+    """Add an item with a document of `DOCUMENT_BYTES`; return its path."""
+    array = np.random.default_rng(1).random(DOCUMENT_BYTES // 8)
+    body = encode_tree({"name": "s", "parts": {"study": {"schema": "marey/document@1", "x": array}}}, MSGPACK)
+    made = server.client(token).post("/projects/lab/studies", content=body, headers={"Content-Type": MSGPACK})
+    assert made.status_code == 201, made.text
+    return f"/projects/lab/studies/{made.json()['id']}/parts/study"
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_a_reader_that_takes_nothing_is_cut_off_and_holds_nothing_any_more(
+    database: Database, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING, "marey_server.http.accepting")
+    with running(database, tmp_path, write_timeout_s=0.2) as server:
+        token = server.make_project()
+        path, memory = add_long_document(server, token), server.app.services.memory
+        with reading(server, path, token) as client:
+            wait_until(lambda: any("closed a connection" in record.message for record in caplog.records))
+            wait_until(lambda: memory.held_bytes == 0)
+            received = sum(len(data) for data in iter(lambda: client.recv(MIB), b""))
+            assert received < DOCUMENT_BYTES
+        assert server.client(token).get("/me").status_code == 200
+
+
+def test_one_client_cannot_hold_all_memory_of_answers(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, request_memory_bytes=3 * DOCUMENT_BYTES) as server:
+        token, other = server.make_project(), server.make_user("rita")
+        path, memory = add_long_document(server, token), server.app.services.memory
+        with reading(server, path, token), reading(server, path, token):
+            wait_until(lambda: memory.held_bytes >= 2 * DOCUMENT_BYTES)
+            refused = server.client(token).get(path, headers={"Accept": MSGPACK})
+            assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+            assert int(refused.headers["Retry-After"]) > 0
+            assert server.client(other).get("/me").status_code == 200
+        wait_until(lambda: memory.held_bytes == 0)
+        assert server.client(token).get(path, headers={"Accept": MSGPACK}).status_code == 200
