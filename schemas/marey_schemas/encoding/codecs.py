@@ -15,6 +15,7 @@ import bson.errors
 import msgpack
 import numpy as np
 import orjson
+from bson.codec_options import CodecOptions
 from bson.raw_bson import RawBSONDocument
 from numpy.typing import NDArray
 
@@ -149,32 +150,65 @@ def _finite_array(value: NDArray[Any] | EncodedArray) -> NDArray[Any]:
     return require_finite(value.decode() if isinstance(value, EncodedArray) else little_endian(value))
 
 
+class _Count:
+    """Count of the objects and lists of a document while it is parsed, and of the members of its objects."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._lists_left = _most_lists(data)
+        self._members_left = MAX_VALUES
+        self.refusal: CodecError | None = None
+
+    def add(self, members: int = 0) -> None:
+        """Count an object or a list. Raises `CodecError` if there are too many."""
+        self._lists_left -= 1
+        self._members_left -= members
+        if self._lists_left < 0 or self._members_left < 0:
+            self.refusal = _too_many_lists(self._data) if self._lists_left < 0 else _too_many_values("")
+            raise self.refusal
+
+    def on_list(self, items: list[Any]) -> list[Any]:
+        """Count a list that was parsed, and return it."""
+        self.add()
+        return items
+
+    def on_object(self, pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
+        """Count an object that was parsed, and return it. Raises `ValueError` for a repeated key."""
+        self.add(len(pairs))
+        members = dict(pairs)
+        if len(members) != len(pairs):
+            repeated = Counter(key for key, _ in pairs).most_common(1)[0][0]
+            raise ValueError(f"the key {repeated!r} is repeated in one object")
+        return members
+
+
 def _parse_json(data: bytes) -> Any:
-    if data.count(b"[") + data.count(b"{") > _most_lists(data):
+    if data.count(b"[") + data.count(b"{") > _most_lists(data) < _count_brackets(data):
         raise _too_many_lists(data)
-    return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    return json.loads(data.decode("utf-8"), object_pairs_hook=_Count(data).on_object, parse_constant=_refuse_constant)
+
+
+def _count_brackets(data: bytes) -> int:
+    """Return the number of objects and lists in JSON: of opening brackets outside of strings."""
+    count, start, inside = 0, 0, False
+    while start < len(data):
+        piece = data[start : start + _PIECE_BYTES]
+        escaping = len(piece) - len(piece.rstrip(b"\\"))
+        piece += data[start + len(piece) : start + len(piece) + escaping % 2]  # an escape stays in one piece
+        start += len(piece)
+        plain = piece.replace(b"\\\\", b"  ").replace(b'\\"', b"  ")
+        signs = np.frombuffer(plain, np.uint8)
+        in_string = np.logical_xor.accumulate(signs == ord('"')) ^ inside
+        count += int(np.count_nonzero(((signs | 32) == ord("{")) & ~in_string))
+        inside = bool(in_string[-1])
+    return count
 
 
 def _parse_msgpack(data: bytes) -> Any:
-    left = _most_lists(data)
-
-    def count() -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise _too_many_lists(data)
-
-    def on_list(items: list[Any]) -> list[Any]:
-        count()
-        return items
-
-    def on_object(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-        count()
-        return _unique(pairs)
-
+    count = _Count(data)
     # The parser allocates what a header claims before it reads on, so claims are limited.
     return msgpack.unpackb(
-        data, object_pairs_hook=on_object, list_hook=on_list, max_array_len=MAX_LIST, max_map_len=MAX_LIST
+        data, object_pairs_hook=count.on_object, list_hook=count.on_list, max_array_len=MAX_LIST, max_map_len=MAX_LIST
     )
 
 
@@ -186,22 +220,37 @@ def _too_many_lists(data: bytes) -> CodecError:
     return CodecError("too-large", "", f"{len(data)} bytes may contain at most {_most_lists(data)} objects and lists")
 
 
+def _too_many_values(pointer: str) -> CodecError:
+    return CodecError("too-large", pointer, f"more than {MAX_VALUES} values; numbers can be sent as arrays")
+
+
 def _parse_bson(data: bytes) -> Any:
-    # Read lazily, object by object: an eager read would turn {"$ref", "$id"} into a database reference.
     if int.from_bytes(data[:4], "little", signed=True) != len(data):
         raise ValueError(f"the size in its header differs from the {len(data)} bytes that were given")
-    return RawBSONDocument(data)
+    if _REFERENCE_KEY in data:  # which would become a database reference, unless each object is read when it is used
+        if data.count(_BSON_OBJECT) > FREE_LISTS:
+            raise CodecError("too-large", "", f"with a key $ref, BSON may contain at most {FREE_LISTS} objects")
+        return RawBSONDocument(data)
+    count = _Count(data)
+
+    class Counted(dict[str, Any]):
+        """Object that is counted before its members are read."""
+
+        def __init__(self) -> None:
+            count.add()
+
+    try:
+        return bson.decode(data, CodecOptions(document_class=Counted))
+    except bson.errors.InvalidBSON as error:
+        if "recursion" in str(error):  # the decoder replaces other errors by its own, and keeps no cause
+            raise RecursionError from error
+        raise count.refusal or error from None
 
 
 _PARSERS: dict[str, Callable[[bytes], Any]] = {JSON: _parse_json, MSGPACK: _parse_msgpack, BSON: _parse_bson}
-
-
-def _unique(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        repeated = Counter(key for key, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"the key {repeated!r} is repeated in one object")
-    return members
+_PIECE_BYTES = 1 << 20
+_REFERENCE_KEY = b"$ref\0"
+_BSON_OBJECT = b"\x03"
 
 
 def _refuse_constant(name: str) -> NoReturn:
@@ -336,7 +385,7 @@ class _Walk:
             raise self._error("too-deep", f"nested deeper than {self._max_depth} levels")
         self._values_left -= values
         if self._values_left < 0:
-            raise self._error("too-large", f"more than {MAX_VALUES} values; numbers can be sent as arrays")
+            raise _too_many_values(self.pointer)
 
     def _error(self, code: str, detail: str) -> CodecError:
         return CodecError(code, self.pointer, detail)

@@ -16,10 +16,8 @@ from marey_schemas.encoding.codecs import (
     BSON,
     BSON_COPIES,
     FREE_ARRAY_BYTES,
-    FREE_LISTS,
     JSON,
     MAX_LIST,
-    MAX_VALUES,
     MEDIA_TYPES,
     MSGPACK,
     UNPACKING,
@@ -230,14 +228,51 @@ def test_an_error_reads_as_a_place_and_a_reason() -> None:
     assert codecs.CodecError("bad-syntax", "", "no").args == ("bad-syntax", "", "no")
 
 
-def test_a_document_of_any_size_may_contain_some_lists_and_a_large_one_more() -> None:
-    fits: list[Any] = [[]] * (FREE_LISTS - 1)
+def test_a_document_of_any_size_may_contain_some_lists_and_a_large_one_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codecs, "FREE_LISTS", 1000)
+    fits: list[Any] = [[]] * 999
+    long = [[0, 0, 0, 0, 0, 0]] * 1001
     for media_type in (JSON, MSGPACK):
         assert len(decode_tree(encode_tree(fits, media_type), media_type)) == len(fits)
         assert refusal(encode_tree([*fits, []], media_type), media_type).code == "too-large"
-    long = [[0, 0, 0, 0, 0, 0]] * (FREE_LISTS + 1)
-    for media_type in (JSON, MSGPACK):
         assert len(decode_tree(encode_tree(long, media_type), media_type)) == len(long)
+
+
+@pytest.mark.parametrize("media_type", [JSON, MSGPACK, BSON])
+def test_objects_are_counted_before_they_are_kept(media_type: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encode_tree({"a": [{}] * 1001}, media_type)
+    monkeypatch.setattr(codecs, "FREE_LISTS", 1000)
+    monkeypatch.setattr(codecs, "BYTES_PER_LIST", 100)
+    monkeypatch.setattr(codecs._Walk, "visit", lambda _walk, _value: pytest.fail("the document was kept"))
+    assert refusal(data, media_type).code == "too-large"
+
+
+@pytest.mark.parametrize("media_type", [JSON, MSGPACK])
+def test_members_are_counted_before_they_are_kept(media_type: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encode_tree({"a": [{"b": 1, "c": 2}] * 100}, media_type)
+    monkeypatch.setattr(codecs, "MAX_VALUES", 199)
+    monkeypatch.setattr(codecs._Walk, "visit", lambda _walk, _value: pytest.fail("the document was kept"))
+    assert refusal(data, media_type).code == "too-large"
+
+
+def test_bson_with_a_key_that_looks_like_a_reference_has_a_limit_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = {"$ref": "collection", "$id": 1, "a": [{}] * 20}
+    assert decode_tree(bson.encode(tree), BSON) == tree
+    monkeypatch.setattr(codecs, "FREE_LISTS", 10)
+    assert refusal(bson.encode(tree), BSON).code == "too-large"
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 5000, '\\"[' * 5000, "\\" * 5000 + "[" * 5000, "[" * 4999 + "\\", '"' + "[" * 5000 + '"']
+)
+@pytest.mark.parametrize("piece_bytes", [7, 8, 1 << 20])
+def test_brackets_in_strings_are_no_lists(text: str, piece_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codecs, "FREE_LISTS", 100)
+    monkeypatch.setattr(codecs, "BYTES_PER_LIST", 1000)
+    monkeypatch.setattr(codecs, "_PIECE_BYTES", piece_bytes)
+    tree = {"a": text, text: [1]}
+    assert decode_tree(encode_tree(tree, JSON), JSON) == tree
+    assert refusal(encode_tree({"a": text, "b": [[]] * 100}, JSON), JSON).code == "too-large"
 
 
 def test_an_array_of_many_short_rows_is_read_from_json_as_programs_write_it() -> None:
@@ -250,14 +285,15 @@ def test_a_list_may_have_its_greatest_length_inside_an_object() -> None:
     assert len(decode_tree(encode_tree({"a": [0] * MAX_LIST}, JSON), JSON)["a"]) == MAX_LIST
 
 
-def test_values_are_limited_beyond_the_length_of_each_list() -> None:
-    half = [0] * (MAX_VALUES // 2)
+def test_values_are_limited_beyond_the_length_of_each_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codecs, "MAX_VALUES", 2000)
+    half = [0] * 1000
     assert refusal(encode_tree([half, half], MSGPACK), MSGPACK).pointer == "/1"
     assert len(decode_tree(encode_tree([half, half[:-2]], MSGPACK), MSGPACK)) == 2
 
 
 def test_bson_whose_levels_would_be_copied_again_and_again_is_refused() -> None:
-    tree: dict[str, Any] = {"text": "x" * MAX_LIST}
+    tree: dict[str, Any] = {"$ref": "x" * MAX_LIST}  # objects with this key are read one by one
     for _ in range(BSON_COPIES - 2):
         tree = {"a": tree}
     data = bson.encode(tree)
