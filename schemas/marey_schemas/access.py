@@ -36,6 +36,14 @@ class Scope(StrEnum):
     ADMIN = "admin"
 
 
+class EndTokens(StrEnum):
+    """Tokens that end when a user is changed; the token of the request itself never does."""
+
+    NONE = "none"
+    SESSIONS = "sessions"
+    ALL = "all"
+
+
 DisplayName = Annotated[str, StringConstraints(min_length=1, max_length=255)]
 Password = Annotated[SecretStr, Field(min_length=10, max_length=1024)]
 ScopeText = Annotated[str, StringConstraints(pattern=rf"^(?:{'|'.join(Scope)})(?:!project=[a-z0-9_-]{{1,64}})?$")]
@@ -59,6 +67,11 @@ class UserChange(Request):
     current_password: SecretStr | None = None
     administrator: bool | None = None
     disabled: bool | None = None
+    end_tokens: EndTokens | None = Field(
+        None,
+        description="Tokens of the user to end: those of sign-ins (`sessions`) or `all`, but not the one of this "
+        "request. By default a new password ends the sessions.",
+    )
 
 
 class User(Answer):
@@ -81,6 +94,7 @@ class Me(Answer):
     job: str | None = Field(
         None, description="The id of the job whose attempt uses the token; null for tokens of users."
     )
+    expires_at: datetime | None = Field(None, description="The end of the token of this request; null if it has none.")
 
 
 class TokenCreate(Request):
@@ -106,7 +120,12 @@ class Token(Answer):
     scopes: tuple[str, ...]
     created_at: datetime
     expires_at: datetime | None
-    last_used_at: datetime | None = None
+    last_used_at: datetime | None = Field(None, description="The latest use, to the hour; null if it was never used.")
+    user: str | None = Field(None, description="The name of the user to whom the token belongs.")
+    session: bool = Field(False, description="Whether a sign-in created the token.")
+    created_by: str | None = Field(
+        None, description="The id of the token whose bearer created this one; null for sign-ins and for the server."
+    )
 
 
 class NewToken(Token):

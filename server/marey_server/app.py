@@ -101,7 +101,7 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
         "status": status,
         "duration_ms": round(duration_s * 1000, 2),
         "bytes_in": handler.received_bytes,
-        "remote": handler.request.remote_ip,
+        "remote": handler.client_address,
     }
 
 
@@ -136,7 +136,6 @@ async def listening(app: Application) -> AsyncIterator[Running]:
         raise CannotListen(f"cannot listen on {settings.host}, port {settings.port}: {error.strerror}") from error
     server = HTTPServer(
         app,
-        xheaders=settings.trust_proxy,
         idle_connection_timeout=settings.header_timeout_s,
         body_timeout=settings.body_timeout_s,
         max_header_size=settings.max_header_bytes,

@@ -1,10 +1,13 @@
-"""Roles in a project, and the role that an operation requires."""
+"""Roles in a project, the role that an operation requires, and the rights of administrators."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from marey_schemas.access import Role
+from marey_server.access import scopes
+from marey_server.access.principal import Principal
+from marey_server.errors import ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 
 _RANK = {role: rank for rank, role in enumerate(Role)}
 
@@ -29,3 +32,17 @@ class RequiredRole:
 
 STRICTEST = RequiredRole(Role.OWNER, "write", guests=False)
 """Role required by operations that declare none."""
+
+
+def is_administrator(principal: Principal) -> bool:
+    """Return whether the caller is an administrator and the credential has the scope for it."""
+    return principal.administrator and scopes.allows(principal.scopes, "admin")
+
+
+def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
+    """Raise `ForbiddenProblem` (or `hidden`) unless the caller is an administrator with the scope for it."""
+    if is_administrator(principal):
+        return
+    if principal.kind == "anonymous":
+        raise UnauthenticatedProblem("Sign in as an administrator.")
+    raise hidden or ForbiddenProblem("Only administrators may do this.", code="administrators-only")

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from functools import partial
+from pydantic import Field
 
 from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, UserChange, UserCreate
+from marey_schemas.base import Request
+from marey_schemas.names import UserName
 from marey_server.access import passwords
-from marey_server.access.principal import Principal
-from marey_server.errors import ForbiddenProblem
+from marey_server.access.roles import require_administrator
+from marey_server.errors import ForbiddenProblem, TooManyRequestsProblem
 from marey_server.http.declarations import KIB, Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store import tokens, users
+from marey_server.process.password_lanes import limited_address
+from marey_server.store import sign_ins, tokens, users
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.sign_ins import SignInTry
+from marey_server.store.tokens import TokenFilter
 from marey_server.store.transaction import Transaction
 
 MAX_LOGIN_BYTES = 4 * KIB
@@ -24,14 +30,21 @@ def read_me(tx: Transaction) -> Me:
     principal = tx.principal
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
-    return Me(user=users.find_user(tx, principal.user_name), scopes=principal.scopes)
+    expires_at = None if principal.expires_us is None else datetime_of(principal.expires_us)
+    return Me(user=users.find_user(tx, principal.user_name), scopes=principal.scopes, expires_at=expires_at)
 
 
-def sign_in(tx: Transaction, principal: Principal, request: Login) -> NewToken:
-    """Return a token for a user whose password was checked."""
-    tx.principal = principal
-    wanted = TokenCreate(name="sign-in", scopes=principal.scopes, expires_in_s=request.expires_in_s)
-    return tokens.create_token(tx, wanted)
+def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_s: int) -> NewToken:
+    """Return a session for a user whose password matched `verified_hash`. Raises `UnauthenticatedProblem`."""
+    tx.principal = users.authenticated(tx, attempt.name, verified_hash)
+    sign_ins.forgive(tx, attempt)
+    return tokens.create_session(tx, expires_in_s)
+
+
+def count_try(tx: Transaction, attempt: SignInTry) -> str | None:
+    """Count a try to sign in; return the hash that the password must match, or None if the user does not exist."""
+    sign_ins.count(tx, attempt)
+    return users.stored_hash(tx, attempt.name)
 
 
 def sign_out(tx: Transaction) -> None:
@@ -52,7 +65,38 @@ class MeResource(Resource):
         return await self.answer(read_me)
 
 
-class LoginResource(Resource):
+class PasswordResource(Resource):
+    """Resource that checks passwords."""
+
+    async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
+        """Count a try and check its password; return the stored hash that it matches, or None.
+
+        The check takes the same time for a user who does not exist. Raises `TooManyRequestsProblem` or
+        `UnavailableProblem`.
+        """
+        services = self.services
+        address = limited_address(self.client_address)
+        attempt = SignInTry(name, address, services.settings.login_tries_per_minute)
+        services.refused_tries.check(attempt)
+        known = await self.look_up(sign_ins.is_known, attempt)
+        lane = services.password_lane if known else services.stranger_lane
+        with lane.place(address):
+            try:
+                stored = await self.change(count_try, attempt)
+            except TooManyRequestsProblem as refusal:
+                services.refused_tries.note(attempt, refusal)
+                raise
+            matches = await lane.run(passwords.password_matches, password, stored)
+        return attempt, stored if matches else None
+
+    async def hash_password(self, password: str) -> str:
+        """Return the hash of a new password, for a caller who may set one."""
+        lane = self.services.password_lane
+        with lane.place(limited_address(self.client_address)):
+            return await lane.run(passwords.hash_password, password)
+
+
+class LoginResource(PasswordResource):
     """Sign-in."""
 
     path = "/login"
@@ -68,10 +112,10 @@ class LoginResource(Resource):
     )
     async def post(self, body: Login) -> Reply:
         """Sign in with name and password; the answer contains a new token, shown only once."""
-        self.services.limit_sign_in(body.name, self.request.remote_ip or "")
-        async with self.services.sign_in_places:
-            principal = await self.look_up(users.verify_password, body.name, body.password.get_secret_value())
-        made = await self.change(sign_in, principal, body)
+        attempt, verified_hash = await self.check_password(body.name, body.password.get_secret_value())
+        if verified_hash is None:
+            raise users.wrong_password()
+        made = await self.change(sign_in, attempt, verified_hash, body.expires_in_s)
         return Reply(made, headers={"Cache-Control": "no-store"})
 
 
@@ -87,16 +131,34 @@ class LogoutResource(Resource):
         return await self.answer(sign_out)
 
 
+class TokenQuery(PageQuery):
+    """Query of a list of tokens."""
+
+    user: UserName | None = Field(None, description="Tokens of this user; default: yours. For administrators.")
+    everybody: bool = Field(False, description="Tokens of all users. For administrators.")
+    prefix: str | None = Field(
+        None, max_length=16, description="The token with this prefix: the text between the two `_` of its secret."
+    )
+    ends_within_s: int | None = Field(None, ge=0, le=10 * 365 * 86400, description="Tokens that end within this time.")
+
+
+class RevokeQuery(Request):
+    """Query of the end of a token."""
+
+    with_created: bool = Field(False, description="Also revoke the tokens that were created with it.")
+
+
 class OwnTokens(Resource):
     """The caller's tokens."""
 
     path = "/tokens"
     tag = "Access"
 
-    @reads(access=Access.USER, query=PageQuery, answer=Token, paged=True)
-    async def get(self, query: PageQuery) -> Rendered:
-        """List your tokens, without their secrets."""
-        return await self.answer(tokens.list_tokens, cursor=query.cursor, limit=query.limit)
+    @reads(access=Access.USER, query=TokenQuery, answer=Token, paged=True)
+    async def get(self, query: TokenQuery) -> Rendered:
+        """List your tokens, without their secrets; administrators may list those of others."""
+        wanted = TokenFilter(query.user, query.everybody, query.prefix, query.ends_within_s)
+        return await self.answer(tokens.list_tokens, wanted, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.USER, body=TokenCreate, answer=NewToken, status=201)
     async def post(self, body: TokenCreate) -> Rendered:
@@ -113,13 +175,13 @@ class TokenResource(Resource):
     path = "/tokens/{token}"
     tag = "Access"
 
-    @writes(access=Access.USER)
-    async def delete(self, token: str) -> Rendered:
-        """Revoke a token; it stops working at once."""
-        return await self.answer(tokens.revoke_token, token)
+    @writes(access=Access.USER, query=RevokeQuery)
+    async def delete(self, token: str, query: RevokeQuery) -> Rendered:
+        """Revoke a token, for administrators of any user; it stops working at once."""
+        return await self.answer(tokens.revoke_token, token, with_created=query.with_created)
 
 
-class AllUsers(Resource):
+class AllUsers(PasswordResource):
     """All users."""
 
     path = "/users"
@@ -136,7 +198,7 @@ class AllUsers(Resource):
         password_hash = None
         if body.password is not None:
             await self.look_up(_require_administrator)
-            password_hash = await self._hash(body.password.get_secret_value())
+            password_hash = await self.hash_password(body.password.get_secret_value())
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/users/{made.name}"),
             users.create_user,
@@ -144,16 +206,12 @@ class AllUsers(Resource):
             password_hash=password_hash,
         )
 
-    async def _hash(self, password: str) -> str:
-        async with self.services.sign_in_places:
-            return await self.compute(passwords.hash_password, password)
-
 
 def _require_administrator(tx: Transaction) -> None:
-    users.require_administrator(tx.principal)
+    require_administrator(tx.principal)
 
 
-class UserResource(Resource):
+class UserResource(PasswordResource):
     """A user."""
 
     path = "/users/{user}"
@@ -171,8 +229,7 @@ class UserResource(Resource):
         if body.password is not None:
             await self.look_up(users.find_user, user)
             verified_hash = await self._verify(user, body)
-            async with self.services.sign_in_places:
-                password_hash = await self.compute(passwords.hash_password, body.password.get_secret_value())
+            password_hash = await self.hash_password(body.password.get_secret_value())
         return await self.answer(
             users.change_user,
             user,
@@ -189,12 +246,9 @@ class UserResource(Resource):
         """
         if body.current_password is None:
             return None
-        self.services.limit_sign_in(user, self.request.remote_ip or "")
-        stored = await self.look_up(users.stored_hash, user)
-        check = partial(passwords.password_matches, body.current_password.get_secret_value(), stored)
-        async with self.services.sign_in_places:
-            if not await self.compute(check):
-                raise ForbiddenProblem("The current password is wrong.", code="wrong-password")
+        _, stored = await self.check_password(user, body.current_password.get_secret_value())
+        if stored is None:
+            raise ForbiddenProblem("The current password is wrong.", code="wrong-password")
         return stored
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", precondition="required")

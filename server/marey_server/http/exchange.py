@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import logging
 import re
 from dataclasses import replace
@@ -61,6 +62,14 @@ class Exchange(RequestHandler):
         """The services of the process."""
         services: Services = self.application.services  # type: ignore[attr-defined]
         return services
+
+    @property
+    def client_address(self) -> str:
+        """The address of the client; behind a trusted proxy, the one that the proxy names."""
+        settings = self.services.settings
+        peer = self.request.remote_ip or ""
+        named = self.request.headers.get(settings.proxy_header) if settings.trust_proxy else None
+        return peer if named is None else forwarded_address(named, settings.proxy_hops) or peer
 
     # -- the body that comes ------------------------------------------------------------------------------------------
 
@@ -177,6 +186,15 @@ class Exchange(RequestHandler):
         self._gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
             self.services.in_flight.discard(self)
+
+
+def forwarded_address(header: str, hops: int) -> str | None:
+    """Return the address that the outermost of `hops` trusted proxies appended to a header, or None without one."""
+    entries = [entry.strip() for entry in header.split(",")]
+    try:
+        return str(ipaddress.ip_address(entries[-hops]))
+    except (IndexError, ValueError):
+        return None
 
 
 def render_problem(error: BaseException, request_id: str) -> Rendered:

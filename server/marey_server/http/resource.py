@@ -42,6 +42,7 @@ from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.process.memory import Holding
+from marey_server.process.password_lanes import limited_address
 from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
 
@@ -153,7 +154,7 @@ class Resource(Exchange):
         token = self.caller.token
         if token is not None and self.services.knows(token):
             return Client(hash_secret(token), is_gone=self.is_gone)
-        return Client(self.request.remote_ip or "", known=False, is_gone=self.is_gone)
+        return Client(limited_address(self.client_address), known=False, is_gone=self.is_gone)
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function` in a thread, away from the event loop, and return its result."""

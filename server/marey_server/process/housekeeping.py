@@ -1,4 +1,4 @@
-"""Housekeeping of the server: reclaims expired leases, serves waiting results, collects garbage.
+"""Housekeeping of the server: reclaims expired leases, serves waiting results, collects garbage, forgets sign-ins.
 
 Only the leading process does it, but concurrent housekeeping would be safe, because every statement repeats its
 conditions. Each chore is a task of its own, so that a failing chore does not affect the others.
@@ -16,7 +16,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
-from marey_server.store import leader
+from marey_server.store import leader, sign_ins
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.reaper import StartGrace
@@ -33,6 +33,7 @@ LEAD = "housekeeping"
 LEAD_TTL_US = 30_000_000
 LONGEST_TICK_S = 5.0
 GARBAGE_EVERY_S = 3600.0
+FORGET_TRIES_EVERY_S = 60.0
 FIRST_GARBAGE_S = 60.0
 """Delay of the first collection after the start; short, so that servers that run an hour a day collect, too."""
 
@@ -45,6 +46,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
     chores = (
         (tick_s, tick_s, _reap),
         (tick_s, tick_s, _share_results),
+        (FORGET_TRIES_EVERY_S, FORGET_TRIES_EVERY_S, _forget_tries),
         (FIRST_GARBAGE_S, GARBAGE_EVERY_S, _collect_garbage),
     )
     tasks = [asyncio.create_task(_repeat(services, holder, *chore)) for chore in chores]
@@ -122,6 +124,13 @@ async def _collect_garbage(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
         collected = await asyncio.wrap_future(services.compute_threads.submit(collect_garbage, services.database))
         log.info("collected garbage: %s", collected)
+
+
+async def _forget_tries(services: Services, holder: str) -> None:
+    """Delete limits of sign-ins that have ended; each try has three, and passwords are hashed one by one."""
+    if await _write(services, _leads, holder):
+        while await _write(services, sign_ins.forget_ended) == sign_ins.FORGOTTEN_AT_ONCE:
+            pass
 
 
 async def _write(

@@ -1,9 +1,8 @@
-"""State of one server process that every handler may use: database, threads, caches, limits on sign-in."""
+"""State of one server process that every handler may use: database, threads, caches."""
 
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable, Hashable
 from contextlib import suppress
@@ -13,7 +12,7 @@ from typing import Any
 from marey_schemas.lru import LruCache
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
+from marey_server.errors import UnavailableProblem
 from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
@@ -21,15 +20,13 @@ from marey_server.motions.searching import size_bytes as searchable_bytes
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
+from marey_server.process.password_lanes import PasswordLane, RefusedTries
 from marey_server.process.settings import Settings
 from marey_server.store import events, tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
 
-NAMES_REMEMBERED = 10_000
-SIGN_INS_AT_ONCE = 2
-"""Greatest number of passwords checked at once; each check needs 32 MiB and 0.1 s."""
 LARGEST_ANSWER_SHARE = 8
 """Largest part of the cache of answers that one body may take; larger bodies would displace all others."""
 ANSWER_ENTRY_BYTES = 512
@@ -38,29 +35,6 @@ MODEL_CACHE_BYTES = 64 << 20
 """Greatest size of the cache of parsed models; models with search trees have a cache of the same size."""
 TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
-
-
-class TryLimit:
-    """Limit of tries per minute and key (token bucket).
-
-    Only the latest `NAMES_REMEMBERED` keys are stored, so that guesses at many names do not fill the memory.
-    """
-
-    def __init__(self, per_minute: int, *, clock: Callable[[], float] = time.monotonic) -> None:
-        self._per_minute = per_minute
-        self._clock = clock
-        self._buckets: LruCache[str, tuple[float, float]] = LruCache(max_entries=NAMES_REMEMBERED)
-
-    def take(self, key: str) -> None:
-        """Count one try. Raises `TooManyRequestsProblem`, which says when the next try is allowed."""
-        now = self._clock()
-        left, since = self._buckets.get(key) or (float(self._per_minute), now)
-        left = min(float(self._per_minute), left + (now - since) * self._per_minute / 60)
-        if left < 1:
-            self._buckets.put(key, (left, now))
-            wait_s = math.ceil((1 - left) * 60 / self._per_minute)
-            raise TooManyRequestsProblem(f"Too many attempts; wait {wait_s} s.", headers={"Retry-After": str(wait_s)})
-        self._buckets.put(key, (left - 1, now))
 
 
 @dataclass(frozen=True)
@@ -94,20 +68,17 @@ class Services:
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
-        self.sign_in_places = asyncio.Semaphore(SIGN_INS_AT_ONCE)
+        self.password_lane = PasswordLane("known")
+        """For signed-in users, and sign-ins from addresses that the user has signed in from before."""
+        self.stranger_lane = PasswordLane("stranger")
+        """For all other sign-ins."""
+        self.refused_tries = RefusedTries()
         self.compute_threads = ComputeThreads()
         self.memory = RequestMemory(settings.request_memory_bytes)
-        self._tries_by_name = TryLimit(settings.login_tries_per_minute)
-        self._tries_by_address = TryLimit(10 * settings.login_tries_per_minute)
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
         self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
-
-    def limit_sign_in(self, name: str, address: str) -> None:
-        """Count one attempt to sign in. Raises `TooManyRequestsProblem`."""
-        self._tries_by_address.take(address)
-        self._tries_by_name.take(name)
 
     def knows(self, token: str) -> bool:
         """Return whether a request with this token was accepted before, so that its caller has lines of its own."""
@@ -135,4 +106,6 @@ class Services:
     def close(self) -> None:
         """Wait for running transactions, then close everything."""
         self.compute_threads.close()
+        self.password_lane.close()
+        self.stranger_lane.close()
         self.database.close()

@@ -45,7 +45,18 @@ class Settings(BaseSettings):
     answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory for a cache of encoded documents.")
     trust_proxy: bool = Field(
         False,
-        description="Trust X-Forwarded-For and X-Forwarded-Proto; only for servers behind a proxy that sets them.",
+        description="Take the addresses of clients from the header proxy_header; only for servers that nobody can "
+        "reach except through a proxy that sets it.",
+    )
+    proxy_header: Literal["X-Forwarded-For", "X-Real-IP"] = Field(
+        "X-Forwarded-For", description="Header in which the proxy names the client's address, if trust_proxy is set."
+    )
+    proxy_hops: int = Field(
+        1,
+        ge=1,
+        le=16,
+        description="Number of proxies that append an address to the header; earlier entries may be the client's "
+        "invention.",
     )
     log_form: Literal["json", "text"] = Field(
         "json", description="Format of the log: one JSON object per line, or text for people."
@@ -87,7 +98,9 @@ class Settings(BaseSettings):
     login_tries_per_minute: int = Field(
         10,
         ge=1,
-        description="Greatest number of sign-in attempts per minute for a user name; an address has ten times as many.",
+        description="Greatest number of wrong passwords per minute for a user name from one address (of IPv6, one "
+        "network of 64 bits). An address has ten times as many for all names, and so have all addresses together at "
+        "once for a name that has never signed in there.",
     )
     import_files_now: int = Field(
         64, ge=0, description="Greatest number of files in an import that runs at once; larger imports become a job."

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from sqlalchemy import BigInteger, ColumnElement, Row, and_, cast, exists, func, select, text, update
 
 from marey_schemas.items import Event
-from marey_server.store import projects, users
+from marey_server.access.roles import require_administrator
+from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.fencing import QUEUED
 from marey_server.store.tables import event, job, project, server_state
@@ -44,7 +45,7 @@ def list_events(
         event.outerjoin(project, project.c.id == event.c.project_id)
     )
     if project_name is None:
-        users.require_administrator(tx.principal)
+        require_administrator(tx.principal)
     else:
         statement = statement.where(event.c.project_id == projects.require(tx, project_name).id)
     if subject is not None:

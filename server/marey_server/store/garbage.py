@@ -1,4 +1,4 @@
-"""Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, and expired keys.
+"""Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, expired keys and tokens.
 
 A read finds the candidates. Each batch is then deleted in a transaction of its own that locks the rows and checks them
 again. A write that starts to refer to a document or blob renews its row first, so it either sees that the row is gone
@@ -32,6 +32,7 @@ from marey_server.store.tables import (
     staged_output,
     upload,
 )
+from marey_server.store.tokens import forget_ended
 from marey_server.store.transaction import Transaction
 
 BATCH = 200
@@ -49,6 +50,7 @@ class Collected:
     uploads: int
     keys: int
     coverage_streams: int = 0
+    tokens: int = 0
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
@@ -60,6 +62,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         uploads=database.write(SYSTEM, _drop_old_uploads),
         keys=database.write(SYSTEM, _drop_old_keys),
         coverage_streams=database.write(SYSTEM, drop_old_streams),
+        tokens=database.write(SYSTEM, forget_ended),
     )
 
 

@@ -68,6 +68,15 @@ token = Table(
     Column("created_us", Micros, nullable=False),
     Column("expires_us", Micros),
     Column("last_used_us", Micros),
+    Column("session", Boolean, nullable=False, default=False, server_default=false()),  # made by a sign-in
+    Column("created_by", ID),  # the token whose bearer created it
+)
+
+sign_in_limit = Table(
+    "sign_in_limit",
+    metadata,
+    Column("key", String(64), primary_key=True),  # hash of a limit's name, and of the account or address it is for
+    Column("until_us", Micros, nullable=False, index=True),  # from then on the row says nothing
 )
 
 project = Table(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
-from sqlalchemy import Row, bindparam, delete, insert, or_, select, update
+from sqlalchemy import ColumnElement, Row, and_, bindparam, delete, insert, or_, select, update
 
-from marey_schemas.access import NewToken, Token, TokenCreate
+from marey_schemas.access import EndTokens, NewToken, Token, TokenCreate
 from marey_schemas.items import Page
 from marey_schemas.jobs import JobState
+from marey_schemas.wording import counted
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
+from marey_server.access.roles import is_administrator, require_administrator
 from marey_server.access.secret_tokens import (
     attempt_secret,
     hash_secret,
@@ -30,6 +32,9 @@ from marey_server.store.transaction import Transaction
 NOTE_USE_EVERY_S = 3600
 """Precision of `last_used_at`; an update on every request would make every read a write."""
 
+KEPT_AFTER_END_US = 30 * 86400 * 1_000_000
+"""Time for which an expired token is listed, so that its owner can see why a program stopped."""
+
 _ATTEMPT_SCOPES = ("read",)
 
 # Every request runs one of these.
@@ -45,6 +50,18 @@ _ATTEMPT_TOKEN = Prepared(
     .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
     .where(attempt.c.token_hash == bindparam("hash"))
 )
+
+
+class TokenFilter(NamedTuple):
+    """Tokens to list: the caller's, or those of a user or of everybody; with a prefix; that end within a time."""
+
+    user: str | None = None
+    everybody: bool = False
+    prefix: str | None = None
+    ends_within_s: int | None = None
+
+
+OWN_TOKENS = TokenFilter()
 
 
 def resolve_token(tx: Transaction, text: str) -> Principal:
@@ -103,15 +120,27 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
         raise ForbiddenProblem(f"Your own credential lacks the scope {beyond[0]!r}.", code="insufficient-scope")
+    return _insert(tx, user_id, request, _end_of(tx, request), session=False)
+
+
+def create_session(tx: Transaction, expires_in_s: int) -> NewToken:
+    """Create the token of a sign-in for the transaction's principal, whose password was checked."""
+    request = TokenCreate(name="sign-in", scopes=tx.principal.scopes, expires_in_s=expires_in_s)
+    return _insert(tx, tx.principal.user_id, request, tx.now_us + expires_in_s * 1_000_000, session=True)
+
+
+def _insert(
+    tx: Transaction, user_id: str | None, request: TokenCreate, expires_us: int | None, *, session: bool
+) -> NewToken:
     issued = issue_user_token()
     row = {
         "id": new_id("token"), "user_id": user_id, "name": request.name, "prefix": issued.prefix,
         "secret_hash": issued.secret_hash, "scopes": list(request.scopes), "created_us": tx.now_us,
-        "expires_us": _end_of(tx, request),
+        "expires_us": expires_us, "session": session, "created_by": tx.principal.token_id,
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
     tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
-    return NewToken(**_shown(made).model_dump(), secret=issued.text)
+    return NewToken(**_shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
@@ -123,45 +152,104 @@ def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
     if "expires_in_s" in request.model_fields_set:
         left_s = (own_us - tx.now_us) // 1_000_000
         raise ForbiddenProblem(
-            f"Your own credential ends in {left_s} s, and a token cannot outlive the one that creates it; "
-            "ask for less, or sign in for a longer time.",
+            f"Your own credential ends on {datetime_of(own_us):%Y-%m-%d at %H:%M} UTC, in {_in_words(left_s)}, and a "
+            "token cannot outlive the one that creates it; ask for less, or sign in for a longer time.",
             code="outlives-credential",
-            context={"left_s": left_s},
+            context={"left_s": left_s, "latest": datetime_of(own_us).isoformat()},
         )
     return own_us
 
 
-def list_tokens(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """Return the caller's tokens, newest first, without their secrets."""
-    user_id = _require_user(tx.principal, "read")
+def _in_words(seconds: int) -> str:
+    """Return a time in the largest unit that it fills, rounded down: days, hours or minutes."""
+    unit, size = next(
+        (unit for unit in (("day", 86_400), ("hour", 3600)) if seconds >= unit[1]),
+        ("minute", 60),
+    )
+    return counted(seconds // size, unit)
+
+
+def list_tokens(
+    tx: Transaction, wanted: TokenFilter = OWN_TOKENS, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
+) -> Page:
+    """Return tokens, newest first, without their secrets: by default the caller's, for administrators anybody's.
+
+    Raises `ForbiddenProblem`, or `NotFoundProblem` for a user whom the caller may not see.
+    """
+    own_id = _require_user(tx.principal, "read")
+    conditions: list[ColumnElement[bool]] = []
+    if wanted.everybody:
+        require_administrator(tx.principal)
+    elif wanted.user is None or wanted.user == tx.principal.user_name:
+        conditions.append(token.c.user_id == own_id)
+    else:
+        conditions.append(token.c.user_id == _id_of(tx, wanted.user))
+    if wanted.prefix is not None:
+        conditions.append(token.c.prefix == wanted.prefix)
+    if wanted.ends_within_s is not None:
+        conditions.append(token.c.expires_us.between(tx.now_us, tx.now_us + wanted.ends_within_s * 1_000_000))
     order = listing.parse_order("-id", {"id": token.c.id})
-    statement = select(token).where(token.c.user_id == user_id)
-    rows, next_cursor = listing.read_page(tx, statement, order, ["tokens", user_id], cursor, limit)
-    return Page(items=tuple(_shown(row) for row in rows), next_cursor=next_cursor)
+    statement = select(token, user.c.name.label("user_name")).join(user, user.c.id == token.c.user_id)
+    identity = ["tokens", own_id, *map(str, wanted)]
+    rows, next_cursor = listing.read_page(tx, statement.where(*conditions), order, identity, cursor, limit)
+    return Page(items=tuple(_shown(row, row.user_name) for row in rows), next_cursor=next_cursor)
 
 
-def revoke_token(tx: Transaction, token_id: str) -> None:
+def _id_of(tx: Transaction, name: str) -> str:
+    """Return the id of a user, for administrators."""
+    unknown = NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
+    require_administrator(tx.principal, hidden=unknown)
+    found = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
+    if found is None:
+        raise unknown
+    return str(found)
+
+
+def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
-    A token may always revoke itself.
+    With `with_created`, also revoke the tokens that its bearer created, and those created with them. Otherwise these
+    count as created by the bearer of the token that created this one. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
         _require_user(principal, "write")
-    statement = delete(token).where(token.c.id == token_id)
-    if not (principal.administrator and scopes.allows(principal.scopes, "admin")):
-        statement = statement.where(token.c.user_id == principal.user_id)
-    if tx.execute(statement).rowcount == 0:
+    which = token.c.id == token_id
+    if not is_administrator(principal):
+        which = and_(which, token.c.user_id == principal.user_id)
+    found = tx.execute(select(token.c.created_by).where(which)).first()
+    if found is None:
         raise NotFoundProblem(f"You have no token {token_id!r}.", code="no-token")
-    tx.emit("token.revoked", token_id)
+    if with_created:
+        chain = select(token.c.id).where(which).cte("chain", recursive=True)
+        chain = chain.union(select(token.c.id).where(token.c.created_by == chain.c.id))
+        which = token.c.id.in_(select(chain.c.id))
+    else:
+        tx.execute(update(token).where(token.c.created_by == token_id).values(created_by=found.created_by))
+    _revoke(tx, which)
 
 
 def revoke_named(tx: Transaction, name: str) -> None:
     """Revoke the caller's tokens that have this name."""
-    user_id = _require_user(tx.principal, "write")
-    ended = tx.execute(delete(token).where(token.c.user_id == user_id, token.c.name == name).returning(token.c.id))
-    for token_id in ended.scalars().all():
+    _revoke(tx, and_(token.c.user_id == _require_user(tx.principal, "write"), token.c.name == name))
+
+
+def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
+    """Revoke tokens of a user, except the one of this request. The caller has checked the rights of the principal."""
+    if which is EndTokens.NONE:
+        return
+    others = and_(token.c.user_id == user_id, token.c.id != (tx.principal.token_id or ""))
+    _revoke(tx, others if which is EndTokens.ALL else and_(others, token.c.session.is_(True)))
+
+
+def _revoke(tx: Transaction, which: ColumnElement[bool]) -> None:
+    for token_id in tx.execute(delete(token).where(which).returning(token.c.id)).scalars().all():
         tx.emit("token.revoked", token_id)
+
+
+def forget_ended(tx: Transaction) -> int:
+    """Delete tokens that ended more than `KEPT_AFTER_END_US` ago; return their number."""
+    return tx.execute(delete(token).where(token.c.expires_us < tx.now_us - KEPT_AFTER_END_US)).rowcount
 
 
 def note_use(tx: Transaction, token_id: str) -> None:
@@ -181,9 +269,10 @@ def _require_user(principal: Principal, scope: str) -> str:
     return principal.user_id
 
 
-def _shown(row: Row[Any]) -> Token:
+def _shown(row: Row[Any], user_name: str | None) -> Token:
     return Token(
         id=row.id, name=row.name, prefix=row.prefix, scopes=tuple(row.scopes), created_at=datetime_of(row.created_us),
         expires_at=None if row.expires_us is None else datetime_of(row.expires_us),
         last_used_at=None if row.last_used_us is None else datetime_of(row.last_used_us),
+        user=user_name, session=row.session, created_by=row.created_by,
     )  # fmt: skip

@@ -80,8 +80,12 @@ class Transaction:
 
         Without `row`, the rows are given at execution.
         """
+        return self.insert_into(table, row).on_conflict_do_nothing()
+
+    def insert_into(self, table: Table, row: Mapping[str, Any] | None = None) -> postgresql.Insert | sqlite.Insert:
+        """Return an INSERT to which a clause ON CONFLICT can be added."""
         added = postgresql.insert(table) if self.is_postgres else sqlite.insert(table)
-        return (added if row is None else added.values(**row)).on_conflict_do_nothing()
+        return added if row is None else added.values(**row)
 
     def lock(self, name: str) -> None:
         """Acquire the lock `name` and hold it until the end of the write.

@@ -6,10 +6,11 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, insert, select
 
-from marey_schemas.access import Scope, User, UserChange, UserCreate
+from marey_schemas.access import EndTokens, Scope, User, UserChange, UserCreate
 from marey_schemas.items import Page
-from marey_server.access import passwords, scopes
+from marey_server.access import scopes
 from marey_server.access.principal import Principal
+from marey_server.access.roles import is_administrator, require_administrator
 from marey_server.errors import (
     ConflictProblem,
     ForbiddenProblem,
@@ -17,7 +18,7 @@ from marey_server.errors import (
     PreconditionFailedProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing
+from marey_server.store import listing, tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
@@ -80,19 +81,11 @@ def change_user(
 ) -> User:
     """Change a user: administrators may change all fields, users their own display name and password.
 
-    `password_hash` is the hash of `request.password`. `verified_hash` is the hash that `request.current_password` was
-    checked against (see `verify_password`); it must still be the user's when the change is written.
+    A new password ends the user's sessions, unless the request says which tokens end. `password_hash` is the hash of
+    `request.password`. `verified_hash` is the hash that `request.current_password` was checked against; it must still
+    be the user's when the change is written.
     """
-    itself = tx.principal.kind == "user" and tx.principal.user_name == name
-    administrates = is_administrator(tx.principal)
-    if not itself:
-        require_administrator(tx.principal, hidden=_no_user(name))
-    elif not scopes.allows(tx.principal.scopes, "write"):
-        raise ForbiddenProblem("This token may not change the user.", code="insufficient-scope")
-    if not administrates and (request.administrator is not None or request.disabled is not None):
-        raise ForbiddenProblem(
-            "Only administrators can make administrators and disable users.", code="administrators-only"
-        )
+    itself = _require_changes(tx.principal, name, request)
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
     if request.password is not None and itself:
         if verified_hash is None:
@@ -107,8 +100,24 @@ def change_user(
             raise
         raise PreconditionFailedProblem("The password was changed by another request.", code="wrong-password") from None
     _require_some_administrator(tx)
+    default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
+    tokens.end_tokens(tx, row.id, request.end_tokens or default)
     tx.emit("user.changed", row.id, name=name, fields=sorted(values))
     return _shown(row)
+
+
+def _require_changes(principal: Principal, name: str, request: UserChange) -> bool:
+    """Return whether users change themselves. Raises `ForbiddenProblem` if the principal may not make the changes."""
+    itself = principal.kind == "user" and principal.user_name == name
+    if not itself:
+        require_administrator(principal, hidden=_no_user(name))
+    elif not scopes.allows(principal.scopes, "write"):
+        raise ForbiddenProblem("This token may not change the user.", code="insufficient-scope")
+    if not is_administrator(principal) and (request.administrator is not None or request.disabled is not None):
+        raise ForbiddenProblem(
+            "Only administrators can make administrators and disable users.", code="administrators-only"
+        )
+    return itself
 
 
 def _values(request: UserChange, password_hash: str | None) -> dict[str, Any]:
@@ -145,15 +154,21 @@ def stored_hash(tx: Transaction, name: str) -> str | None:
     return found
 
 
-def verify_password(tx: Transaction, name: str, password: str) -> Principal:
-    """Return the user who signs in with this name and password. Takes 0.1 s whether or not the user exists.
+def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
+    """Return the principal of a user whose password matched `verified_hash`, which must still be the user's.
 
-    It only reads. Raises `UnauthenticatedProblem`.
+    Raises `UnauthenticatedProblem`.
     """
-    row = tx.execute(select(user).where(user.c.name == name, user.c.disabled.is_(False))).first()
-    if not passwords.password_matches(password, None if row is None else row.password_hash) or row is None:
-        raise UnauthenticatedProblem("The name or the password is wrong.", code="wrong-password")
+    statement = select(user).where(user.c.name == name, user.c.password_hash == verified_hash)
+    row = tx.execute(statement.where(user.c.disabled.is_(False))).first()
+    if row is None:
+        raise wrong_password()
     return _principal(row)
+
+
+def wrong_password() -> UnauthenticatedProblem:
+    """Return the error for a sign-in that fails, which does not say whether the user exists."""
+    return UnauthenticatedProblem("The name or the password is wrong.", code="wrong-password")
 
 
 def _principal(row: Row[Any]) -> Principal:
@@ -181,23 +196,6 @@ def administrator_principal(tx: Transaction, name: str | None = None) -> Princip
     if row is None:
         raise _no_user(name or FIRST_ADMINISTRATOR)
     return _principal(row)
-
-
-# -- rules ------------------------------------------------------------------------------------------------------------
-
-
-def is_administrator(principal: Principal) -> bool:
-    """Return whether the caller is an administrator and the credential has the scope for it."""
-    return principal.administrator and scopes.allows(principal.scopes, "admin")
-
-
-def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
-    """Raise `ForbiddenProblem` (or `hidden`) unless the caller is an administrator with the scope for it."""
-    if is_administrator(principal):
-        return
-    if principal.kind == "anonymous":
-        raise UnauthenticatedProblem("Sign in as an administrator.")
-    raise hidden or ForbiddenProblem("Only administrators may do this.", code="administrators-only")
 
 
 def _no_user(name: str) -> NotFoundProblem:

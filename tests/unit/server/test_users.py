@@ -23,7 +23,9 @@ from marey_server.errors import (
 )
 from marey_server.store import projects, tokens, users
 from marey_server.store.database.connections import Database
+from marey_server.store.garbage import collect_garbage
 from marey_server.store.tables import attempt, job
+from marey_server.store.tokens import TokenFilter
 from marey_server.store.transaction import Transaction
 
 
@@ -39,10 +41,28 @@ def chief(database: Database) -> Principal:
     return database.read(SYSTEM, users.administrator_principal)
 
 
+def test_a_password_that_was_changed_while_it_was_checked_signs_nobody_in(database: Database, chief: Principal) -> None:
+    sign_up(database, chief, "ann", "correct horse")
+    verified = database.read(ANONYMOUS, users.stored_hash, "ann")
+    new = passwords.hash_password("battery staple")
+    change = UserChange(password="battery staple")
+    database.write(chief, users.change_user, "ann", change, expected_rev=None, password_hash=new)
+    with pytest.raises(UnauthenticatedProblem):
+        database.read(ANONYMOUS, users.authenticated, "ann", verified)
+
+
 def sign_up(database: Database, chief: Principal, name: str, password: str | None = None) -> Principal:
     hashed = passwords.hash_password(password) if password else None
     made = database.write(chief, users.create_user, UserCreate(name=name), password_hash=hashed)
     return Principal("user", made.id, name, scopes=("read", "write", "jobs"))
+
+
+def check(database: Database, name: str, password: str) -> Principal:
+    """Sign in as a server does: the password is compared outside of transactions."""
+    stored = database.read(ANONYMOUS, users.stored_hash, name)
+    if not passwords.password_matches(password, stored):
+        raise users.wrong_password()
+    return database.read(ANONYMOUS, users.authenticated, name, stored)
 
 
 def test_the_first_administrator_is_made_once(database: Database, chief: Principal) -> None:
@@ -79,12 +99,12 @@ def test_users_see_themselves_and_nobody_else(database: Database, chief: Princip
 def test_signing_in_needs_the_password(database: Database, chief: Principal) -> None:
     sign_up(database, chief, "ann", "correct horse")
     sign_up(database, chief, "silent")
-    principal = database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
+    principal = check(database, "ann", "correct horse")
     assert (principal.user_name, principal.administrator) == ("ann", False)
     assert "admin" not in principal.scopes
     for name, password in (("ann", "wrong horse"), ("nobody", "correct horse"), ("silent", ""), ("admin", "")):
         with pytest.raises(UnauthenticatedProblem) as refused:
-            database.read(ANONYMOUS, users.verify_password, name, password)
+            check(database, name, password)
         assert refused.value.detail == "The name or the password is wrong."
 
 
@@ -96,7 +116,7 @@ def test_a_user_changes_the_password_with_the_current_one(database: Database, ch
         database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new)
     old = database.read(ann, users.stored_hash, "ann")
     database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
-    assert database.read(ANONYMOUS, users.verify_password, "ann", "battery staple").user_name == "ann"
+    assert check(database, "ann", "battery staple").user_name == "ann"
     with pytest.raises(PreconditionFailedProblem):
         database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
 
@@ -159,6 +179,134 @@ def test_a_token_makes_none_that_outlives_it(database: Database, chief: Principa
         make_token(database, leaked, expires_in_s=600)
 
 
+@pytest.mark.parametrize(
+    ("left_s", "words"), [(7.5 * 86_400, "7 days"), (1.5 * 86_400, "1 day"), (9000, "2 hours"), (3595, "59 minutes")]
+)
+def test_a_token_that_would_outlive_its_creator_is_refused_with_the_latest_date(
+    database: Database, chief: Principal, left_s: float, words: str
+) -> None:
+    held = make_token(database, chief, expires_in_s=int(left_s))
+    caller = database.read(ANONYMOUS, tokens.resolve_token, held.secret)
+    with pytest.raises(
+        ForbiddenProblem, match=f"ends on {held.expires_at:%Y-%m-%d at %H:%M} UTC, in {words}"
+    ) as refused:
+        make_token(database, caller, expires_in_s=None)
+    assert refused.value.context["latest"] == held.expires_at.isoformat()
+
+
+def test_a_chain_of_tokens_never_widens(database: Database, chief: Principal) -> None:
+    first = make_token(database, chief, scopes=("read", "write", "jobs!project=walk"), expires_in_s=3600)
+    held = first
+    for narrower in (("read", "write"), ("write",), ("write!project=run",)):
+        caller = database.read(ANONYMOUS, tokens.resolve_token, held.secret)
+        for wider in ("admin", "work", "jobs", "jobs!project=run", "admin!project=walk"):
+            with pytest.raises(ForbiddenProblem):
+                make_token(database, caller, scopes=(wider,))
+        held = make_token(database, caller, scopes=narrower)
+        assert held.created_by == caller.token_id
+        assert held.expires_at == first.expires_at
+
+
+def sign_in(database: Database, name: str, password: str) -> NewToken:
+    def start(tx: Transaction) -> NewToken:
+        tx.principal = check(database, name, password)
+        return tokens.create_session(tx, 3600)
+
+    return database.write(ANONYMOUS, start)
+
+
+def works(database: Database, *made: NewToken) -> list[bool]:
+    def one(secret: str) -> bool:
+        try:
+            return bool(database.read(ANONYMOUS, tokens.resolve_token, secret).user_id)
+        except UnauthenticatedProblem:
+            return False
+
+    return [one(token.secret) for token in made]
+
+
+@pytest.mark.parametrize(
+    ("end_tokens", "left"), [(None, [True, False, True]), ("none", [True] * 3), ("all", [True, False, False])]
+)
+def test_a_new_password_ends_other_sessions_and_all_tokens_if_asked(
+    database: Database, chief: Principal, end_tokens: str | None, left: list[bool]
+) -> None:
+    sign_up(database, chief, "ann", "correct horse")
+    here, elsewhere = (sign_in(database, "ann", "correct horse") for _ in range(2))
+    ann = database.read(ANONYMOUS, tokens.resolve_token, here.secret)
+    program = make_token(database, ann)
+    beside = make_token(database, chief)
+    given = {} if end_tokens is None else {"end_tokens": end_tokens}
+    change = UserChange(password="battery staple", current_password="correct horse", **given)
+    old, new = database.read(ann, users.stored_hash, "ann"), passwords.hash_password("battery staple")
+    database.write(ann, users.change_user, "ann", change, expected_rev=None, password_hash=new, verified_hash=old)
+    assert works(database, here, elsewhere, program) == left
+    assert works(database, beside) == [True]
+
+
+def test_a_password_set_by_an_administrator_ends_every_session(database: Database, chief: Principal) -> None:
+    sign_up(database, chief, "ann", "correct horse")
+    session = sign_in(database, "ann", "correct horse")
+    new = passwords.hash_password("battery staple")
+    change = UserChange(password="battery staple")
+    database.write(chief, users.change_user, "ann", change, expected_rev=None, password_hash=new)
+    assert works(database, session) == [False]
+
+
+def test_administrators_list_and_end_tokens_of_others(database: Database, chief: Principal) -> None:
+    ann, ben = sign_up(database, chief, "ann"), sign_up(database, chief, "ben")
+    made = make_token(database, ann, scopes=("read!project=walk",))
+    own = make_token(database, chief, expires_in_s=3600)
+    listed = database.read(chief, tokens.list_tokens, TokenFilter(user="ann")).items
+    assert [(one.id, one.user, one.scopes) for one in listed] == [(made.id, "ann", ("read!project=walk",))]
+    every = database.read(chief, tokens.list_tokens, TokenFilter(everybody=True)).items
+    assert {one.id for one in every} == {made.id, own.id}
+    found = database.read(
+        chief, tokens.list_tokens, TokenFilter(everybody=True, prefix=made.secret.split("_")[1])
+    ).items
+    assert [one.id for one in found] == [made.id]
+    soon = database.read(chief, tokens.list_tokens, TokenFilter(everybody=True, ends_within_s=7200)).items
+    assert [one.id for one in soon] == [own.id]
+    narrow = Principal("user", chief.user_id, "admin", administrator=True, scopes=("read", "write"))
+    for who in (ben, narrow):
+        with pytest.raises(NotFoundProblem):
+            database.read(who, tokens.list_tokens, TokenFilter(user="ann"))
+        with pytest.raises(ForbiddenProblem):
+            database.read(who, tokens.list_tokens, TokenFilter(everybody=True))
+        with pytest.raises(NotFoundProblem):
+            database.write(who, tokens.revoke_token, made.id)
+    with pytest.raises(NotFoundProblem):
+        database.read(chief, tokens.list_tokens, TokenFilter(user="nobody"))
+    database.write(chief, tokens.revoke_token, made.id)
+    assert works(database, made) == [False]
+
+
+def test_a_leaked_token_is_revoked_with_all_that_were_created_with_it(database: Database, chief: Principal) -> None:
+    def child(parent: NewToken) -> NewToken:
+        return make_token(database, database.read(ANONYMOUS, tokens.resolve_token, parent.secret))
+
+    leaked, beside = make_token(database, chief), make_token(database, chief)
+    first = child(leaked)
+    second = child(first)
+    third = child(second)
+    database.write(chief, tokens.revoke_token, second.id)  # as somebody would who hides where `third` comes from
+    assert works(database, leaked, first, third, beside) == [True, True, True, True]
+    database.write(chief, tokens.revoke_token, leaked.id, with_created=True)
+    assert works(database, leaked, first, third, beside) == [False, False, False, True]
+
+
+def test_expired_tokens_are_listed_for_a_month_and_then_deleted(
+    database: Database, chief: Principal, clock: AdjustableClock
+) -> None:
+    make_token(database, chief, expires_in_s=60)
+    lasting = make_token(database, chief, expires_in_s=None)
+    clock.advance(20 * 86400)
+    assert collect_garbage(database).tokens == 0
+    clock.advance(11 * 86400)
+    assert collect_garbage(database).tokens == 1
+    assert [one.id for one in database.read(chief, tokens.list_tokens).items] == [lasting.id]
+
+
 def test_tokens_of_a_disabled_user_are_worth_nothing(database: Database, chief: Principal) -> None:
     ann = sign_up(database, chief, "ann", "correct horse")
     made = make_token(database, ann)
@@ -166,7 +314,7 @@ def test_tokens_of_a_disabled_user_are_worth_nothing(database: Database, chief: 
     with pytest.raises(UnauthenticatedProblem):
         database.read(ANONYMOUS, tokens.resolve_token, made.secret)
     with pytest.raises(UnauthenticatedProblem):
-        database.read(ANONYMOUS, users.verify_password, "ann", "correct horse")
+        check(database, "ann", "correct horse")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,32 @@
+"""Limits on sign-ins that all servers share; sessions, and the creator of each token."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0006"
+down_revision = "0005"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    """Create the table, and mark the tokens that sign-ins created."""
+    op.create_table(
+        "sign_in_limit",
+        sa.Column("key", sa.String(64), nullable=False),
+        sa.Column("until_us", sa.BigInteger(), nullable=False),
+        sa.PrimaryKeyConstraint("key", name="pk_sign_in_limit"),
+    )
+    op.create_index("ix_sign_in_limit_until_us", "sign_in_limit", ["until_us"])
+    op.add_column("token", sa.Column("session", sa.Boolean(), nullable=False, server_default=sa.false()))
+    op.add_column("token", sa.Column("created_by", sa.String(40), nullable=True))
+    token = sa.table("token", sa.column("name"), sa.column("session", sa.Boolean()))
+    op.execute(token.update().where(token.c.name == "sign-in").values(session=True))
+
+
+def downgrade() -> None:
+    """Drop the columns and the table."""
+    op.drop_column("token", "created_by")
+    op.drop_column("token", "session")
+    op.drop_index("ix_sign_in_limit_until_us", "sign_in_limit")
+    op.drop_table("sign_in_limit")

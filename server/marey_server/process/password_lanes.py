@@ -1,0 +1,116 @@
+"""Threads that hash passwords, and the part of a client's address that limits of sign-ins count.
+
+A hash takes 0.1 s and 32 MiB, so few run at once, and none in the threads of the database or of other computations.
+Users at addresses from which they have signed in before have a lane of their own: sign-ins of strangers never delay
+them, and together never use more than one processor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import ParamSpec, TypeVar
+
+from marey_schemas.lru import LruCache
+from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
+from marey_server.store.sign_ins import LimitScope, SignInTry, too_many_sign_ins
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+PLACES = 16
+"""Greatest number of requests in a lane, the one whose password is being hashed included."""
+PLACES_PER_ADDRESS = 4
+"""Greatest number of requests from one address among them."""
+IPV6_NETWORK_BITS = 64
+"""Length of the prefix of an IPv6 address that a provider assigns to one customer, who uses all addresses below it."""
+REFUSALS_REMEMBERED = 10_000
+
+
+def limited_address(text: str) -> str:
+    """Return what limits count instead of an address: the address itself, but of IPv6 the network of 64 bits."""
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:  # a Unix socket has none
+        return text
+    if isinstance(address, ipaddress.IPv4Address):
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.ip_network((int(address), IPV6_NETWORK_BITS), strict=False))
+
+
+class PasswordLane:
+    """Thread that hashes passwords, and a bounded number of requests that use it."""
+
+    def __init__(self, name: str) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"marey-password-{name}")
+        self._places: Counter[str] = Counter()
+
+    @property
+    def taken(self) -> int:
+        """The number of requests in the lane."""
+        return self._places.total()
+
+    @contextmanager
+    def place(self, address: str) -> Iterator[None]:
+        """Take a place inside the block.
+
+        Raises `TooManyRequestsProblem` if the address has too many, `UnavailableProblem` if the lane is full.
+        """
+        if self._places[address] >= PLACES_PER_ADDRESS:
+            raise TooManyRequestsProblem(
+                f"This address may check {PLACES_PER_ADDRESS} passwords at once; wait for an answer first.",
+                code="too-many-sign-ins",
+                headers={"Retry-After": "1"},
+            )
+        if self.taken >= PLACES:
+            raise UnavailableProblem(
+                f"The server checks as many passwords at once as it may ({PLACES}); try again in 2 s.",
+                code="too-many-passwords",
+                headers={"Retry-After": "2"},
+            )
+        self._places[address] += 1
+        try:
+            yield
+        finally:
+            self._places[address] -= 1
+            self._places += Counter()  # drops addresses without a place
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run `function`, which hashes a password, in the thread of the lane."""
+        return await asyncio.wrap_future(self._thread.submit(function, *args, **kwargs))
+
+    def close(self) -> None:
+        """Start no more hashes."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+
+class RefusedTries:
+    """Refused sign-ins, remembered until they are allowed again, so that repeating them does not reach the database."""
+
+    def __init__(self, *, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._until: LruCache[tuple[str | None, str], tuple[float, LimitScope]] = LruCache(
+            max_entries=REFUSALS_REMEMBERED
+        )
+
+    def check(self, attempt: SignInTry) -> None:
+        """Raise `TooManyRequestsProblem` while the limits refuse a try like this one."""
+        for key in ((None, attempt.address), (attempt.name, attempt.address)):
+            until_s, limit = self._until.get(key) or (0.0, "address")
+            wait_s = math.ceil(until_s - self._clock())
+            if wait_s > 0:
+                raise too_many_sign_ins(limit, wait_s)
+
+    def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
+        """Remember that a limit refused a try."""
+        limit: LimitScope = refusal.context["limit"]
+        name = None if limit == "address" else attempt.name
+        self._until.put((name, attempt.address), (self._clock() + refusal.context["wait_s"], limit))
