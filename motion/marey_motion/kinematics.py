@@ -7,7 +7,8 @@ at +x, forward(theta) = (sin theta, cos theta) in (x, z), and a growing heading 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from marey_schemas.options.contacts import TOE_SPEED_M_S
 CONTACT_WINDOW_S = 0.1
 # A sideways axis shorter than this on the ground belongs to a body lying on its side and says nothing of its heading.
 SHORTEST_LATERAL_M = 1e-3
+_KEPT_CHAINS = 256
 
 
 def global_positions(clip: Clip, *, end_sites: bool = False) -> NDArray[np.float32]:
@@ -116,29 +118,50 @@ def forward_kinematics(
         raise MotionError(
             f"the poses have shape {poses.shape}; this skeleton needs (frames, {3 + 4 * joints})", where="poses"
         )
-    sites = skeleton.end_sites if end_sites else ()
-    parents, offsets = skeleton.parents, skeleton.offsets.astype(poses.dtype)
-    if sites:
-        parents = np.concatenate((parents, np.array([site.joint for site in sites], dtype=np.int32)))
-        offsets = np.concatenate((offsets, np.array([site.offset for site in sites], dtype=poses.dtype)))
-    points = len(parents)
-    slots = np.full(points, -1, dtype=np.int32)
-    slots[list(translated_joints)] = np.arange(len(translated_joints), dtype=np.int32)
+    table = _chain(skeleton, poses.dtype, end_sites)
+    points = len(table.parents)
+    slots = table.no_slots
+    if translated_joints:
+        slots = slots.copy()
+        slots[list(translated_joints)] = np.arange(len(translated_joints), dtype=np.int32)
     if translations is None:
         translations = np.empty((0, 0, 3), dtype=poses.dtype)
-    turned = np.zeros(joints, dtype=np.bool_)
-    turned[parents[1:]] = True  # a leaf's own rotation moves nothing
     out = np.empty((len(poses), 3 * points), dtype=poses.dtype)
     kinematics_kernels.positions(
         as_kernel_input(poses),
-        as_kernel_input(offsets),
-        as_kernel_input(parents),
+        table.offsets,
+        table.parents,
         as_kernel_input(translations),
         slots,
-        turned,
+        table.turned,
         out,
     )
     return out.reshape(len(poses), points, 3)
+
+
+class _Chain(NamedTuple):
+    """Arguments of the kernel that follow from a skeleton: P points, which are J joints and then end sites.
+
+    `no_slots` is -1 for each point, which means that no translation replaces its offset; `turned` says of each joint
+    whether its rotation moves another point, which that of a leaf does not.
+    """
+
+    offsets: AnyFloats
+    parents: NDArray[np.int32]
+    no_slots: NDArray[np.int32]
+    turned: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=_KEPT_CHAINS)
+def _chain(skeleton: Skeleton, dtype: np.dtype[np.floating[Any]], end_sites: bool) -> _Chain:
+    sites = skeleton.end_sites if end_sites else ()
+    parents, offsets = skeleton.parents, skeleton.offsets.astype(dtype)
+    if sites:
+        parents = np.concatenate((parents, np.array([site.joint for site in sites], dtype=np.int32)))
+        offsets = np.concatenate((offsets, np.array([site.offset for site in sites], dtype=dtype)))
+    turned = np.zeros(skeleton.joint_count, dtype=np.bool_)
+    turned[parents[1:]] = True
+    return _Chain(as_kernel_input(offsets), as_kernel_input(parents), np.full(len(parents), -1, dtype=np.int32), turned)
 
 
 def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:

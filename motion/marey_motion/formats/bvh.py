@@ -212,10 +212,11 @@ def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float6
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)
-    reach = np.linalg.norm(translations, axis=2).max(axis=0)
-    folded = (lengths > 0) & (reach < 0.1 * lengths)
-    if 2 * np.count_nonzero(folded) <= np.count_nonzero(lengths):
-        return
+    for frames in (translations[:1], translations):  # of most files, one frame shows that they hold positions
+        reach = np.linalg.norm(frames, axis=2).max(axis=0)
+        folded = (lengths > 0) & (reach < 0.1 * lengths)
+        if 2 * np.count_nonzero(folded) <= np.count_nonzero(lengths):
+            return
     translations += offsets
     source.warnings.append(
         CheckWarning(
@@ -231,6 +232,7 @@ def _drop_redundant_translations(source: SourceMotion, translations: NDArray[np.
     """Keep only joints whose positions differ from their OFFSET by more than the rounding of files."""
     offsets = source.offsets[list(source.translated_joints)]
     size = np.abs(source.offsets).max()
-    moving = (np.abs(translations - offsets) > _PRINTED_DIGITS * size).any(axis=(0, 2))
+    farthest = np.maximum(translations.max(axis=0) - offsets, offsets - translations.min(axis=0))
+    moving = (farthest > _PRINTED_DIGITS * size).any(axis=1)
     source.translated_joints = tuple(np.array(source.translated_joints)[moving].tolist())
     source.translations = np.ascontiguousarray(translations[:, moving]) if moving.any() else None

@@ -60,7 +60,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
     """
     _check_range(source, file)
     try:
-        anatomy = anatomy_of(source.skeleton)
+        anatomy = anatomy_of(source)
         found = infer_conversion(source, anatomy, file, options)
         axes = np.array(_TO_Y_UP[found.up_axis], np.float64)
         if found.handedness == "left":
@@ -135,13 +135,17 @@ def _converted_clip(source: SourceMotion, skeleton: Skeleton, axes: NDArray[np.f
 
 def _moved(vectors: NDArray[np.float64], axes: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
     """Convert vectors (..., 3) to other axes and to metres; exact if nothing changes."""
-    turned = vectors if np.array_equal(axes, np.eye(3)) else vectors @ axes.T
+    turned = vectors if _same_axes(axes) else vectors @ axes.T
     return turned if scale == 1.0 else turned * scale
+
+
+def _same_axes(axes: NDArray[np.float64]) -> bool:
+    return bool(axes.tolist() == _TO_Y_UP["y"])
 
 
 def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real]:
     """Convert rotations to other axes, exactly. A mirrored axis also reverses the direction of rotation."""
-    if np.array_equal(axes, np.eye(3)):
+    if _same_axes(axes):
         return rotations
     sense = np.rint(np.linalg.det(axes))
     result = np.empty_like(rotations)

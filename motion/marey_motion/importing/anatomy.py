@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -13,8 +12,9 @@ from marey_motion.clip import Clip
 from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.errors import MappingError
 from marey_motion.importing.landmarks import KEPT_SKELETONS, Landmarks, find_landmarks, path_length
+from marey_motion.importing.source import SourceMotion
 from marey_motion.rigs import JointMapping, guess_axes, map_joints, rest_pose_doubts
-from marey_motion.skeleton import Skeleton
+from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.lru import LruCache
 
 
@@ -81,29 +81,36 @@ def _mapping_part(anatomy: Anatomy, clip: Clip | None) -> dict[str, Any]:
     return document.model_dump(by_alias=True, exclude_none=True)
 
 
-_KNOWN: LruCache[bytes, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
+_SkeletonKey = tuple[tuple[str, ...] | bytes, ...]
+
+_KNOWN: LruCache[_SkeletonKey, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
 
 
-def anatomy_of(skeleton: Skeleton) -> Anatomy:
+def anatomy_of(skeleton: Skeleton | SourceMotion) -> Anatomy:
     """Return the anatomy of a skeleton; equal skeletons share a cached one.
 
     Parameters
     ----------
-    skeleton : Skeleton    J joints; skeletons are equal when every name and number is
+    skeleton : Skeleton or SourceMotion    J joints; skeletons are equal when every name and number is. The skeleton of
+        a motion in its file's unit is made only if no equal one is known.
 
     Returns
     -------
     Anatomy    shared by all equal skeletons
     """
-    return _KNOWN.get_or_make(_content_key(skeleton), lambda: Anatomy(skeleton))
+    if isinstance(skeleton, Skeleton):
+        return _KNOWN.get_or_make(_content_key(skeleton, skeleton.end_sites), lambda: Anatomy(skeleton))
+    return _KNOWN.get_or_make(_content_key(skeleton, ()), lambda: Anatomy(skeleton.skeleton))
 
 
-def _content_key(skeleton: Skeleton) -> bytes:
-    """Compute a digest of every name and number of a skeleton."""
-    digest = hashlib.sha256(repr((skeleton.joint_names, skeleton.display_names)).encode())
-    for array in (skeleton.parents, skeleton.offsets, skeleton.rest_rotations):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    for site in skeleton.end_sites:
-        digest.update(b"%d:" % site.joint)
-        digest.update(site.offset.tobytes())
-    return digest.digest()
+def _content_key(joints: Skeleton | SourceMotion, end_sites: tuple[EndSite, ...]) -> _SkeletonKey:
+    """List every name and number of a skeleton."""
+    names = tuple(joints.joint_names)
+    return (
+        names,
+        tuple(joints.display_names) or names,
+        np.asarray(joints.parents, np.int32).tobytes(),
+        np.asarray(joints.offsets, np.float64).tobytes(),
+        np.asarray(joints.rest_rotations, np.float64).tobytes(),
+        *(b"%d:%b" % (site.joint, site.offset.tobytes()) for site in end_sites),
+    )

@@ -7,6 +7,7 @@ user is asked.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -76,7 +77,7 @@ class Conversion:
 class _Measurements:
     """Measures of the file's body, in its own unit and axes.
 
-    `positions` (F, J, 3) of sampled frames and `rest` (J, 3); `leg` is None without two feet.
+    `positions` (J, F, 3) of the joints in sampled frames and `rest` (J, 3); `leg` is None without two feet.
     """
 
     file: str
@@ -128,7 +129,8 @@ def _measure(source: SourceMotion, anatomy: Anatomy, file: str) -> _Measurements
             translations=translations,
             translated_joints=source.translated_joints,
         )
-    return _Measurements(file, landmarks, positions.astype(np.float64, copy=False), rest, anatomy.leg)
+    of_joints = np.ascontiguousarray(positions.transpose(1, 0, 2), np.float64)
+    return _Measurements(file, landmarks, of_joints, rest, anatomy.leg)
 
 
 # Up axis
@@ -153,7 +155,7 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
         return flat[0]
     if standing[0] == "y" and standing[1] >= _CLEAR_COSINE:
         body.evidence.append(
-            f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {len(body.positions)} frames"
+            f"up axis y: head above feet, mean cosine {standing[1]:.2f} over {body.positions.shape[1]} frames"
         )
         return "y"
     return _settle_up_axis(body, *standing, flat)
@@ -161,7 +163,7 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
     """Choose the upward axis if the body is not upright along y: it may lie or climb, or the axis is another one."""
-    rest_axis, rest_cosine = _body_axis(body.rest[None], body.landmarks)
+    rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
     if rest_cosine > 0.0:
         resting = f"rest pose points along {rest_axis} with cosine {rest_cosine:.2f}"
@@ -200,11 +202,12 @@ def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[Up
     The cosine is 0 if legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
     """
     assert landmarks.feet is not None
-    feet = positions[:, list(landmarks.feet)].mean(axis=1)
+    feet = _mean_point(positions, landmarks.feet)
     if landmarks.head is None:
-        mean, folded = _mean_direction(positions[:, landmarks.hips] - feet), False
+        assert landmarks.hips is not None
+        mean, folded = _mean_direction(positions[landmarks.hips] - feet), False
     else:
-        head, hips = positions[:, landmarks.head], positions[:, landmarks.hips]
+        head, hips = positions[landmarks.head], positions[landmarks.hips]
         mean = _mean_direction(head - feet)
         folded = float(_mean_direction(head - hips) @ _mean_direction(hips - feet)) < _FOLDED_COSINE
     axis = int(np.argmax(np.abs(mean)))
@@ -213,20 +216,44 @@ def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[Up
 
 def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute the mean direction (3,) of vectors (F, 3); those of length zero are ignored."""
-    lengths = np.linalg.norm(ways, axis=1)
-    mean: NDArray[np.float64] = (ways[lengths > 0] / lengths[lengths > 0, None]).sum(axis=0) / len(ways)
+    lengths = _lengths(ways)
+    count, moving = len(ways), lengths > 0
+    if not moving.all():
+        ways, lengths = ways[moving], lengths[moving]
+    mean: NDArray[np.float64] = np.add.reduce(ways / lengths[:, None], axis=0) / count
     return mean
+
+
+# Below, numpy's ufuncs give the same bits as its `mean`, `std` and `norm`, which take longer than 64 poses do.
+
+
+def _mean_point(positions: NDArray[np.float64], joints: Sequence[int]) -> NDArray[np.float64]:
+    """Compute the mean positions (F, 3) of some joints of (J, F, 3)."""
+    mean: NDArray[np.float64] = np.add.reduce(positions.take(joints, axis=0), axis=0) / len(joints)
+    return mean
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the lengths (F,) of vectors (F, 3)."""
+    lengths: NDArray[np.float64] = np.sqrt(np.add.reduce(vectors * vectors, axis=1))
+    return lengths
+
+
+def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the standard deviation (k,) over the first axis of (F, k)."""
+    deviations = values - np.add.reduce(values, axis=0) / len(values)
+    spread: NDArray[np.float64] = np.sqrt(np.add.reduce(deviations * deviations, axis=0) / len(values))
+    return spread
 
 
 def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
     """Find the axis along which the lowest of feet and hands hardly moves, while it moves along the others."""
     limbs = [*body.landmarks.ground_joints, *(body.landmarks.hands or ())]
     assert body.leg is not None
-    below = body.positions[:, limbs]
-    middle = body.positions.mean(axis=1)
-    signs = np.where(median(middle - below.mean(axis=1)) >= 0, 1.0, -1.0)
-    lowest = (below * signs).min(axis=1)
-    spread = lowest.std(axis=0) / body.leg
+    below = body.positions.take(limbs, axis=0)
+    middle = np.add.reduce(body.positions, axis=0) / len(body.positions)
+    signs = np.where(median(middle - np.add.reduce(below, axis=0) / len(limbs)) >= 0, 1.0, -1.0)
+    spread = _spread(np.minimum.reduce(below * signs, axis=0)) / body.leg
     flattest, second = np.argsort(spread)[:2]
     if spread[flattest] > _FLAT_GROUND or spread[second] < max(_CLEARLY_FLATTER * spread[flattest], _FLAT_GROUND):
         return None
@@ -238,7 +265,7 @@ def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
 def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
     """Check that a ground through the origin, orthogonal to the axis, is just under the body."""
     assert body.leg is not None
-    lowest = _heights(body.positions, axis).min(axis=1)
+    lowest = _heights(body.positions, axis).min(axis=0)
     return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)
 
 
@@ -323,7 +350,7 @@ def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
     """Compute the median height of the hips above the ground, in the file's unit; 0 without feet."""
     if body.leg is None:
         return 0.0
-    return float(median(hip_heights(body.positions, body.landmarks, up_axis)))
+    return float(median(hip_heights(body.positions.transpose(1, 0, 2), body.landmarks, up_axis)))
 
 
 def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: UpAxis = "y") -> NDArray[np.float64]:
@@ -339,8 +366,9 @@ def hip_heights(positions: NDArray[np.float64], landmarks: Landmarks, up_axis: U
     -------
     (F,) float64    in the unit of `positions`
     """
-    ground = low_quantile(_heights(positions[:, list(landmarks.ground_joints)], up_axis).min(axis=1))
-    heights: NDArray[np.float64] = _heights(positions[:, landmarks.hips], up_axis) - ground
+    above = _heights(positions, up_axis)
+    ground = low_quantile(np.minimum.reduce(above.take(landmarks.ground_joints, axis=1), axis=1))
+    heights: NDArray[np.float64] = above[:, landmarks.hips] - ground
     return heights
 
 
@@ -352,8 +380,8 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
     if body.landmarks.hands is None or body.leg is None:
         return False
     heights = _heights(body.positions, up_axis)
-    hands = heights[:, list(body.landmarks.hands)].min(axis=1)
-    feet = heights[:, list(body.landmarks.ground_joints)].min(axis=1)
+    hands = np.minimum.reduce(heights.take(body.landmarks.hands, axis=0), axis=0)
+    feet = np.minimum.reduce(heights.take(body.landmarks.ground_joints, axis=0), axis=0)
     return bool(median(hands - feet) < 0.25 * body.leg)
 
 
@@ -373,16 +401,16 @@ def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: Impo
         return
     up = np.zeros(3)
     up["xyz".index(up_axis[-1])] = -1.0 if up_axis[0] == "-" else 1.0
-    left, right = (body.positions[:, _leg_joints(source.parents, landmarks, foot)] for foot in landmarks.feet)
-    leftwards = left.mean(axis=1) - right.mean(axis=1)
+    left, right = (_mean_point(body.positions, _leg_joints(source.parents, landmarks, foot)) for foot in landmarks.feet)
+    leftwards = left - right
     # The lower foot stands; the other may point anywhere.
-    feet, toes = body.positions[:, list(landmarks.feet)], body.positions[:, list(landmarks.toes)]
-    standing = _heights(feet, up_axis).argmin(axis=1)
-    frames = np.arange(len(feet))
-    x, y, z = (toes - feet)[frames, standing].T
-    expected = np.stack((up[1] * z - up[2] * y, up[2] * x - up[0] * z, up[0] * y - up[1] * x), axis=1)
-    scale = float(np.sum(np.linalg.norm(expected, axis=1) * np.linalg.norm(leftwards, axis=1)))
-    cosine = float(np.sum(expected * leftwards)) / scale if scale > 0 else 0.0
+    feet, toes = (body.positions.take(pair, axis=0) for pair in (landmarks.feet, landmarks.toes))
+    standing = _heights(feet, up_axis).argmin(axis=0)
+    x, y, z = (toes - feet)[standing, np.arange(len(standing))].T
+    expected = np.empty_like(leftwards)
+    expected[:, 0], expected[:, 1], expected[:, 2] = up[1] * z - up[2] * y, up[2] * x - up[0] * z, up[0] * y - up[1] * x
+    scale = float(np.add.reduce(_lengths(expected) * _lengths(leftwards)))
+    cosine = float(np.add.reduce(expected * leftwards, axis=None)) / scale if scale > 0 else 0.0
     if cosine < _MIRRORED_COSINE:
         body.warnings.append(
             CheckWarning(

@@ -62,6 +62,12 @@ class TestRestPose:
         assert dropped == (20, 5)
         np.testing.assert_array_equal(trimmed.poses, walk.poses)
 
+    @pytest.mark.parametrize(("start", "end"), [(63, 64), (64, 65), (65, 63), (120, 100), (120, 0), (0, 120)])
+    def test_long_rest_poses_are_counted_whole(self, walk: Clip, standing: Clip, start: int, end: int) -> None:
+        parts = [standing.sliced(0, start)] if start else []
+        clip = joined(*parts, walk, *([standing.sliced(0, end)] if end else []))
+        assert without_rest_pose(clip)[1] == (start, end)
+
     def test_a_rest_pose_between_other_poses_is_no_finding(self, walk: Clip, standing: Clip) -> None:
         clip = joined(walk, standing.sliced(0, 20), walk)
         assert found(clip, "rest-pose-frame") is None

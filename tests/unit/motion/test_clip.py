@@ -110,3 +110,16 @@ def test_translations_must_fit_the_joints_they_move(
     with pytest.raises(ClipError, match=r".") as caught:
         Clip(body, 30.0, still, translations, joints)
     assert caught.value.where in ("translations", "translated_joints")
+
+
+@pytest.mark.parametrize("square", [0.99801, 0.9985, 1.0, 1.0015, 1.00199])
+def test_rotations_within_the_tolerance_are_accepted(body: Skeleton, still: AnyFloats, square: float) -> None:
+    still[7, 3] = np.sqrt(square)
+    assert Clip(body, 30.0, still).frame_count == 10
+
+
+@pytest.mark.parametrize("square", [0.0, 0.99799, 1.00201, 1e60])
+def test_one_rotation_beyond_the_tolerance_is_refused(body: Skeleton, still: AnyFloats, square: float) -> None:
+    still[7, 3] = np.sqrt(square)
+    with pytest.raises(ClipError, match="frame 7 must be a unit quaternion"):
+        Clip(body, 30.0, still)

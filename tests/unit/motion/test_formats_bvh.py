@@ -146,6 +146,18 @@ class TestChannels:
         np.testing.assert_array_equal(source.translations, [[[0.5, 10, 0], [0.5, 10, 0]]])
         assert "position-channels-relative" in codes(source)
 
+    @pytest.mark.parametrize("away", ["0 12 0", "0 8 0"])
+    def test_a_joint_that_leaves_its_offset_in_one_frame_is_translated(self, away: str) -> None:
+        rows = [f"0 0 0 0 0 0 {position} 1 2 3" for position in ("0 10 0", "0 10 0", away, "0 10 0")]
+        source = read(bvh(rows, hierarchy=nested(["a", "b"], [f"{POSITIONS} {ZXY}"] * 2)))
+        assert source.translated_joints == (1,)
+
+    def test_positions_that_begin_near_zero_and_grow_are_no_displacements(self) -> None:
+        rows = [f"0 0 0 0 0 0 0 {height} 0 1 2 3" for height in (0.5, 9.5)]
+        source = read(bvh(rows, hierarchy=nested(["a", "b"], [f"{POSITIONS} {ZXY}"] * 2)))
+        assert source.translations[:, 0, 1].tolist() == [0.5, 9.5]
+        assert "position-channels-relative" not in codes(source)
+
     def test_bones_without_offsets_are_taken_from_the_position_channels(self) -> None:
         hierarchy = ARM.replace("OFFSET 0 10 0", "OFFSET 0 0 0").replace(f"3 {ZXY}", f"6 {POSITIONS} {ZXY}")
         rows = [f"0 90 0 0 0 0 1 {height} 2 0 0 0" for height in (10, 10, 10.5)]

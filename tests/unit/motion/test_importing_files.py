@@ -19,7 +19,7 @@ from marey_motion.exporting import write_clip_file
 from marey_motion.formats import read_motion, write_bvh, write_predecessor_skeleton
 from marey_motion.formats.predecessor import clips, documents
 from marey_motion.gait import generate_gait
-from marey_motion.importing import anatomy
+from marey_motion.importing import anatomy, source
 from marey_motion.importing.files import import_file, mapping_part
 from marey_motion.importing.items import FileToImport, ImportedFile
 from marey_motion.importing.plan import PlannedFile, plan_imports
@@ -86,6 +86,14 @@ def test_the_anatomy_of_equal_skeletons_is_found_once(count: Count, monkeypatch:
     # Of the skeleton in the file's centimetres, and in metres.
     assert calls["find_landmarks"] == 1
     assert calls["map_joints"] <= 2
+
+
+def test_a_skeleton_is_made_for_the_first_of_equal_files_only(count: Count, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(anatomy, "_KNOWN", LruCache(max_entries=8))
+    calls = count(source, "Skeleton")
+    for speed in (1.0, 1.4):
+        read("take.bvh", write_bvh(generate_gait(speed, 0.0, 1.0, 30.0)))
+    assert calls == {"Skeleton": 1}
 
 
 def test_what_is_kept_of_one_file_changes_nothing_about_another(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,6 +87,17 @@ def test_a_clip_in_its_rest_pose_stands_where_the_skeleton_rests(body: Skeleton)
     )
 
 
+def test_clips_of_one_skeleton_do_not_affect_each_other(body: Skeleton, tumbling: Callable[..., Any]) -> None:
+    plain = tumbling(body)
+    moved = Clip(body, 30.0, plain.poses, np.ones((plain.frame_count, 2, 3), np.float32), (3, 7))
+    alone = [kinematics.global_positions(clip, end_sites=True).tobytes() for clip in (plain, moved)]
+    again = [kinematics.global_positions(clip, end_sites=True).tobytes() for clip in (moved, plain)]
+    assert again[::-1] == alone
+    assert alone[0] != alone[1]
+    assert kinematics.global_positions(plain).shape == (plain.frame_count, body.joint_count, 3)
+    assert kinematics.forward_kinematics(body, plain.poses.astype(np.float64)).dtype == np.float64
+
+
 def test_the_same_frames_give_the_same_bytes_wherever_they_stand_in_a_clip(
     body: Skeleton, tumbling: Callable[..., Any]
 ) -> None:
