@@ -211,7 +211,7 @@ class Attempt(Answer):
 
     job: str
     fence: int
-    worker: str
+    worker: str = Field(description="Name of the worker; `a worker` for callers who are not contributors.")
     started_at: datetime
     ended_at: datetime | None
     outcome: str | None = Field(None, description="succeeded, failed, interrupted, lost, cancelled or timeout.")

@@ -29,6 +29,12 @@ class ClaimRequest(Request):
     wait_s: float = Field(0, ge=0, le=30)
     protocol: int = PROTOCOL_VERSION
     job: str | None = Field(None, description="Claim only this job.")
+    claim_id: str | None = Field(
+        None,
+        min_length=16,
+        max_length=64,
+        description="Random name of the claim. A repeated claim of the same token gets the same leases, renewed.",
+    )
 
 
 class PinnedInput(Answer):

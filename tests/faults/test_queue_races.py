@@ -128,6 +128,19 @@ def test_the_first_of_complete_and_cancel_to_commit_decides(desk: Desk, other: D
     _, cancelled = interleave(bout.does("complete", desk.database), bout.does("cancel", other))
     assert isinstance(cancelled, ConflictProblem)
     assert desk.state(bout.job) == "succeeded"
+    bout = Bout(desk, other)
+    _, completed = interleave(bout.does("cancel", desk.database), bout.does("complete", other))
+    assert completed.state == "cancelled"
+    assert desk.state(bout.job) == "cancelled"
+
+
+def test_a_claim_that_arrives_twice_at_once_claims_once(desk: Desk, other: Database) -> None:
+    desk.submit_many(*[JobCreate(kind="errand")] * 6)
+    request = ClaimRequest(worker="w", kinds=("errand",), max=2, claim_id="the same claim twice")
+    one, two = (Step(database, desk.user, lambda tx: queue.claim(tx, request)) for database in (desk.database, other))
+    first, second = interleave(one, two)
+    assert first == second
+    assert len(desk.claim_many()) == 4
 
 
 def test_a_dependant_submitted_while_its_job_completes_is_not_left_waiting(desk: Desk, other: Database) -> None:
@@ -249,7 +262,8 @@ def _running_keys(tx: Transaction) -> list[str]:
 def test_two_reapers_at_once_take_a_job_back_once(desk: Desk, other: Database) -> None:
     for _ in range(20):
         desk.submit(max_attempts=5)
-    desk.claim_many()
+    for lease in desk.claim_many():
+        desk.heartbeat(lease)
     desk.clock.advance(61)
     interleave(Step(desk.database, SYSTEM, reap_page), Step(other, SYSTEM, reap_page))
     again = desk.claim_many()

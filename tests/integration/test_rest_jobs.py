@@ -247,6 +247,29 @@ def test_a_job_is_cancelled_and_tried_again(server: Server, owner: httpx.Client,
     assert owner.post(f"/jobs/{again.json()['id']}/retry").status_code == 409
 
 
+def test_a_claim_whose_answer_was_lost_is_answered_again(owner: httpx.Client, worker: httpx.Client) -> None:
+    for _ in range(3):
+        submit(owner)
+    wanted = {"worker": "w", "kinds": ["errand"], "max": 2, "claim_id": "a" * 32}
+    answers = [ok(worker.post("/leases", json=wanted)) for _ in range(2)]
+    assert answers[0] == answers[1]
+    assert len({lease["job"] for lease in answers[0]["leases"]}) == 2
+    assert len(claim(worker, max=256)) == 1
+
+
+def test_names_of_workers_are_for_contributors(server: Server, owner: httpx.Client, worker: httpx.Client) -> None:
+    job = submit(owner)
+    claim(worker)
+    ok(owner.patch("/projects/lab", json={"visibility": "public"}, headers={"If-Match": "*"}))
+    for client, name in (
+        (owner, "w"),
+        (server.client(), "a worker"),
+        (server.client(server.make_user("sam")), "a worker"),
+    ):
+        (tried,) = ok(client.get(f"/jobs/{job['id']}/attempts"))["items"]
+        assert tried["worker"] == name
+
+
 def test_strangers_neither_see_nor_touch_jobs(server: Server, owner: httpx.Client) -> None:
     job = submit(owner)
     stranger = server.client(server.make_user("sam"))

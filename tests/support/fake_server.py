@@ -76,6 +76,8 @@ class FakeServer:
         self.may_complete = threading.Event()
         self.may_complete.set()
         self.tokens_seen: set[str] = set()
+        self.claims: dict[str, list[dict[str, Any]]] = {}
+        self.answers_to_lose = 0
         self._lock = threading.Lock()
         self._http = _Connections(("127.0.0.1", 0), _handler(self))
         threading.Thread(target=self._http.serve_forever, daemon=True).start()
@@ -97,7 +99,9 @@ class FakeServer:
         return name
 
     def claim(self, wanted: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return the lease of the first job of a wanted kind, or nothing after a short wait."""
+        """Return the lease of the first job of a wanted kind, or nothing after a short wait; again for the same id."""
+        if wanted["claim_id"] in self.claims:
+            return self.claims[wanted["claim_id"]]
         deadline = time.monotonic() + min(wanted["wait_s"], 2)
         while time.monotonic() < deadline:
             with self._lock:
@@ -106,7 +110,8 @@ class FakeServer:
                         self.jobs.remove(job)
                         self.leased[job.name] = job
                         self.order.append(("claimed", job.name))
-                        return [job.lease(fence=len(self.leased))]
+                        self.claims[wanted["claim_id"]] = [job.lease(fence=len(self.leased))]
+                        return self.claims[wanted["claim_id"]]
             time.sleep(0.01)
         return []
 
@@ -163,7 +168,11 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
             body = self.body()
             server.tokens_seen.add(self.headers["Authorization"])
             if self.path == "/api/v1/leases":
-                return self.reply(200, json.dumps({"leases": server.claim(json.loads(body))}).encode())
+                leases = server.claim(json.loads(body))
+                if leases and server.answers_to_lose:
+                    server.answers_to_lose -= 1
+                    return self.problem(503, "unavailable")
+                return self.reply(200, json.dumps({"leases": leases}).encode())
             if PARTS.fullmatch(self.path):
                 return self.reply(200, server.read(json.loads(body)["parts"]), "application/msgpack; arrays=blocks")
             job, _fence, request = ATTEMPT.fullmatch(self.path).groups()

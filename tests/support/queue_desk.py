@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -103,8 +103,12 @@ class Desk:
         """Make the user `ann` and her project."""
         made = self.database.write(SYSTEM, users.create_user, UserCreate(name="ann"))
         scopes = ("read", "write", "jobs", "work")
-        self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann")
+        self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann", claim_key=b"of ann")
         self.database.write(self.user, projects.create_project, ProjectCreate(name=self.project))
+
+    def replaced_token(self) -> Principal:
+        """Return the user with another token."""
+        return replace(self.user, token_id="token_new", claim_key=b"another secret")
 
     # -- submitting ----------------------------------------------------------------------------------------------------
 

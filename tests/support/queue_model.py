@@ -27,6 +27,9 @@ class ModelJob:
     fence: int = 0
     attempt: int = 0
     interruptions: int = 0
+    unstarted: int = 0
+    started: bool = False
+    """Whether the attempt that holds the job has written anything."""
     lease_expires_us: int = 0
     deadline_us: int = 0
     cancel_requested: bool = False
@@ -61,7 +64,7 @@ class ModelQueue:
             busy.add(job.key) if job.key is not None else None
             job.state = "running"
             job.fence += 1
-            job.attempt += 1
+            job.started = False
             job.deadline_us = now_us + job.time_limit_us
             job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
             taken.append(job.id)
@@ -72,16 +75,31 @@ class ModelQueue:
         job = self.jobs[job_id]
         return job.state == "running" and job.fence == fence
 
-    def heartbeat(self, job_id: str, now_us: int) -> None:
-        """Extend a lease that is held."""
+    def renew(self, job_id: str, now_us: int) -> None:
+        """Extend a lease that is held, as a repeated claim does."""
         job = self.jobs[job_id]
         job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
 
-    def complete(self, job_id: str, fence: int, write_id: str) -> None:
-        """End a job that is held, with success."""
+    def write(self, job_id: str) -> None:
+        """Count the attempt that holds a job, when it writes for the first time."""
         job = self.jobs[job_id]
-        job.answers[fence, write_id] = "succeeded"
-        self._end(job, "succeeded")
+        job.attempt += not job.started
+        job.started = True
+
+    def heartbeat(self, job_id: str, now_us: int) -> None:
+        """Extend a lease that is held."""
+        self.write(job_id)
+        self.renew(job_id, now_us)
+
+    def complete(self, job_id: str, fence: int, write_id: str) -> str:
+        """End a job that is held, with success unless it was cancelled; return its state."""
+        job = self.jobs[job_id]
+        state = "cancelled" if job.cancel_requested else "succeeded"
+        if not job.cancel_requested:
+            self.write(job_id)
+        job.answers[fence, write_id] = state
+        self._end(job, state)
+        return state
 
     def fail(
         self,
@@ -95,6 +113,7 @@ class ModelQueue:
         signature: str | None,
     ) -> None:
         """End an attempt that is held, without success."""
+        self.write(job_id)
         job = self.jobs[job_id]
         state = self._after_failure(job, now_us, retryable, interrupted, signature)
         if signature is not None:
@@ -130,10 +149,19 @@ class ModelQueue:
             job.fence += 1
             if job.cancel_requested:
                 self._end(job, "cancelled")
-            elif job.lease_expires_us >= job.deadline_us + GRACE_US or job.attempt >= job.max_attempts:
+            elif not job.started and job.unstarted < 10:
+                job.unstarted += 1
+                self._queue(job, now_us)
+            elif (
+                not job.started or job.lease_expires_us >= job.deadline_us + GRACE_US or job.attempt >= job.max_attempts
+            ):
                 self._end(job, "failed")
             else:
                 self._queue(job, now_us)
+
+    @staticmethod
+    def _is_over(job: ModelJob) -> bool:
+        return job.lease_expires_us >= job.deadline_us + GRACE_US or job.attempt >= job.max_attempts
 
     def cancel(self, job_id: str, now_us: int) -> None:
         """Cancel a job that has not ended."""
@@ -156,9 +184,11 @@ class ModelQueue:
     def _dependants(self, job_id: str) -> Sequence[ModelJob]:
         return [job for job in self.jobs.values() if job_id in job.after and job.state == "waiting"]
 
-    def states(self) -> dict[str, tuple[str, int, int, int]]:
-        """Return state, fence, attempts and interruptions of every job."""
-        return {job.id: (job.state, job.fence, job.attempt, job.interruptions) for job in self.jobs.values()}
+    def states(self) -> dict[str, tuple[str, int, int, int, int]]:
+        """Return state, fence, attempts, interruptions and unstarted claims of every job."""
+        return {
+            job.id: (job.state, job.fence, job.attempt, job.interruptions, job.unstarted) for job in self.jobs.values()
+        }
 
     def ids(self) -> Iterable[str]:
         """Return the ids of all jobs."""

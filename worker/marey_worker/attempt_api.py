@@ -38,9 +38,9 @@ _NONE: bytes = msgpack.packb(None)
 
 
 def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
-    """Claim jobs. The request is not repeated: if an answer is lost, its leases expire."""
+    """Claim jobs. If the answer is lost, the same request gets the same leases."""
     response = transport.send(
-        "POST", "/leases", content=as_json(request), repeatable=False, timeout_s=request.wait_s + 30.0
+        "POST", "/leases", content=as_json(request), repeatable=True, timeout_s=request.wait_s + 30.0
     )
     return read_model(LeaseList, response).leases
 

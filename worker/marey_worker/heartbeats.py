@@ -19,6 +19,9 @@ CONFIRM_AFTER = 2 / 3
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
+FIRST_S = 1.0
+"""Greatest wait before the first heartbeat, with which the attempt begins to count; shorter jobs need none."""
+
 TICK_S = 0.25
 JITTER = 0.2
 """Share of the interval by which heartbeats of many attempts are spread."""
@@ -65,7 +68,7 @@ class LeaseKeeper:
             self._beat(patiently=patiently)
 
     def _run(self) -> None:
-        wait_s = spread(self._interval_s, JITTER)
+        wait_s = spread(min(FIRST_S, self._interval_s), JITTER)
         while not self._stopped.wait(TICK_S):
             silent_s = time.monotonic() - self._tried
             news = self._progress is not self._told and silent_s >= PROGRESS_EVERY_S

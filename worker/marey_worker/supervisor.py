@@ -7,13 +7,14 @@ import os
 import socket
 import threading
 import time
+import uuid
 from collections.abc import Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from marey_client.errors import Forbidden, Invalid, MareyError, Unauthenticated
+from marey_client.errors import Forbidden, Invalid, LeaseLost, MareyError, Unauthenticated
 from marey_client.retries import ONCE
 from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
@@ -111,22 +112,26 @@ class Supervisor:
 
     def _claim_and_run(self) -> None:
         failures = 0
+        claim_id = uuid.uuid4().hex
         finishing: Future[None] | None = None
         with _Bench(self._options) as bench, ThreadPoolExecutor(1, thread_name_prefix="marey-finish") as finisher:
             while not self._stopping.is_set():
                 try:
                     child = bench.child()
-                    leases = self._claim()
+                    leases = self._claim(claim_id)
                 except (Unauthenticated, Forbidden, Invalid) as error:
                     self._refusal = error
                     self.stop()
                     break
                 except (MareyError, ChildBroken) as error:
                     failures += 1
+                    if isinstance(error, LeaseLost):  # the answer was lost for too long
+                        claim_id = uuid.uuid4().hex
                     log.warning("no work: %s", error)
                     self._stopping.wait(PAUSES.delay_s(failures))
                     continue
                 failures = 0
+                claim_id = uuid.uuid4().hex
                 for lease in leases:
                     earlier, finishing = finishing, self._attempt(lease, child, finisher)
                     if earlier is not None:
@@ -134,13 +139,15 @@ class Supervisor:
             if finishing is not None:
                 finishing.result()
 
-    def _claim(self) -> tuple[Lease, ...]:
+    def _claim(self, claim_id: str) -> tuple[Lease, ...]:
+        """Claim a job; after a failure, the same `claim_id` gets the job that a lost answer named."""
         wanted = ClaimRequest(
             worker=self._options.name,
             kinds=self._options.kinds,
             labels=dict(self._options.labels),
             max=1,
             wait_s=CLAIM_WAIT_S,
+            claim_id=claim_id,
         )
         return claim(self._claims, wanted)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from marey_schemas.access import Scope
@@ -26,6 +26,8 @@ class Principal:
     job_id: str | None = None
     fence: int | None = None
     project_id: str | None = None
+    claim_key: bytes = field(default=b"", repr=False)
+    """Secret from which the tokens of repeatable claims are derived; empty without a user's token."""
 
     @property
     def actor(self) -> str | None:

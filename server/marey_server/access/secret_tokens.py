@@ -31,7 +31,20 @@ def issue_user_token() -> IssuedToken:
 
 def issue_attempt_token() -> IssuedToken:
     """Create the token of an attempt; its row is found by the hash."""
-    secret = secrets.token_hex(32)
+    return _attempt_token(secrets.token_hex(32))
+
+
+def derive_claim_key(secret: str) -> bytes:
+    """Derive the key of `derive_attempt_token` from the secret of a user's token."""
+    return hmac.digest(secret.encode("utf-8", "surrogatepass"), b"marey attempt tokens", "sha256")
+
+
+def derive_attempt_token(claim_key: bytes, claim_id: str, job_id: str, fence: int) -> IssuedToken:
+    """Derive the token of an attempt, always the same one for the same claim of the same user's token."""
+    return _attempt_token(hmac.digest(claim_key, f"{claim_id} {job_id} {fence}".encode(), "sha256").hex())
+
+
+def _attempt_token(secret: str) -> IssuedToken:
     return IssuedToken(f"{_ATTEMPT}{secret}", "", hash_secret(secret))
 
 

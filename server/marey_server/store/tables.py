@@ -251,7 +251,9 @@ job = Table(
     Column("max_attempts", Integer, nullable=False, default=3),
     Column("attempt", Integer, nullable=False, default=0),
     Column("interruptions", Integer, nullable=False, default=0),
+    Column("unstarted", Integer, nullable=False, default=0, server_default=text("0")),  # claims lost before any write
     Column("fence", Integer, nullable=False, default=0),
+    Column("counted_fence", Integer, nullable=False, default=0, server_default=text("0")),  # last one in `attempt`
     Column("run_at_us", Micros, nullable=False),
     Column("lease_expires_us", Micros),
     Column("deadline_us", Micros),
@@ -345,6 +347,7 @@ attempt = Table(
     Column("fence", Integer, primary_key=True),
     Column("worker", String(255), nullable=False),
     Column("claimed_by", ID),  # the token that claimed
+    Column("claim_id", String(64)),  # the name that the worker gave to its claim
     Column("token_hash", String(64), nullable=False, unique=True),
     Column("started_us", Micros, nullable=False),
     Column("ended_us", Micros),
@@ -354,6 +357,13 @@ attempt = Table(
     Column("write_id", String(64)),  # of the final answer
     Column("answer", Document),  # what it was answered, for the same write_id again
     Column("log_bytes", BigInteger, nullable=False, default=0),
+    Index(
+        "ix_attempt_claim",
+        "claimed_by",
+        "claim_id",
+        sqlite_where=text("claim_id IS NOT NULL"),
+        postgresql_where=text("claim_id IS NOT NULL"),
+    ),
 )
 
 job_log = Table(

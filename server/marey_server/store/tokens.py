@@ -15,6 +15,7 @@ from marey_server.access.principal import Principal
 from marey_server.access.roles import is_administrator, require_administrator
 from marey_server.access.secret_tokens import (
     attempt_secret,
+    derive_claim_key,
     hash_secret,
     issue_user_token,
     secret_matches,
@@ -83,7 +84,16 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
         raise _unknown()
     if row.expires_us is not None and row.expires_us <= tx.now_us:
         raise _unknown()
-    return Principal("user", row.user_id, row.name, row.administrator, tuple(row.scopes), row.id, row.expires_us)
+    return Principal(
+        "user",
+        row.user_id,
+        row.name,
+        row.administrator,
+        tuple(row.scopes),
+        row.id,
+        row.expires_us,
+        claim_key=derive_claim_key(secret),
+    )
 
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:

@@ -177,6 +177,8 @@ def test_an_overdue_job_that_cannot_be_taken_back_keeps_no_other_from_it(
 ) -> None:
     jobs = desk.submit_many(*[JobCreate(kind="errand", max_attempts=1)] * 3)
     leases = {lease.job: lease for lease in desk.claim_many()}
+    for lease in leases.values():
+        desk.heartbeat(lease)
     desk.clock.advance(1000)
 
     def propagate_all_but_one(tx: Transaction, ended: list[Ended]) -> None:
@@ -298,7 +300,7 @@ def test_interruptions_are_counted_apart_from_attempts(desk: Desk) -> None:
 def test_a_lost_job_is_tried_again_until_its_attempts_are_used_up(desk: Desk) -> None:
     job = desk.submit(max_attempts=2)
     for _ in range(2):
-        desk.claim()
+        desk.heartbeat(desk.claim())
         desk.clock.advance(61)
         assert desk.reap() == 1
     failure = desk.job(job).failure
@@ -336,12 +338,23 @@ def test_a_worker_that_does_not_stop_loses_a_cancelled_job_after_a_grace(desk: D
         desk.complete(lease)
 
 
-def test_a_result_that_comes_before_the_worker_hears_of_the_cancellation_stands(desk: Desk) -> None:
-    job = desk.submit()
+@pytest.mark.parametrize("in_batch", [False, True])
+def test_a_job_whose_cancellation_was_acknowledged_never_succeeds(desk: Desk, in_batch: bool) -> None:
+    job = desk.submit(into="results")
     lease = desk.claim()
-    desk.cancel(job)
-    assert desk.complete(lease).state == "succeeded"
-    assert desk.state(job) == "succeeded"
+    desk.stage(lease, "late")
+    assert desk.cancel(job).cancel_requested
+    for _ in range(2):  # a repeated request gets the same answer
+        if in_batch:
+            asked = [BatchCompletion(job=job, fence=lease.fence, write_id="write-late")]
+            answer = desk.database.write(desk.user, completion.complete_many, asked)[0].answer
+        else:
+            answer = desk.complete(lease, write_id="write-late")
+        assert answer is not None
+        assert (answer.state, answer.outputs) == ("cancelled", ())
+    assert desk.state(job) == "cancelled"
+    assert desk.outputs(job) == []
+    assert desk.cancel(job).state == "cancelled"
 
 
 def test_many_jobs_are_claimed_and_completed_at_once_each_with_its_own_answer(desk: Desk) -> None:

@@ -59,6 +59,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.clock = clock
         self.model = ModelQueue()
         self.leases: list[Lease] = []
+        self.claims: dict[str, list[Lease]] = {}
         self.said: list[tuple[str, Lease, str]] = []
         self.ended: dict[str, tuple[str, int]] = {}
         desk.database.write(SYSTEM, _forget_jobs)
@@ -144,9 +145,27 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(most=st.integers(1, 4))
     def claim(self, most: int) -> None:
         self._tick()
-        leases = self.desk.claim_many(most, ERRANDS)
+        claim_id = f"claim of errands {self.clock.us}"
+        leases = self.desk.claim_many(most, ERRANDS, claim_id=claim_id)
         assert [lease.job for lease in leases] == self.model.claim(self.clock.us, most)
         self.leases += leases
+        if leases:
+            self.claims[claim_id] = leases
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data(), most=st.integers(1, 4))
+    def claim_again(self, data: st.DataObject, most: int) -> None:
+        """The answer to a claim was lost, or its request arrives twice: the answer names what is still held."""
+        claim_id = data.draw(st.sampled_from(sorted(self.claims)))
+        held = [lease for lease in self.claims[claim_id] if self._holds(lease)]
+        if not held:
+            with pytest.raises(LeaseLostProblem):
+                self.desk.claim_many(most, ERRANDS, claim_id=claim_id)
+            return
+        again = self.desk.claim_many(most, ERRANDS, claim_id=claim_id)
+        assert again == held
+        for lease in again:
+            self.model.renew(lease.job, self.clock.us)
 
     @rule(most=st.integers(1, 4))
     def claim_chained(self, most: int) -> None:
@@ -171,6 +190,8 @@ class QueueMachine(RuleBasedStateMachine):
         lease = self._some_lease(data)
         if self._holds(lease):
             self.desk.stage(lease, name)
+            if lease.kind in ERRANDS:
+                self.model.write(lease.job)
         else:
             with pytest.raises(LeaseLostProblem):
                 self.desk.stage(lease, name)
@@ -180,10 +201,12 @@ class QueueMachine(RuleBasedStateMachine):
     def complete(self, data: st.DataObject) -> None:
         lease, write_id = self._some_lease(data), self.desk.write_id()
         if self._holds(lease):
-            assert self.desk.complete(lease, write_id=write_id).state == "succeeded"
+            cancelled = next(row.cancel_requested_us is not None for row in self._rows() if row.id == lease.job)
+            state = self.desk.complete(lease, write_id=write_id).state
+            assert state == ("cancelled" if cancelled else "succeeded")
             self.said.append(("complete", lease, write_id))
             if lease.kind in ERRANDS:
-                self.model.complete(lease.job, lease.fence, write_id)
+                assert self.model.complete(lease.job, lease.fence, write_id) == state
         else:
             with pytest.raises(LeaseLostProblem):
                 self.desk.complete(lease, write_id=write_id)
@@ -256,7 +279,7 @@ class QueueMachine(RuleBasedStateMachine):
     @invariant()
     def errands_stand_as_the_model_says(self) -> None:
         errands = {
-            row.id: (row.state, row.fence, row.attempt, row.interruptions)
+            row.id: (row.state, row.fence, row.attempt, row.interruptions, row.unstarted)
             for row in self._rows()
             if row.kind in ERRANDS
         }

@@ -44,6 +44,17 @@ def test_the_next_job_begins_while_the_end_of_the_last_one_is_reported(
     assert [server.ended(job)["result"]["sum"] for job in (first, second)] == [1, 2]
 
 
+def test_a_job_is_run_once_although_the_answer_to_its_claim_was_lost(
+    server: FakeServer, start_worker: StartWorker
+) -> None:
+    server.answers_to_lose = 1
+    job = server.submit("add", {"a": 1, "b": 1})
+    start_worker("--slots", "1")
+    assert server.ended(job)["result"]["sum"] == 2
+    assert server.answers_to_lose == 0
+    assert [name for name, _ in server.order].count("claimed") == 1
+
+
 def test_a_worker_that_stops_reports_what_is_done(server: FakeServer, start_worker: StartWorker) -> None:
     server.may_complete.clear()
     worker = start_worker("--slots", "1")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import bindparam, exists, select, tuple_, update
+from sqlalchemy import and_, bindparam, exists, select, tuple_, update
 
 from marey_schemas.jobs import JobOutput, JobState
 from marey_schemas.worker_protocol import (
@@ -20,10 +20,11 @@ from marey_server import faults
 from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import staging
-from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts
+from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts, end_jobs
 from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_outcome
 from marey_server.store.jobs.fan_out import release_tasks
 from marey_server.store.jobs.fencing import (
+    COUNT_ATTEMPT,
     HELD,
     held,
     held_parameters,
@@ -44,7 +45,8 @@ _Place = tuple[str, int]
 def complete(tx: Transaction, job_id: str, fence: int, request: CompleteRequest) -> CompleteAnswer:
     """End the job with success and publish its staged outputs; a repeated `write_id` gets the same answer.
 
-    Raises `LeaseLostProblem` if the attempt does not hold the job, or has ended it with another `write_id`.
+    If its cancellation was requested, the job is cancelled instead, and nothing is published. Raises `LeaseLostProblem`
+    if the attempt does not hold the job, or has ended it with another `write_id`.
     """
     require_attempt(tx.principal, job_id, fence)
     place = (job_id, fence)
@@ -77,8 +79,8 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
 
 _WIN = Prepared(
     update(job)
-    .where(HELD)
-    .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1)
+    .where(HELD, job.c.cancel_requested_us.is_(None))
+    .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1, **COUNT_ATTEMPT)
     .returning(
         *ENDED_COLUMNS,
         job.c.fence,
@@ -165,9 +167,27 @@ def _pass_fault_points(tx: Transaction) -> None:
 
 def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
     earlier = stored_answer(tx, *place, write_id)
-    if earlier is None or earlier["state"] != JobState.SUCCEEDED:
+    if earlier is None:
+        return _end_cancelled(tx, place, write_id)
+    if earlier["state"] not in (JobState.SUCCEEDED, JobState.CANCELLED):
         raise lease_lost(*place)
-    return CompleteAnswer(**earlier)
+    return CompleteAnswer(job=earlier["job"], state=earlier["state"], outputs=earlier.get("outputs", ()))
+
+
+def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
+    """End a job of which a cancellation was acknowledged before the worker had finished.
+
+    Raises `LeaseLostProblem` if the attempt does not hold the job.
+    """
+    ended = end_jobs(tx, and_(held(*place), job.c.cancel_requested_us.is_not(None)), JobState.CANCELLED.value)
+    if not ended:
+        raise lease_lost(*place)
+    answer = CompleteAnswer(job=place[0], state=JobState.CANCELLED)
+    end = AttemptEnd(*place, "cancelled", write_id=write_id, answer=answer.model_dump(mode="json"))
+    end_attempts(tx, [end])
+    staging.drop_staged(tx, [place])
+    propagate_ends(tx, ended)
+    return answer
 
 
 # -- batches ----------------------------------------------------------------------------------------------------------

@@ -126,7 +126,7 @@ def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_wor
         into=row.into_path,
         priority=row.priority,
         seed=row.seed,
-        attempt=row.attempt,
+        attempt=row.attempt + (row.state == "running" and row.counted_fence < row.fence),
         fence=row.fence,
         max_attempts=row.max_attempts,
         interruptions=row.interruptions,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Row, update
 
@@ -25,6 +25,8 @@ ENDING_COLUMNS = (
     job.c.id,
     job.c.kind,
     job.c.fence,
+    job.c.counted_fence,
+    job.c.unstarted,
     job.c.attempt,
     job.c.max_attempts,
     job.c.interruptions,
@@ -43,8 +45,8 @@ class AttemptOutcome:
     attempt_outcome: str
     rest_us: int | None = None
     failure: dict[str, Any] | None = None
-    counts: bool = True
-    """Whether the attempt counts against `max_attempts`; an interruption has a count of its own."""
+    counts_as: Literal["attempt", "interruption", "unstarted"] = "attempt"
+    """Limit that it counts against: `max_attempts`, or one of those in the policy."""
 
 
 def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:
@@ -69,11 +71,14 @@ def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, 
 def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
     """Return the outcome of an attempt whose lease expired. A retry is queued without delay.
 
+    An attempt that has written nothing does not count; perhaps the answer to its claim was lost.
     If the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If it expired
     earlier, the worker is lost, even if the server notices it after the deadline.
     """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
+    if row.counted_fence < row.fence:
+        return _unstarted(row, policy)
     if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
         return _over_time(row)
     if row.attempt >= row.max_attempts:
@@ -86,7 +91,14 @@ def _interrupted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
     if row.interruptions >= policy.max_interruptions:
         detail = f"The job's workers were stopped {row.interruptions + 1} times."
         return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "interrupted", detail, attempt_outcome="interrupted")
-    return AttemptOutcome("queued", "interrupted", 0, counts=False)
+    return AttemptOutcome("queued", "interrupted", 0, counts_as="interruption")
+
+
+def _unstarted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
+    if row.unstarted >= policy.max_unstarted:
+        detail = f"{row.unstarted + 1} workers claimed the job and were not heard of again."
+        return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, attempt_outcome="lost")
+    return AttemptOutcome("queued", "lost", 0, counts_as="unstarted")
 
 
 def _over_time(row: Row[Any]) -> AttemptOutcome:
@@ -124,10 +136,16 @@ def apply_outcome(
     propagate_ends(tx, ended)
 
 
+_COUNTS: dict[str, dict[str, Any]] = {
+    "attempt": {},
+    "interruption": {"attempt": job.c.attempt - 1, "interruptions": job.c.interruptions + 1},
+    "unstarted": {"unstarted": job.c.unstarted + 1},
+}
+
+
 def _queue_again(
     tx: Transaction, row: Row[Any], condition: ColumnElement[bool], outcome: AttemptOutcome, values: dict[str, Any]
 ) -> bool:
-    uncounted = {} if outcome.counts else {"attempt": job.c.attempt - 1, "interruptions": job.c.interruptions + 1}
     queued = tx.execute(
         update(job)
         .where(condition)
@@ -138,7 +156,7 @@ def _queue_again(
             deadline_us=None,
             progress=None,
             rev=job.c.rev + 1,
-            **uncounted,
+            **_COUNTS[outcome.counts_as],
             **values,
         )
         .returning(job.c.project_id)

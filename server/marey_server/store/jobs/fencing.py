@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, and_, bindparam, case, literal_column, select, tuple_
+from sqlalchemy import ColumnElement, Row, and_, bindparam, case, literal_column, select, tuple_, update
 
 from marey_server.access.principal import Principal
 from marey_server.errors import LeaseLostProblem, NotFoundProblem
@@ -46,6 +46,14 @@ def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
     return {"held_ids": [job_id for job_id, _ in attempts], "held_attempts": list(attempts)}
 
 
+UNCOUNTED: ColumnElement[int] = case((job.c.counted_fence < job.c.fence, 1), else_=0)
+"""1 while the attempt that holds the job has written nothing, so that it is not counted yet; else 0."""
+
+COUNT_ATTEMPT: dict[str, Any] = {"attempt": job.c.attempt + UNCOUNTED, "counted_fence": job.c.fence}
+"""Values that every write of an attempt sets in its job: an attempt counts from its first write, not from its claim,
+because the answer to the claim may have been lost."""
+
+
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
     """Check that the caller's credential belongs to this attempt.
 
@@ -60,14 +68,18 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
 
 
 def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Lock the job for this transaction and return `columns` of it.
+    """Lock the job for this transaction, count the attempt at its first write, and return `columns` of the job.
 
     Raises `LeaseLostProblem` if the attempt no longer holds the job.
     """
-    statement = select(job.c.project_id, *columns).where(held(job_id, fence)).with_for_update()
+    holding = held(job_id, fence)
+    statement = select(job.c.project_id, UNCOUNTED.label("uncounted"), *columns).where(holding).with_for_update()
     row = tx.execute(statement).one_or_none()
     if row is None:
         raise lease_lost(job_id, fence)
+    if row.uncounted:
+        tx.execute(update(job).where(holding).values(**COUNT_ATTEMPT))
+        return tx.execute(statement).one()
     return row
 
 

@@ -24,6 +24,9 @@ class QueuePolicy:
     first_backoff_s: float = 10.0
     longest_backoff_s: float = 15 * 60.0
     max_interruptions: int = 20
+    max_unstarted: int = 10
+    """Limit of claims that are lost before the first write of the attempt. They do not count as attempts, because the
+    answer to the claim may have been lost; the limit ends a job that kills each worker at once."""
     log_limit_bytes: int = 10 * 2**20
     random_unit: Callable[[], float] = random.random
 

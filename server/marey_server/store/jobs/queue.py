@@ -36,11 +36,23 @@ from marey_schemas.worker_protocol import (
     PinnedInput,
 )
 from marey_server import faults
-from marey_server.access.secret_tokens import IssuedToken, issue_attempt_token
-from marey_server.errors import ForbiddenProblem, InvalidProblem
+from marey_server.access.principal import Principal
+from marey_server.access.secret_tokens import IssuedToken, derive_attempt_token, issue_attempt_token
+from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs.events import emit_job_events
-from marey_server.store.jobs.fencing import QUEUED, RUNNING, earlier, held, lease_lost, require_attempt
+from marey_server.store.jobs.fencing import (
+    COUNT_ATTEMPT,
+    HELD,
+    QUEUED,
+    RUNNING,
+    UNCOUNTED,
+    earlier,
+    held,
+    held_parameters,
+    lease_lost,
+    require_attempt,
+)
 from marey_server.store.jobs.labels import keys_within
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, member, project
@@ -50,15 +62,21 @@ from marey_server.store.transaction import Transaction
 def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_POLICY) -> list[Lease]:
     """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
-    Raises `ForbiddenProblem` if the caller may not claim jobs, and `InvalidProblem` for another protocol version.
+    A repeated `claim_id` gets the leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
+    caller may not claim jobs, `InvalidProblem` for another protocol version, and `LeaseLostProblem` if no lease of the
+    earlier claim is held any more.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
-    rows = _claim_rows(tx, request, policy)
+    scopes = _require_worker(tx.principal)
+    claim_id = request.claim_id if tx.principal.claim_key else None
+    if claim_id is not None and (again := _claimed_before(tx, claim_id, policy)):
+        return again
+    rows = _claim_rows(tx, request, scopes, policy)
     if not rows:
         return []
-    tokens = [issue_attempt_token() for _ in rows]
+    tokens = [_issue_token(tx, claim_id, row) for row in rows]
     tx.run_each(
         _INSERT_ATTEMPT,
         [
@@ -67,6 +85,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
                 "fence": row.fence,
                 "worker": request.worker,
                 "claimed_by": tx.principal.token_id,
+                "claim_id": claim_id,
                 "token_hash": token.secret_hash,
                 "started_us": tx.now_us,
             }
@@ -75,13 +94,40 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     )
     emit_job_events(tx, "job.started", [(row.project_id, row.id, {"fence": row.fence}) for row in rows])
     tx.after_commit(lambda: faults.point("claim.after_commit"))
-    sizes = _sizes(tx, rows)
-    return [
-        _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
-    ]
+    return _leases(tx, rows, tokens, policy)
 
 
 _INSERT_ATTEMPT = Prepared(insert(attempt))
+
+_CLAIMED_BEFORE = Prepared(
+    select(attempt.c.job_id, attempt.c.fence).where(
+        attempt.c.claimed_by == bindparam("token"), attempt.c.claim_id == bindparam("claim")
+    )
+)
+
+
+def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list[Lease]:
+    """Renew and return the leases of an earlier claim of the same name; empty if there was none.
+
+    Two claims of the same name at the same time run one after the other. Raises `LeaseLostProblem`.
+    """
+    token_id = tx.principal.token_id
+    tx.lock(f"claim {token_id} {claim_id}")
+    places = [(row.job_id, row.fence) for row in tx.run(_CLAIMED_BEFORE, {"token": token_id, "claim": claim_id})]
+    if not places:
+        return []
+    renewed = update(job).where(HELD).values(lease_expires_us=_renewed(tx, policy)).returning(*_LEASE_COLUMNS)
+    rows = sorted(tx.execute(renewed, held_parameters(places)).all(), key=_pick_order)
+    if not rows:
+        raise LeaseLostProblem("No lease of this claim is held any more. Claim under a new `claim_id`.")
+    return _leases(tx, rows, [_issue_token(tx, claim_id, row) for row in rows], policy)
+
+
+def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> IssuedToken:
+    """Return the token of an attempt, derived if the claim can be repeated, so that no secret needs to be stored."""
+    if claim_id is None:
+        return issue_attempt_token()
+    return derive_attempt_token(tx.principal.claim_key, claim_id, row.id, row.fence)
 
 
 def heartbeat(
@@ -93,9 +139,7 @@ def heartbeat(
     holds the job.
     """
     require_attempt(tx.principal, job_id, fence)
-    values: dict[str, Any] = {
-        "lease_expires_us": earlier(job.c.deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us)
-    }
+    values: dict[str, Any] = {"lease_expires_us": _renewed(tx, policy), **COUNT_ATTEMPT}
     if request.progress is not None:
         values["progress"] = request.progress.model_dump(mode="json")
     columns = (job.c.lease_expires_us, job.c.cancel_requested_us, job.c.deadline_us)
@@ -109,7 +153,32 @@ def heartbeat(
     )
 
 
+def _renewed(tx: Transaction, policy: QueuePolicy) -> ColumnElement[int]:
+    return earlier(job.c.deadline_us + policy.end_grace_us, tx.now_us + policy.lease_ttl_us)
+
+
 # -- the claim in one statement ----------------------------------------------------------------------------------------
+
+
+_LEASE_COLUMNS = (
+    job.c.id,
+    job.c.project_id,
+    select(project.c.name).where(project.c.id == job.c.project_id).scalar_subquery().label("project_name"),
+    job.c.kind,
+    job.c.params,
+    job.c.inputs,
+    job.c.into_path,
+    job.c.seed,
+    job.c.parent_id,
+    job.c.position,
+    job.c.size,
+    job.c.time_limit_s,
+    job.c.memory_limit_mb,
+    job.c.fence,
+    (job.c.attempt + UNCOUNTED).label("attempt"),
+    job.c.priority,
+    job.c.run_at_us,
+)
 
 
 def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
@@ -123,32 +192,13 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
         .values(
             state="running",
             fence=job.c.fence + 1,
-            attempt=job.c.attempt + 1,
             lease_expires_us=earlier(deadline_us + bindparam("end_grace"), now_us + bindparam("lease_ttl")),
             deadline_us=deadline_us,
             started_us=func.coalesce(job.c.started_us, now_us),
             progress=None,
             rev=job.c.rev + 1,
         )
-        .returning(
-            job.c.id,
-            job.c.project_id,
-            select(project.c.name).where(project.c.id == job.c.project_id).scalar_subquery().label("project_name"),
-            job.c.kind,
-            job.c.params,
-            job.c.inputs,
-            job.c.into_path,
-            job.c.seed,
-            job.c.parent_id,
-            job.c.position,
-            job.c.size,
-            job.c.time_limit_s,
-            job.c.memory_limit_mb,
-            job.c.fence,
-            job.c.attempt,
-            job.c.priority,
-            job.c.run_at_us,
-        )
+        .returning(*_LEASE_COLUMNS)
     )
 
 
@@ -220,11 +270,16 @@ _CLAIM_STATEMENTS = {
 }
 
 
-def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> list[Row[Any]]:
-    caller = tx.principal
+def _require_worker(caller: Principal) -> list[str]:
+    """Return the scopes that let the caller work for all projects, or for the named ones."""
     scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
     if not scopes or caller.kind not in ("user", "system"):
         raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
+    return scopes
+
+
+def _claim_rows(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> list[Row[Any]]:
+    caller = tx.principal
     restriction = _Restriction(request.job is not None, "work" not in scopes, not caller.administrator)
     parameters: dict[str, Any] = {
         "now_us": tx.now_us,
@@ -244,6 +299,15 @@ def _claim_rows(tx: Transaction, request: ClaimRequest, policy: QueuePolicy) -> 
 
 
 # -- answers ----------------------------------------------------------------------------------------------------------
+
+
+def _leases(
+    tx: Transaction, rows: Sequence[Row[Any]], tokens: Sequence[IssuedToken], policy: QueuePolicy
+) -> list[Lease]:
+    sizes = _sizes(tx, rows)
+    return [
+        _lease(row, sizes.get(row.parent_id, row.size), token, policy) for row, token in zip(rows, tokens, strict=True)
+    ]
 
 
 def _sizes(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, int]:

@@ -32,6 +32,9 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "priority": job.c.priority,
 }
 
+UNNAMED_WORKER = "a worker"
+"""Stands for the name of a worker, which is often that of its host, for callers who may not know it."""
+
 UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
 
 
@@ -79,17 +82,18 @@ def list_jobs(
 
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:
-    """Return the attempts of a job in the order of their start."""
-    find_job(tx, job_id)
+    """Return the attempts of a job in the order of their start; names of workers are for contributors."""
+    _, project = find_job(tx, job_id)
+    named = roles.includes(project.role, Role.CONTRIBUTOR)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))
-    return Page(items=tuple(_attempt_document(row) for row in rows))
+    return Page(items=tuple(_attempt_document(row, named=named) for row in rows))
 
 
-def _attempt_document(row: Row[Any]) -> Attempt:
+def _attempt_document(row: Row[Any], *, named: bool) -> Attempt:
     return Attempt(
         job=row.job_id,
         fence=row.fence,
-        worker=row.worker,
+        worker=row.worker if named else UNNAMED_WORKER,
         started_at=datetime_of(row.started_us),
         ended_at=None if row.ended_us is None else datetime_of(row.ended_us),
         outcome=row.outcome,

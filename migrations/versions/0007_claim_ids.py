@@ -1,0 +1,29 @@
+"""Claims that can be repeated, and attempts that count from their first write."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0007"
+down_revision = "0006"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    """Add the columns; attempts of earlier versions were counted when they were claimed."""
+    op.add_column("job", sa.Column("unstarted", sa.Integer(), nullable=False, server_default=sa.text("0")))
+    op.add_column("job", sa.Column("counted_fence", sa.Integer(), nullable=False, server_default=sa.text("0")))
+    op.execute("UPDATE job SET counted_fence = fence WHERE fence > 0")
+    op.add_column("attempt", sa.Column("claim_id", sa.String(length=64), nullable=True))
+    named = sa.text("claim_id IS NOT NULL")
+    op.create_index(
+        "ix_attempt_claim", "attempt", ["claimed_by", "claim_id"], sqlite_where=named, postgresql_where=named
+    )
+
+
+def downgrade() -> None:
+    """Drop the index and the columns."""
+    op.drop_index("ix_attempt_claim", "attempt")
+    op.drop_column("attempt", "claim_id")
+    op.drop_column("job", "counted_fence")
+    op.drop_column("job", "unstarted")
