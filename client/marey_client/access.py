@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.access import (
+    EndTokens,
     Member,
     MemberChange,
     NewToken,
@@ -51,6 +52,10 @@ class Users:
         """Disable a user; the user's data stays."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
+    def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
+        """End the sessions of a user, or all tokens, except the one of this client."""
+        return self.change(name, UserChange(end_tokens=which))
+
     def enable(self, name: str) -> User:
         """Enable a disabled user again, with the same password and tokens."""
         return self.change(name, UserChange(disabled=False))
@@ -58,21 +63,32 @@ class Users:
 
 @dataclass(frozen=True)
 class Tokens:
-    """Tokens of the caller."""
+    """Tokens of the caller; for administrators, of everybody."""
 
     transport: Transport
 
-    def list(self) -> Iterator[Token]:
-        """List the tokens, without secrets."""
-        return pages(self.transport, Token, "/tokens")
+    def list(
+        self,
+        *,
+        user: str | None = None,
+        everybody: bool = False,
+        prefix: str | None = None,
+        ends_within_s: int | None = None,
+    ) -> Iterator[Token]:
+        """List the tokens, without secrets: yours, or, for administrators, those of a user or of everybody.
+
+        `prefix` selects the token of a secret `marey_<prefix>_...`, `ends_within_s` those that end within a time.
+        """
+        params = {"user": user, "everybody": everybody or None, "prefix": prefix, "ends_within_s": ends_within_s}
+        return pages(self.transport, Token, "/tokens", params)
 
     def create(self, token: TokenCreate) -> NewToken:
         """Create a token; its secret is in the answer and never shown again."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
-    def revoke(self, token_id: str) -> None:
-        """Revoke a token, at once."""
-        self.transport.send("DELETE", f"/tokens/{token_id}")
+    def revoke(self, token_id: str, *, with_created: bool = False) -> None:
+        """Revoke a token, at once; with `with_created`, also the tokens that were created with it."""
+        self.transport.send("DELETE", f"/tokens/{token_id}", params={"with_created": with_created or None})
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,15 +13,18 @@ import typer
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, UserName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
-    from marey_schemas.access import NewToken, TokenCreate
+    from marey_schemas.access import NewToken, Token, TokenCreate
 
 token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage your tokens.")
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 
 SECONDS_PER_DAY = 86_400
+SOON_DAYS = 14
+"""Number of days before its end from which a list shows the time left to a token."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -123,24 +127,64 @@ def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
 
 
 @token.command("ls")
-def list_tokens(context: typer.Context, as_json: AsJson = False) -> None:
-    """Show your tokens, without their secrets."""
+def list_tokens(
+    context: typer.Context,
+    user: Annotated[str | None, typer.Option(help="Tokens of this user (for administrators).")] = None,
+    everybody: Annotated[bool, typer.Option("--everybody", help="Tokens of all users (for administrators).")] = False,
+    prefix: Annotated[
+        str | None, typer.Option(help="The token whose secret begins with marey_PREFIX_, to find a token that leaked.")
+    ] = None,
+    expiring: Annotated[
+        int | None, typer.Option(min=0, help="Only tokens that end within this number of days.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show your tokens, without their secrets. Scopes show to which projects a token is bound."""
+    within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
-        tokens = list(marey.tokens.list())
+        tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))
     if as_json:
         return print_json(tokens)
-    rows = [(one.id, one.name, one.prefix, " ".join(one.scopes), one.expires_at, one.last_used_at) for one in tokens]
-    return print_table(("id", "name", "prefix", "scopes", "expires", "last used"), rows)
+    rows = [
+        (one.id, one.user, one.name, one.prefix, " ".join(one.scopes), _end_of(one), one.last_used_at) for one in tokens
+    ]
+    return print_table(("id", "user", "name", "prefix", "scopes", "expires", "last used"), rows)
 
 
+def _end_of(token: Token) -> str:
+    """Return the end of a token, with the time left if that is less than `SOON_DAYS`."""
+    if token.expires_at is None:
+        return "never"
+    left = token.expires_at - datetime.now(UTC)
+    shown = f"{token.expires_at:%Y-%m-%d}"
+    if left.total_seconds() <= 0:
+        return f"{shown} (ended)"
+    return f"{shown} (in {counted(left.days, 'day')})" if left.days < SOON_DAYS else shown
+
+
+@token.command("rm", help="Revoke a token, at once; the same as `marey token revoke`.")
 @token.command("revoke")
 def revoke_token(
-    context: typer.Context, token_id: Annotated[str, typer.Argument(help="The token's id; marey token ls shows them.")]
+    context: typer.Context,
+    token_id: Annotated[str | None, typer.Argument(help="The token's id; marey token ls shows them.")] = None,
+    with_created: Annotated[
+        bool, typer.Option("--with-created", help="Also revoke the tokens that were created with it.")
+    ] = False,
+    all_of: Annotated[
+        str | None,
+        typer.Option("--all-of", metavar="USER", help="Revoke all tokens of a user instead, except the one in use."),
+    ] = None,
 ) -> None:
-    """Revoke a token, at once."""
+    """Revoke a token, at once. Administrators may revoke the tokens of others."""
+    if (token_id is None) == (all_of is None):
+        raise WrongUsage("give the id of a token, or a user with --all-of")
     with connect(context) as marey:
-        marey.tokens.revoke(token_id)
-    print_message(f"{token_id} is revoked")
+        if all_of is not None:
+            marey.users.end_tokens(all_of)
+            return print_message(f"all tokens of {all_of} are revoked, except the one in use")
+        assert token_id is not None
+        marey.tokens.revoke(token_id, with_created=with_created)
+    return print_message(f"{token_id} is revoked")
 
 
 # -- users --
@@ -208,17 +252,23 @@ def show_user(
 
 @user.command("password")
 def change_password(
-    context: typer.Context, name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
+    end_tokens: Annotated[
+        bool, typer.Option("--end-tokens", help="Also end all tokens; otherwise only sessions of sign-ins end.")
+    ] = False,
 ) -> None:
-    """Set a new password. To change your own password, enter the current one first."""
-    from marey_schemas.access import UserChange
+    """Set a new password, and end the other sessions. To change your own password, enter the current one, too."""
+    from marey_schemas.access import EndTokens, UserChange
 
     with connect(context) as marey:
         me = marey.me().user
         who = name or (me.name if me else None)
         if who is None:
             raise WrongUsage("the token belongs to no user; give the name of the user")
-        change = {"password": _ask_secret("New password", twice=True)}
+        change: dict[str, Any] = {"password": _ask_secret("New password", twice=True)}
+        if end_tokens:
+            change["end_tokens"] = EndTokens.ALL
         if me is not None and who == me.name:
             change["current_password"] = _ask_secret("Current password")
         marey.users.change(who, UserChange.model_validate(change))

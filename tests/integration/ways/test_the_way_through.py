@@ -175,6 +175,31 @@ def test_a_token_can_be_made_used_and_revoked(run: CommandLine, tmp_path: Path) 
     assert "bad-token" in run("project", "ls", "--token-file", tmp_path / "token", status=1).stderr
 
 
+def test_a_token_that_leaked_is_found_and_revoked_with_what_was_created_with_it(
+    run: CommandLine, tmp_path: Path
+) -> None:
+    leaked, copied = tmp_path / "leaked", tmp_path / "copied"
+    run("token", "create", "leaked", "--days", "3", "--output", leaked)
+    run("token", "create", "copied", "--output", copied, "--token-file", leaked)
+    listed = ("token", "ls", "--everybody", "--prefix", leaked.read_text().split("_")[1])
+    shown = run(*listed, "--expiring", "4").stdout
+    assert " days)" in shown  # 2 or 3: the clock of the server may be a second ahead
+    (found,) = json.loads(run(*listed, "--json").stdout)
+    assert found["user"] == "admin"
+    run("token", "rm", found["id"], "--with-created")
+    assert "bad-token" in run("project", "ls", "--token-file", copied, status=1).stderr
+
+
+def test_all_tokens_of_a_user_end_at_once(run: CommandLine, marey: Marey) -> None:
+    marey.users.create(UserCreate(name="lea", password="correct horse"))
+    session = marey.sign_in(Login(name="lea", password="correct horse"))
+    assert [one.id for one in marey.tokens.list(user="lea")] == [session.id]
+    assert "no-user" in run("token", "revoke", "--all-of", "nobody", status=1).stderr
+    run("token", "revoke", "--all-of", "lea")
+    assert list(marey.tokens.list(user="lea")) == []
+    assert "--all-of" in run("token", "revoke", status=2).stderr
+
+
 def test_poses_come_whole_and_in_slices(project: ProjectHandle, takes: Path) -> None:
     project.imports.upload(find_files([takes / "walk.bvh"]).files, ImportOptions(collection="raw"))
     (clip,) = project.clips.list()
