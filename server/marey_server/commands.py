@@ -11,6 +11,7 @@ import sqlite3
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -139,7 +140,8 @@ def clock(*, set_now: bool = False, **settings: Any) -> None:
     """Compare the clock that an SQLite database keeps with that of this machine; with `set_now`, set it to this one."""
     from sqlalchemy.exc import OperationalError
 
-    from marey_server.store.clock_setting import alone, read_clock, set_clock
+    from marey_server.store.clock_setting import read_clock, set_clock
+    from marey_server.store.database.opening import alone
 
     file = _sqlite_file(read_settings(**settings), must_exist=True)
     try:
@@ -151,6 +153,41 @@ def clock(*, set_now: bool = False, **settings: Any) -> None:
     _say(str(state))
     if moved is not None:
         _say(f"the database now uses the time of this machine; {moved:,} times that were later were set back")
+
+
+def purge(**settings: Any) -> None:
+    """Delete what is older than the settings keep it and what nothing refers to, then return free pages of SQLite."""
+    from marey_server.app import connect_database
+    from marey_server.store.garbage import collect_garbage
+    from marey_server.store.retention import retire
+
+    chosen = read_settings(**settings)
+    if chosen.database_url is None:
+        _sqlite_file(chosen, must_exist=True)
+    with _database_of(chosen), closing(connect_database(chosen)) as database:
+        for done in (retire(database, chosen.retention), collect_garbage(database)):
+            for name, count in asdict(done).items():
+                _say(f"deleted {count:,} {name.replace('_', ' ')}")
+        on_sqlite = database.is_sqlite
+    if on_sqlite:
+        _shrink(_sqlite_file(chosen, must_exist=True))
+
+
+def _shrink(file: Path) -> None:
+    """Give the free pages of an SQLite database back to the disk, unless a server is running."""
+    from sqlalchemy.exc import OperationalError
+
+    from marey_server.store.database.opening import vacuum
+
+    before = file.stat().st_size
+    try:
+        vacuum(file)
+    except OperationalError as error:
+        raise CommandFailed(
+            f"{file} was not made smaller ({error.orig}); stop the server, and leave as much space free as the "
+            "database needs"
+        ) from None
+    _say(f"the database takes {file.stat().st_size:,} bytes; it took {before:,}")
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:

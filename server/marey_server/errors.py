@@ -127,6 +127,13 @@ class LeaseLostProblem(ConflictProblem):
     code = "lease-lost"
 
 
+class GoneProblem(ApiProblem):
+    """It existed, and was deleted."""
+
+    status = 410
+    code = "gone"
+
+
 class PreconditionFailedProblem(ApiProblem):
     """The resource has changed since you read it."""
 

@@ -141,6 +141,15 @@ def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as
     _database("fsck", data, database_url, as_json=as_json)
 
 
+@db.command("purge")
+def purge_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
+    """Delete what is older than the settings keep it and what nothing refers to, and make an SQLite file smaller.
+
+    A server does the first two every hour by itself. To make the file smaller, stop the server before.
+    """
+    _database("purge", data, database_url)
+
+
 @db.command("clock")
 def set_clock(
     set_now: Annotated[

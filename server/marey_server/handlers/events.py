@@ -42,13 +42,18 @@ class Events(Resource):
         headers=("Last-Event-ID",),
     )
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
-        """Return events in the order of their commits; as text/event-stream, also future events."""
+        """Return events in the order of their commits; as text/event-stream, also future events.
+
+        If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and its context
+        has the number after which the kept ones begin.
+        """
         after = self._last_received(query)
         await self.services.number_events()
         if self.media is not EVENT_STREAM:
             found = await self.look_up(events.list_events, project, after=after, limit=query.limit)
             return Reply(Page(items=tuple(found)))
         project_id = (await self.look_up(projects.require, project)).id
+        await self.look_up(events.require_kept, after)
         self.set_header("Content-Type", "text/event-stream")
         self.set_header("Cache-Control", "no-store")
         if self.request.method != "HEAD":

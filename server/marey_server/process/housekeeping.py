@@ -1,4 +1,4 @@
-"""Housekeeping of the server: reclaims expired leases, serves waiting results, collects garbage, forgets sign-ins.
+"""Housekeeping of the server: reclaims leases, serves waiting results, deletes what is old or unreferenced.
 
 Only the leading process does it, but concurrent housekeeping would be safe, because every statement repeats its
 conditions. Each chore is a task of its own, so that a failing chore does not affect the others.
@@ -20,6 +20,7 @@ from marey_server.store import leader, sign_ins
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.retention import retire
 from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
@@ -122,8 +123,13 @@ def _leads(tx: Transaction, holder: str) -> bool:
 
 async def _collect_garbage(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
-        collected = await asyncio.wrap_future(services.compute_threads.submit(collect_garbage, services.database))
-        log.info("collected garbage: %s", collected)
+        retired = await _in_thread(services, retire, services.database, services.settings.retention)
+        collected = await _in_thread(services, collect_garbage, services.database)
+        log.info("deleted what was old: %s; collected garbage: %s", retired, collected)
+
+
+async def _in_thread(services: Services, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    return await asyncio.wrap_future(services.compute_threads.submit(function, *args, **kwargs))
 
 
 async def _forget_tries(services: Services, holder: str) -> None:

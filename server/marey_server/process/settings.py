@@ -12,6 +12,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_server.store.jobs.policy import QueuePolicy
+from marey_server.store.retention import Retention
 
 MIB = 1024 * 1024
 
@@ -128,6 +129,17 @@ class Settings(BaseSettings):
         le=3600,
         description="Seconds that a worker has to stop a job that was cancelled or whose time limit has passed.",
     )
+    events_days: int = Field(
+        Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever, as for the next two."
+    )
+    logs_days: int = Field(
+        Retention.logs_days, ge=0, description="Days for which the log of an attempt is kept after its end."
+    )
+    jobs_days: int = Field(
+        Retention.jobs_days,
+        ge=0,
+        description="Days for which a job is kept after its end. A job that made a revision is kept for ever.",
+    )
     local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
 
     @field_validator("data")
@@ -158,6 +170,11 @@ class Settings(BaseSettings):
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Return the sources in order of precedence: flags, variables, file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    @property
+    def retention(self) -> Retention:
+        """Return for how long events, logs and jobs are kept."""
+        return Retention(self.events_days, self.logs_days, self.jobs_days)
 
     @property
     def resolved_database_threads(self) -> int:

@@ -6,13 +6,9 @@ would count from then on; here the mark is set to the time of this machine, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
-import sqlalchemy
-from sqlalchemy import Connection, NullPool, update
+from sqlalchemy import Connection, update
 
 from marey_server.store.database.clock import datetime_of, set_high_water, stored_high_water_us, wall_clock_us
 from marey_server.store.tables import job, metadata, token
@@ -45,20 +41,6 @@ class StoredClock:
 def read_clock(connection: Connection) -> StoredClock:
     """Return the clock of a database."""
     return StoredClock(stored_high_water_us(connection), wall_clock_us())
-
-
-@contextmanager
-def alone(file: Path) -> Iterator[Connection]:
-    """Connect to an SQLite file that no other process has open, in one transaction.
-
-    Raises `sqlalchemy.exc.OperationalError` if another process has it open.
-    """
-    engine = sqlalchemy.create_engine(f"sqlite:///{file}", poolclass=NullPool, connect_args={"timeout": 1.0})
-    with engine.connect() as connection:
-        connection.exec_driver_sql("PRAGMA locking_mode = EXCLUSIVE")  # also excludes those that only have it open
-        connection.exec_driver_sql("BEGIN EXCLUSIVE")
-        yield connection
-        connection.commit()
 
 
 def set_clock(connection: Connection) -> int:

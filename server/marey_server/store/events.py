@@ -9,12 +9,14 @@ than one that was already listed, writers do not wait for each other, and the or
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import takewhile
 from typing import Any, NamedTuple
 
-from sqlalchemy import BigInteger, ColumnElement, Row, and_, cast, exists, func, select, text, update
+from sqlalchemy import BigInteger, ColumnElement, Row, and_, cast, delete, exists, func, insert, select, text, update
 
 from marey_schemas.items import Event
 from marey_server.access.roles import require_administrator
+from marey_server.errors import GoneProblem
 from marey_server.store import projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.jobs.fencing import QUEUED
@@ -30,6 +32,9 @@ CHANNEL = "marey_events"
 """Channel of Postgres on which servers announce to each other that events got numbers."""
 
 _LAST_NUMBER = "last_event_number"
+_LAST_DELETED = "last_deleted_event"
+DELETED_AT_ONCE = 1000
+"""Greatest number of events that are deleted in one transaction."""
 _UNNUMBERED = event.c.number.is_(None)
 
 
@@ -38,8 +43,10 @@ def list_events(
 ) -> list[Event]:
     """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
-    With `subject`, only events of that object are listed. On Postgres, call `number_events` before.
+    With `subject`, only events of that object are listed. On Postgres, call `number_events` before. Raises
+    `GoneProblem` if events after `after` were deleted, unless `after` is 0, the beginning of what is kept.
     """
+    require_kept(tx, after)
     number = _number(tx)
     statement = select(*_COLUMNS, number.label("number"), project.c.name.label("project")).select_from(
         event.outerjoin(project, project.c.id == event.c.project_id)
@@ -52,6 +59,34 @@ def list_events(
         statement = statement.where(event.c.subject == subject)
     rows = tx.execute(statement.where(_follows(tx, after)).order_by(number).limit(min(limit, MAX_EVENTS)))
     return [_shown(row) for row in rows]
+
+
+def require_kept(tx: Transaction, after: int) -> None:
+    """Check that a follower who received the event numbered `after` has missed none. Raises `GoneProblem`."""
+    last = tx.execute(select(server_state.c.value).where(server_state.c.key == _LAST_DELETED)).scalar()
+    if 0 < after < (last or 0):
+        raise GoneProblem(
+            f"Events up to number {last} were deleted because they are old; list what you follow again, and continue "
+            f"with after={last}.",
+            code="events-deleted",
+            context={"after": last},
+        )
+
+
+def delete_oldest(tx: Transaction, age_us: int) -> int:
+    """Delete some of the oldest events if they are older than `age_us`, and return how many; the newest one is kept."""
+    number = _number(tx)
+    newest = newest_number(tx)
+    oldest = select(number.label("number"), event.c.at_us).where(_follows(tx, 0), number < newest)
+    rows = tx.execute(oldest.order_by(number).limit(DELETED_AT_ONCE)).all()
+    old = list(takewhile(lambda row: row.at_us < tx.now_us - age_us, rows))
+    if not old:
+        return 0
+    tx.execute(delete(event).where(_follows(tx, 0), number <= old[-1].number))
+    is_mark = server_state.c.key == _LAST_DELETED
+    if tx.execute(update(server_state).where(is_mark).values(value=old[-1].number)).rowcount == 0:
+        tx.execute(insert(server_state).values(key=_LAST_DELETED, value=old[-1].number))
+    return len(old)
 
 
 _COLUMNS = (event.c.at_us, event.c.kind, event.c.subject, event.c.actor, event.c.body)

@@ -36,6 +36,7 @@ from marey_server.store.tokens import forget_ended
 from marey_server.store.transaction import Transaction
 
 BATCH = 200
+"""Number of rows, or of jobs, that are deleted in one transaction."""
 MOST_UPLOADS = 10_000
 """Number of rows deleted in one round; databases limit the parameters of a statement."""
 

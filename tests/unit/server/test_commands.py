@@ -1,6 +1,7 @@
 """The care of a database from the shell: backup, restore, check; the event loop of a server."""
 
 import asyncio
+import re
 import sqlite3
 import stat
 import sys
@@ -74,6 +75,31 @@ def test_nothing_is_restored_over_or_beside_what_a_server_left(data: Path, tmp_p
     with pytest.raises(commands.CommandFailed, match=left):
         commands.restore(source=tmp_path / "copy.db", data=target)
     assert [path.name for path in target.iterdir()] == [left]
+
+
+def test_a_purge_deletes_what_is_old_and_makes_the_file_smaller(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = data / "marey.db"
+    with closing(sqlite3.connect(file)) as server:
+        server.execute("CREATE TABLE ballast AS SELECT zeroblob(4000000) AS bytes")
+        server.execute("DROP TABLE ballast")
+        server.execute("UPDATE event SET at_us = 1")
+        server.execute("INSERT INTO event (at_us, kind, subject, body) VALUES (2, 'newest', 'x', '{}')")
+        server.commit()
+    before = file.stat().st_size
+    commands.purge(data=data)
+    said = capsys.readouterr().out
+    assert re.search(r"deleted [1-9]\d* events", said)
+    assert f"it took {before:,}" in said
+    assert before - file.stat().st_size > 3_000_000
+    commands.fsck(data=data)
+
+
+def test_a_purge_beside_a_running_server_deletes_and_says_why_the_file_stays(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(open_database(Settings(data=data))), pytest.raises(commands.CommandFailed, match="stop the server"):
+        commands.purge(data=data)
+    assert "deleted 0 events" in capsys.readouterr().out
 
 
 def test_a_new_administrators_token_is_written_for_who_lost_theirs(

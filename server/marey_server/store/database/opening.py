@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from alembic.util import CommandError
-from sqlalchemy import exc, make_url
+from sqlalchemy import Connection, NullPool, create_engine, exc, make_url
 
 from marey_server.errors import StorageFullProblem, UnavailableProblem
 from marey_server.store.database.clock import ClockFarAhead
@@ -51,6 +51,27 @@ def sqlite_file(url: str) -> Path | None:
     ):
         return None
     return Path(parsed.database)
+
+
+@contextmanager
+def alone(file: Path) -> Iterator[Connection]:
+    """Connect to an SQLite file that no other process has open, in one transaction.
+
+    Raises `sqlalchemy.exc.OperationalError` if another process has it open.
+    """
+    engine = create_engine(f"sqlite:///{file}", poolclass=NullPool, connect_args={"timeout": 1.0})
+    with engine.connect() as connection:
+        connection.exec_driver_sql("PRAGMA locking_mode = EXCLUSIVE")  # also excludes those that only have it open
+        connection.exec_driver_sql("BEGIN EXCLUSIVE")
+        yield connection
+        connection.commit()
+
+
+def vacuum(file: Path) -> None:
+    """Copy an SQLite file without its free pages. Raises like `alone`, and if the disk has no room for the copy."""
+    with alone(file) as connection:
+        connection.commit()  # a vacuum runs outside of transactions; the lock stays
+        connection.exec_driver_sql("VACUUM")
 
 
 def _shown(url: str) -> str:

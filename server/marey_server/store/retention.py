@@ -1,0 +1,165 @@
+"""Retention: deletes events, logs and jobs that are older than the server keeps them.
+
+Work is done in batches, each in a transaction of its own, so that no other write waits long. A process that dies
+between two batches leaves nothing behind that the next round does not find. Every revision keeps the job that made it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, and_, delete, exists, insert, or_, select, tuple_, update
+
+from marey_server.access.principal import SYSTEM
+from marey_server.store import events
+from marey_server.store.database.connections import Database
+from marey_server.store.garbage import BATCH
+from marey_server.store.tables import (
+    attempt,
+    job,
+    job_blob,
+    job_dependency,
+    job_log,
+    lineage,
+    revision,
+    staged_output,
+)
+from marey_server.store.transaction import Transaction
+
+DAY_US = 86400 * 1_000_000
+DELETED_LOG = b"[This log was deleted because it was old.]\n"
+"""Text of a log that was deleted. Logs that are not longer are kept."""
+
+
+@dataclass(frozen=True)
+class Retention:
+    """Numbers of days for which things are kept after their end; 0: for ever."""
+
+    events_days: int = 365
+    logs_days: int = 90
+    jobs_days: int = 365
+
+
+@dataclass(frozen=True, slots=True)
+class Retired:
+    """Numbers of deleted things."""
+
+    events: int = 0
+    logs: int = 0
+    jobs: int = 0
+
+
+def retire(database: Database, retention: Retention) -> Retired:
+    """Delete what is older than the server keeps it; safe at any time and in several processes at once."""
+    return Retired(
+        events=_retire_events(database, retention.events_days) if retention.events_days else 0,
+        logs=_retire_logs(database, retention.logs_days) if retention.logs_days else 0,
+        jobs=_retire_jobs(database, retention.jobs_days) if retention.jobs_days else 0,
+    )
+
+
+def _retire_events(database: Database, days: int) -> int:
+    deleted = 0
+    while count := database.write(SYSTEM, events.delete_oldest, days * DAY_US):
+        deleted += count
+    return deleted
+
+
+# -- logs --------------------------------------------------------------------------------------------------------------
+
+
+def _retire_logs(database: Database, days: int) -> int:
+    deleted, after = 0, ("", 0)
+    while found := database.read(SYSTEM, _old_logs, days * DAY_US, after):
+        deleted += database.write(SYSTEM, _delete_logs, found)
+        after = found[-1]
+    return deleted
+
+
+def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tuple[str, int]]:
+    """Return the next attempts, by job and fence, that ended long ago and have a log."""
+    statement = (
+        select(attempt.c.job_id, attempt.c.fence)
+        .where(
+            tuple_(attempt.c.job_id, attempt.c.fence) > tuple_(*after),
+            attempt.c.ended_us < tx.now_us - age_us,
+            attempt.c.log_bytes > len(DELETED_LOG),
+        )
+        .order_by(attempt.c.job_id, attempt.c.fence)
+        .limit(BATCH)
+    )
+    return [(row.job_id, row.fence) for row in tx.execute(statement)]
+
+
+def _delete_logs(tx: Transaction, attempts: Sequence[tuple[str, int]]) -> int:
+    """Put `DELETED_LOG` in the place of logs. Logs of ended attempts do not grow any more."""
+    chosen = tuple_(job_log.c.job_id, job_log.c.fence).in_(attempts)
+    tx.execute(delete(job_log).where(chosen))
+    notices = [{"job_id": job_id, "fence": fence, "offset": 0, "data": DELETED_LOG} for job_id, fence in attempts]
+    tx.execute(insert(job_log), notices)
+    shortened = update(attempt).where(tuple_(attempt.c.job_id, attempt.c.fence).in_(attempts))
+    tx.execute(shortened.values(log_bytes=len(DELETED_LOG)))
+    return len(attempts)
+
+
+# -- jobs --------------------------------------------------------------------------------------------------------------
+
+
+def _retire_jobs(database: Database, days: int) -> int:
+    deleted, after = 0, ""
+    while found := database.read(SYSTEM, _old_jobs, days * DAY_US, after):
+        for job_id in found:
+            while tasks := database.write(SYSTEM, _delete_tasks, job_id):
+                deleted += tasks
+            deleted += database.write(SYSTEM, _delete_if_unused, job_id)
+        after = found[-1]
+    return deleted
+
+
+task = job.alias("task")
+
+
+def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
+    """Return the next jobs that ended long ago and, with their tasks, made no revision and have no job after them."""
+    tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
+    with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))
+    others = and_(job_dependency.c.job_id != job.c.id, job_dependency.c.job_id.not_in(tasks))
+    task_needed = or_(task.c.finished_us.is_(None), _made_something(task.c.id))
+    statement = (
+        select(job.c.id)
+        .where(
+            job.c.id > after,
+            job.c.parent_id.is_(None),
+            job.c.finished_us < tx.now_us - age_us,
+            ~_made_something(job.c.id),
+            ~exists().where(task.c.parent_id == job.c.id, task_needed),
+            ~exists().where(with_tasks, others),
+        )
+        .order_by(job.c.id)
+        .limit(BATCH)
+    )
+    return list(tx.execute(statement).scalars())
+
+
+def _made_something(job_id: ColumnElement[str]) -> ColumnElement[bool]:
+    return or_(exists().where(revision.c.job_id == job_id), exists().where(lineage.c.job_id == job_id))
+
+
+def _delete_tasks(tx: Transaction, parent: str) -> int:
+    """Delete some tasks of an old job, and return how many."""
+    some = list(tx.execute(select(job.c.id).where(job.c.parent_id == parent).limit(BATCH)).scalars())
+    tx.execute(delete(job_dependency).where(job_dependency.c.job_id == parent, job_dependency.c.on_job_id.in_(some)))
+    return _delete_jobs(tx, some)
+
+
+def _delete_if_unused(tx: Transaction, job_id: str) -> int:
+    """Delete an old job unless a job after it was submitted meanwhile."""
+    used = select(job_dependency.c.job_id).where(job_dependency.c.on_job_id == job_id).limit(1)
+    return 0 if tx.execute(used).first() else _delete_jobs(tx, [job_id])
+
+
+def _delete_jobs(tx: Transaction, job_ids: Sequence[str]) -> int:
+    for table in (job_log, staged_output, attempt, job_blob, job_dependency):
+        tx.execute(delete(table).where(table.c.job_id.in_(job_ids)))
+    return tx.execute(delete(job).where(job.c.id.in_(job_ids))).rowcount
