@@ -20,8 +20,8 @@ PAST = frozenset(
     }
 )  # fmt: skip
 """Columns of moments that have passed; none may lie in the future."""
-WAITING = frozenset({"expires_us", "lease_expires_us", "run_at_us"})
-"""Columns of moments to wait for: leases and leaders are renewed, and jobs may run, as soon as a server starts."""
+WAITING = frozenset({"expires_us", "lease_expires_us", "run_at_us", "until_us"})
+"""Columns of moments to wait for. Leases and leaders are renewed, and jobs and sign-ins go on, when a server starts."""
 MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.started_us}
 """Columns of moments that keep their distance from another column of the row if that one lies in the future."""
 
