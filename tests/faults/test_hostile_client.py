@@ -1,0 +1,92 @@
+"""A hostile client at every route, as every kind of caller: the server refuses, survives and changes nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+from tests.support.furnished_house import House, build_house
+from tests.support.hostile_client import fire_all, shots, some
+from tests.support.process_cost import ProcessCost
+from tests.support.rest_server import People
+from tests.support.server_process import ServerProcess
+from tests.support.tiers import examples
+from tests.support.who_may import PEOPLE
+
+from marey_server.store.database.connections import Database
+from marey_server.store.tables import metadata
+
+pytestmark = pytest.mark.timeout(3600)
+
+SEED = 20261123
+OUTSIDERS = tuple(person.name for person in PEOPLE.values() if person.rank < 0 and person.standing != "attempt")
+MOST_MB = 1_200
+"""Twice what the server and its children may take, because this bound must hold on a busy machine."""
+OWN_BUSINESS = {"leader", "server_state", "event"}
+"""Tables that the server changes by itself."""
+SETTINGS = {"MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5"}
+
+
+@dataclass
+class Attacked:
+    """A furnished server in a process of its own."""
+
+    process: ServerProcess
+    house: House
+    cost: ProcessCost
+
+    def fingerprint(self) -> dict[str, str]:
+        """Return a digest of the rows of each table, except for what the server writes by itself."""
+        found = {}
+        engine = self.house.people.database.engine
+        with engine.connect() as connection:
+            for table in metadata.sorted_tables:
+                columns = [column for column in table.columns if column.name != "last_used_us"]
+                rows = sorted(map(repr, connection.execute(select(*columns))))
+                found[table.name] = hashlib.sha256("\n".join(rows).encode()).hexdigest()
+        return {name: digest for name, digest in found.items() if name not in OWN_BUSINESS}
+
+
+@pytest.fixture
+def attacked(tmp_path: Path, database_url: str) -> Iterator[Attacked]:
+    """A furnished server in a process of its own, on SQLite and on Postgres."""
+    process = ServerProcess(tmp_path, database_url, **SETTINGS).start()
+    database = Database(database_url)
+    people = People(process.url, database)
+    try:
+        assert process.process is not None
+        yield Attacked(process, build_house(people), ProcessCost(process.process.pid))
+        assert process.stop() == 0, process.log.read_text()[-3000:]
+    finally:
+        process.stop()
+        people.close()
+        database.close()
+
+
+def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_well(attacked: Attacked) -> None:
+    every = some(shots(attacked.house), examples(250), SEED)
+    refused = [shot for shot in every if shot.refusal]
+    before = attacked.fingerprint()
+    outcomes = asyncio.run(fire_all(attacked.process.url, refused, 8))
+    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert attacked.fingerprint() == before
+
+    accepted = [shot for shot in every if not shot.refusal]
+    outcomes = asyncio.run(fire_all(attacked.process.url, accepted, 8))
+    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert accepted
+    assert refused
+    assert attacked.cost.peak_mb() < MOST_MB
+    assert attacked.house.people.client(attacked.house.tokens["reader"]).get("/projects/lab").status_code == 200
+
+
+def test_two_hundred_hostile_connections_leave_no_fault(attacked: Attacked) -> None:
+    outsiders = [shot for shot in shots(attacked.house, OUTSIDERS) if shot.refusal]
+    outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, examples(250), SEED), 200))
+    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert attacked.cost.peak_mb() < MOST_MB

@@ -1,0 +1,63 @@
+"""Random calls by callers of every kind against a model of what each may do and know, and holes that it must find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.support.rest_server import Server, running
+from tests.support.tiers import examples
+from tests.support.who_may_know import Program
+
+from marey_server.access import roles, scopes
+from marey_server.store import blobs
+from marey_server.store.database.connections import Database
+
+pytestmark = pytest.mark.timeout(7200)
+
+SEED = 20261123
+CALLS = 1_000
+"""Calls in the tier `test`; the tier `soak` makes twenty times as many."""
+CALLS_TO_FIND_A_HOLE = 2_000
+
+
+@pytest.fixture
+def server(database: Database, tmp_path: Path) -> Iterator[Server]:
+    """A running server, on SQLite and on Postgres."""
+    with running(database, tmp_path) as one:
+        yield one
+
+
+def test_every_caller_does_and_knows_what_the_model_says(server: Server) -> None:
+    program = Program(server, SEED)
+    program.run(examples(CALLS))
+    assert program.differences == []
+
+
+def _bounds_of_tokens_are_forgotten(held: Any, need: str, _project: str | None = None) -> bool:
+    return scopes.reaches_somewhere(held, need)
+
+
+def _everybody_holds_all_bytes(_tx: Any, digests: Any, **_since: Any) -> set[str]:
+    return set(digests)
+
+
+def _every_role_is_enough(_role: Any, _required: Any) -> bool:
+    return True
+
+
+HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
+    "every member may do everything": (roles, "includes", _every_role_is_enough),
+    "a token reaches beyond its project": (scopes, "allows", _bounds_of_tokens_are_forgotten),
+    "a digest is enough to have the bytes": (blobs, "_held", _everybody_holds_all_bytes),
+}
+
+
+@pytest.mark.parametrize("hole", HOLES)
+def test_a_planted_hole_is_found(server: Server, monkeypatch: pytest.MonkeyPatch, hole: str) -> None:
+    monkeypatch.setattr(*HOLES[hole])
+    program = Program(server, SEED)
+    program.run(CALLS_TO_FIND_A_HOLE)
+    assert program.differences

@@ -1,0 +1,198 @@
+"""What a hostile client costs a server, and what others notice of it: `python -m tests.support.hostile_figures`.
+
+Options: `--seconds` of the crowd of 200 connections, `--shots` of those that are sent one after another to measure
+their cost, `--database` for another database than SQLite. Figures to reach on two processors: no request of up to 10 kB
+takes more than 50 ms of processor time or 20 MB; the server stays below 600 MB; 99 of 100 answers to a well-behaved
+client come within 250 ms, heartbeats within 2 s, and `/readyz` within 1 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import multiprocessing
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from pathlib import Path
+
+import httpx
+from tests.support.furnished_house import House, build_house
+from tests.support.hostile_client import (
+    ENDS_CREDENTIALS,
+    SMALL_BYTES,
+    Manner,
+    Outcome,
+    Shot,
+    fire,
+    fire_all,
+    shots,
+    some,
+)
+from tests.support.process_cost import ProcessCost
+from tests.support.rest_server import People
+from tests.support.server_process import ServerProcess
+from tests.support.who_may import PEOPLE
+
+from marey_server.store.database.connections import Database
+
+CONNECTIONS = 200
+SEED = 20261123
+WORST = 12
+_EVERY_S = 0.05
+Row = tuple[float, float, Outcome]
+"""Processor time in milliseconds and memory in MB that a shot cost, and its outcome."""
+
+
+class Companion:
+    """Well-behaved client that notes how long it waits, in a thread."""
+
+    def __init__(self, name: str, ask: Callable[[], httpx.Response]) -> None:
+        self.name = name
+        self._ask = ask
+        self._waits_s: list[float] = []
+        self._refused: list[int] = []
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name)
+
+    def __enter__(self) -> None:
+        self._waits_s, self._refused = [], []
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._run, name=self.name)
+        self._thread.start()
+
+    def __exit__(self, *_error: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(_EVERY_S):
+            start = time.monotonic()
+            status = self._ask().status_code
+            self._waits_s.append(time.monotonic() - start)
+            if status >= 400:
+                self._refused.append(status)
+
+    def line(self) -> str:
+        """Return the figures as a line."""
+        waits_ms = sorted(1e3 * wait for wait in self._waits_s) or [0.0]
+        p99 = waits_ms[min(len(waits_ms) - 1, round(0.99 * len(waits_ms)))]
+        return (
+            f"  {self.name:24} {len(waits_ms):6} answers  median {statistics.median(waits_ms):7.1f} ms  "
+            f"p99 {p99:7.1f} ms  longest {waits_ms[-1]:7.1f} ms  refused {len(self._refused)}"
+        )
+
+
+def measure_costs(url: str, every: Sequence[Shot], cost: ProcessCost) -> None:
+    """Send shots one after another and print the most expensive ones."""
+    rows: list[Row] = []
+    for shot in every:
+        cost.wait_until_idle()
+        cost.reset_peak()
+        resident, processor = cost.resident_mb(), cost.processor_s()
+        outcome = asyncio.run(fire(url, shot))
+        cost.wait_until_idle()
+        times = 2 if shot.manner is Manner.TWICE else 6 if shot.manner is Manner.UNREAD else 1
+        rows.append((1e3 * (cost.processor_s() - processor) / times, cost.peak_mb() - resident, outcome))
+    small = [row for row in rows if len(row[2].shot.data) <= SMALL_BYTES]
+    print(f"{len(rows)} requests one after another, {len(small)} of them of up to 10 kB; the server: "
+          f"{cost.resident_mb():.0f} MB")  # fmt: skip
+    for unit, figure in (("ms of processor time", _processor_ms), ("MB more", _more_mb)):
+        print(f"  most {unit}, per request of up to 10 kB")
+        for row in sorted(small, key=figure, reverse=True)[:WORST]:
+            print(f"    {figure(row):9.1f}  {_said(row[2])}")
+
+
+_processor_ms: Callable[[Row], float] = itemgetter(0)
+_more_mb: Callable[[Row], float] = itemgetter(1)
+
+
+def _said(outcome: Outcome) -> str:
+    return f"{outcome.shot.label} ({len(outcome.shot.data)} bytes): {outcome.status} after {outcome.seconds:.2f} s"
+
+
+def attack(url: str, every: Sequence[Shot], seconds: float) -> None:
+    """Send shots over 200 connections for a time, and print the faults and the longest waits."""
+    deadline = time.monotonic() + seconds
+    endless = itertools.takewhile(lambda _shot: time.monotonic() < deadline, itertools.cycle(every))
+    outcomes = asyncio.run(fire_all(url, endless, CONNECTIONS))
+    counts: dict[int | None, int] = {}
+    for outcome in outcomes:
+        counts[outcome.status] = counts.get(outcome.status, 0) + 1
+    print(f"{len(outcomes)} hostile requests in {seconds:.0f} s; answers by status: {counts}", flush=True)
+    for outcome in filter(lambda outcome: outcome.fault, outcomes):
+        print(f"  FAULT {outcome.fault}", flush=True)
+
+
+def companions_of(house: House) -> list[Companion]:
+    """Return a reader, a worker that sends heartbeats, and an orchestrator that asks whether the server is ready."""
+    people, values = house.people, house.variables
+    reader, attempt = people.client(house.tokens["reader"]), people.client(house.tokens["attempt"])
+    asking = httpx.Client(base_url=people.address, timeout=120)
+    heartbeat = f"/jobs/{values['job']}/attempts/{values['fence']}/heartbeat"
+    clip = f"/projects/lab/clips/{values['item']}"
+    return [
+        Companion("reads a clip", lambda: reader.get(clip)),
+        Companion("sends heartbeats", lambda: attempt.post(heartbeat, json={})),
+        Companion("asks /readyz", lambda: asking.get("/readyz")),
+    ]
+
+
+def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float) -> None:
+    """Print what well-behaved clients wait, alone and beside 200 hostile connections of 20 principals."""
+    several = [house]
+    for number in range(20 - len(PEOPLE)):
+        tokens = {"stranger": house.people.make_user(f"stranger{number}")}
+        several.append(House(house.people, tokens, house.variables))
+    hostile = [
+        shot
+        for one in several
+        for shot in some(shots(one, tuple(one.tokens)), 2_000, SEED)
+        if not shot.route.endswith(ENDS_CREDENTIALS) and len(shot.data) <= SMALL_BYTES
+    ]
+    companions = companions_of(house)
+    for name in (
+        "alone",
+        f"beside {CONNECTIONS} hostile connections of {sum(len(one.tokens) for one in several)} callers",
+    ):
+        cost.reset_peak()
+        start, processor = time.monotonic(), cost.processor_s()
+        with companions[0], companions[1], companions[2]:
+            if name == "alone":
+                time.sleep(seconds / 3)
+            else:
+                crowd = multiprocessing.get_context("spawn").Process(target=attack, args=(url, hostile, seconds))
+                crowd.start()
+                crowd.join()
+        busy = (cost.processor_s() - processor) / (time.monotonic() - start)
+        print(f"{name}: peak {cost.peak_mb():.0f} MB, {busy:.2f} processors")
+        for companion in companions:
+            print(companion.line(), flush=True)
+
+
+def main() -> None:
+    """Run the measurements."""
+    parser = argparse.ArgumentParser(prog="python -m tests.support.hostile_figures")
+    parser.add_argument("--seconds", type=float, default=60)
+    parser.add_argument("--shots", type=int, default=1_000)
+    parser.add_argument("--database", help="address of an empty Postgres database with the newest schema")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        process = ServerProcess(Path(folder), given.database, MAREY_LEASE_TTL_S="3600").start()
+        assert process.process is not None
+        database = Database(given.database or f"sqlite:///{process.data / 'marey.db'}")
+        try:
+            house, cost = build_house(People(process.url, database)), ProcessCost(process.process.pid)
+            measure_crowd(process.url, house, cost, given.seconds)
+            measure_costs(process.url, some(shots(house), given.shots, SEED), cost)
+        finally:
+            process.stop()
+            database.close()
+
+
+if __name__ == "__main__":
+    main()

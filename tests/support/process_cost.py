@@ -1,0 +1,81 @@
+"""Processor time and memory of a process and its children, from /proc."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from pathlib import Path
+
+_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+_QUIET_S = 0.0005
+"""Processor time within two hundredths of a second below which a process is idle."""
+_LONGEST_WAIT_S = 20.0
+
+
+class ProcessCost:
+    """What a process and its children take; the peak is measured from the last `reset_peak`."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+
+    def processor_s(self) -> float:
+        """Return the processor time so far in seconds, that of ended children included."""
+        total = self._ended_children_s()
+        for pid in self._family():
+            for task in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+                with contextlib.suppress(OSError, IndexError):
+                    total += int(task.read_text().split()[0]) / 1e9
+        return total
+
+    def peak_mb(self) -> float:
+        """Return the greatest resident memory since `reset_peak` in MB, summed over the processes that live."""
+        return sum(self._status_kb(pid, "VmHWM") for pid in self._family()) / 1e3
+
+    def resident_mb(self) -> float:
+        """Return the resident memory in MB."""
+        return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
+
+    def reset_peak(self) -> None:
+        """Start to measure the peak of memory again."""
+        for pid in self._family():
+            with contextlib.suppress(OSError):
+                Path(f"/proc/{pid}/clear_refs").write_text("5")
+
+    def wait_until_idle(self) -> None:
+        """Wait until the process does nothing, so that work after an answer is measured with it."""
+        deadline = time.monotonic() + _LONGEST_WAIT_S
+        before = self.processor_s()
+        while time.monotonic() < deadline:
+            time.sleep(0.02)
+            now = self.processor_s()
+            if now - before < _QUIET_S:
+                return
+            before = now
+
+    def _family(self) -> list[int]:
+        children: dict[int, list[int]] = {}
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                children.setdefault(int(_fields(stat)[1]), []).append(int(stat.parent.name))
+        family = [self.pid]
+        for pid in family:  # grows while it is read
+            family += children.get(pid, [])
+        return family
+
+    def _ended_children_s(self) -> float:
+        fields = _fields(Path(f"/proc/{self.pid}/stat"))
+        return (int(fields[13]) + int(fields[14])) * _TICK_S
+
+    @staticmethod
+    def _status_kb(pid: int, name: str) -> int:
+        with contextlib.suppress(OSError):
+            for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+                if line.startswith(f"{name}:"):
+                    return int(line.split()[1])
+        return 0
+
+
+def _fields(stat: Path) -> list[str]:
+    """Return the fields after the name of a process."""
+    return stat.read_text().rpartition(")")[2].split()

@@ -1,0 +1,303 @@
+"""Model of who may know what: projects, members, items, blobs and tokens in memory, and what each caller is answered.
+
+Projects, users, items and bytes carry marks in their texts. After every call the answer must have the status of the
+model, contain what the caller asked for, and contain no mark of a project that the caller may not read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+from tests.support.furnished_house import HIERARCHY, MOTION
+from tests.support.rest_server import ALL_SCOPES, USER_SCOPES, People
+from tests.support.who_may import RANK
+
+from marey_schemas.access import Role
+
+PROJECTS = ("red", "green", "blue")
+USERS = ("ann", "bob", "cleo", "dora")
+BLOBS = tuple(f"bytes {number}".encode() for number in range(6))
+DIGESTS = tuple(f"sha256:{hashlib.sha256(data).hexdigest()}" for data in BLOBS)
+POSSESSION_BY_PROJECT = False
+"""Whether bytes that a token of one project has sent are unknown to the other tokens of its user."""
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Credential: whose it is, and the one project that it is bound to, if any."""
+
+    user: str | None
+    bound: str | None = None
+    scopes: tuple[str, ...] = USER_SCOPES
+
+    @property
+    def name(self) -> str:
+        return f"{self.user or 'anonymous'} {self.bound or ''} {','.join(self.scopes)}"
+
+
+ROOT = Caller("root", scopes=ALL_SCOPES)
+CALLERS = (
+    Caller(None),
+    *(Caller(user) for user in USERS),
+    *(Caller(user, bound) for user in USERS[:2] for bound in PROJECTS[:2]),
+    Caller("ann", scopes=("read",)),
+    Caller("cleo", scopes=("write",)),
+    ROOT,
+)
+
+
+@dataclass
+class World:
+    """What there is, and who is what."""
+
+    public: set[str] = field(default_factory=set)
+    roles: dict[tuple[str, str], Role] = field(default_factory=dict)
+    disabled: set[str] = field(default_factory=set)
+    held: set[tuple[str, str | None, int]] = field(default_factory=set)
+    stored: set[int] = field(default_factory=set)
+    items: dict[str, dict[str, int | None]] = field(default_factory=lambda: {name: {} for name in PROJECTS})
+
+    def refused(self, caller: Caller) -> bool:
+        return caller.user in self.disabled
+
+    def has(self, caller: Caller, scope: str, project: str | None = None) -> bool:
+        """Return whether the credential includes a scope, in a project if one is named."""
+        return scope in caller.scopes and caller.bound in (None, project or caller.bound)
+
+    def role(self, caller: Caller, project: str) -> Role | None:
+        """Return the caller's role, None for outsiders and tokens that do not reach the project."""
+        if caller.user is None or caller.bound not in (None, project):
+            return None
+        return Role.OWNER if caller == ROOT else self.roles.get((project, caller.user))
+
+    def knows(self, caller: Caller, project: str) -> bool:
+        """Return whether the caller may know that a project exists."""
+        return project in self.public or self.role(caller, project) is not None
+
+    def status(self, caller: Caller, project: str, least: Role, scope: str, *, guests: bool = True) -> int:
+        """Return the status with which an operation of a project refuses a caller, or 0."""
+        if self.refused(caller):
+            return 401
+        reads = least is Role.READER and guests
+        if caller.user is None and not reads:
+            return 401
+        if caller.user is not None and scope not in caller.scopes:
+            return 403
+        role = self.role(caller, project)
+        if role is None:
+            if project not in self.public:
+                return 404
+            return 0 if reads else 403
+        if RANK[role] < RANK[least]:
+            return 403
+        return 0
+
+    def sees_contents(self, caller: Caller, project: str) -> bool:
+        """Return whether the caller may read what is in a project."""
+        mine = self.role(caller, project) is not None and self.has(caller, "read", project)
+        return project in self.public or mine
+
+    def referring(self, caller: Caller, blob: int) -> bool:
+        """Return whether something that the caller may read refers to a blob."""
+        return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
+
+    def may_refer(self, caller: Caller, blob: int) -> bool:
+        """Return whether the caller may read a blob, or refer to it."""
+        places = (None, caller.bound) if POSSESSION_BY_PROJECT and caller.bound else (None, *PROJECTS)
+        held = any((caller.user, place, blob) in self.held for place in places)
+        return held or self.referring(caller, blob)
+
+
+class Program:
+    """Random calls on a server and on the model; `differences` collects where they disagree."""
+
+    def __init__(self, people: People, seed: int) -> None:
+        self.people = people
+        self.chance = random.Random(seed)
+        self.world = World()
+        self.differences: list[str] = []
+        self.calls = 0
+        self._made = 0
+        self.skeletons: dict[str, dict[str, Any]] = {}
+        self._furnish()
+
+    def _furnish(self) -> None:
+        root = self.people.make_user("root", administrator=True, scopes=ALL_SCOPES)
+        self.tokens: dict[Caller, str | None] = {CALLERS[0]: None, ROOT: root}
+        for user in USERS:
+            self.tokens[Caller(user)] = self.people.make_user(user)
+        for caller in CALLERS:
+            if caller not in self.tokens:
+                bound = f"!project={caller.bound}" if caller.bound else ""
+                wanted = {"name": caller.name, "scopes": [scope + bound for scope in caller.scopes]}
+                made = self.people.client(self.tokens[Caller(caller.user)]).post("/tokens", json=wanted)
+                self.tokens[caller] = made.json()["secret"]
+        for project, user in zip(PROJECTS, USERS, strict=False):
+            owner = self.people.client(self.tokens[Caller(user)])
+            assert owner.post("/projects", json={"name": project, "description": f"mark-{project}"}).is_success
+            body: dict[str, Any] = {"name": f"mark-{project}-rig", "parts": {"hierarchy": HIERARCHY}}
+            made = owner.post(f"/projects/{project}/skeletons", json=body)
+            self.skeletons[project] = {"item": made.json()["id"], "revision": 1}
+            self.world.roles[project, user] = Role.OWNER
+
+    def run(self, count: int) -> None:
+        """Make calls, until the server and the model differ."""
+        kinds = (
+            self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
+            self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
+            self.change_visibility, self.list_members, self.list_events, self.list_tokens, self.disable,
+        )  # fmt: skip
+        while self.calls < count and not self.differences:
+            self.chance.choice(kinds)(self.chance.choice(CALLERS), self.chance.choice(PROJECTS))
+
+    # -- calls --------------------------------------------------------------------------------------------------------
+
+    def read_project(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read")
+        self._call(caller, "GET", f"/projects/{project}", expected or 200)
+
+    def list_projects(self, caller: Caller, _project: str) -> None:
+        answer = self._call(caller, "GET", "/projects", self._anyone(caller, "read"))
+        self._compare(answer, caller, {name for name in PROJECTS if self.world.sees_contents(caller, name)})
+
+    def list_items(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read")
+        answer = self._call(caller, "GET", f"/projects/{project}/clips?count=exact&limit=1000", expected or 200)
+        self._compare(answer, caller, set(self.world.items[project]))
+        if answer.is_success and answer.json()["count"] != len(self.world.items[project]):
+            self._differ(answer, caller, f"counted {answer.json()['count']}")
+
+    def create_item(self, caller: Caller, project: str) -> None:
+        blob = self.chance.choice([None, *range(len(BLOBS))])
+        self._made += 1
+        name = f"mark-{project}-{self._made}"
+        info: dict[str, Any] = {"schema": "marey/clip-info@1", "comment": name}
+        if blob is not None:
+            info["source"] = {"file": DIGESTS[blob], "file_name": name}
+        expected = self.world.status(caller, project, Role.CONTRIBUTOR, "write")
+        if not expected:
+            expected = 409 if blob is not None and not self.world.may_refer(caller, blob) else 201
+        body = {"name": name, "parts": {"motion": {**MOTION, "skeleton": self.skeletons[project]}, "info": info}}
+        if self._call(caller, "POST", f"/projects/{project}/clips", expected, json=body).is_success:
+            self.world.items[project][name] = blob
+
+    def send_blob(self, caller: Caller, _project: str) -> None:
+        blob = self.chance.randrange(len(BLOBS))
+        expected = self._user(caller, "write") or 204
+        if self._call(caller, "PUT", f"/blobs/{DIGESTS[blob]}", expected, content=BLOBS[blob]).is_success:
+            self.world.held.add((str(caller.user), caller.bound, blob))
+
+    def read_blob(self, caller: Caller, _project: str) -> None:
+        blob = self.chance.randrange(len(BLOBS))
+        known = 200 if self.world.may_refer(caller, blob) else 404
+        expected = self._anyone(caller, "read")
+        self._call(caller, "GET", f"/blobs/{DIGESTS[blob]}", known if expected == 200 else expected)
+
+    def ask_missing(self, caller: Caller, _project: str) -> None:
+        answer = self._call(
+            caller, "POST", "/blobs/missing", self._user(caller, "read") or 200, json={"digests": DIGESTS}
+        )
+        if answer.is_success:
+            expected = [digest for blob, digest in enumerate(DIGESTS) if not self.world.may_refer(caller, blob)]
+            if answer.json()["missing"] != expected:
+                self._differ(answer, caller, "other blobs are missing")
+
+    def put_member(self, caller: Caller, project: str) -> None:
+        user, role = self.chance.choice(USERS), self.chance.choice(list(Role))
+        expected = self.world.status(caller, project, Role.OWNER, "write")
+        if not expected and user in self.world.disabled:
+            expected = 404
+        if not expected and role is not Role.OWNER and self._last_owner(project, user):
+            expected = 409
+        new = (project, user) not in self.world.roles
+        body = {"role": role.value}
+        path = f"/projects/{project}/members/{user}"
+        if self._call(caller, "PUT", path, expected or 200, json=body, new=new).is_success:
+            self.world.roles[project, user] = role
+
+    def remove_member(self, caller: Caller, project: str) -> None:
+        user = self.chance.choice(USERS)
+        expected = self.world.status(caller, project, Role.OWNER, "write")
+        if not expected:
+            there = (project, user) in self.world.roles
+            expected = 404 if not there else 409 if self._last_owner(project, user) else 204
+        path = f"/projects/{project}/members/{user}"
+        if self._call(caller, "DELETE", path, expected, headers={"If-Match": "*"}).is_success:
+            del self.world.roles[project, user]
+
+    def change_visibility(self, caller: Caller, project: str) -> None:
+        public = self.chance.random() < 0.4
+        expected = self.world.status(caller, project, Role.OWNER, "write") or 200
+        body = {"visibility": "public" if public else "private"}
+        path = f"/projects/{project}"
+        if self._call(caller, "PATCH", path, expected, json=body, headers={"If-Match": "*"}).is_success:
+            (self.world.public.add if public else self.world.public.discard)(project)
+
+    def list_members(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read", guests=False)
+        answer = self._call(caller, "GET", f"/projects/{project}/members", expected or 200)
+        self._compare(answer, caller, {user for place, user in self.world.roles if place == project}, "user")
+
+    def list_events(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read", guests=False)
+        self._call(caller, "GET", f"/projects/{project}/events?limit=1000", expected or 200)
+
+    def list_tokens(self, caller: Caller, _project: str) -> None:
+        expected = self._user(caller, "read")
+        if not expected and caller.bound is not None:
+            expected = 403
+        answer = self._call(caller, "GET", "/tokens", expected or 200)
+        own = {one.name for one in CALLERS if one.user == caller.user and one.name != Caller(one.user).name}
+        self._compare(answer, caller, {*own, "test"} - {ROOT.name})
+
+    def disable(self, _caller: Caller, _project: str) -> None:
+        user, disabled = self.chance.choice(USERS), self.chance.random() < 0.3
+        path = f"/users/{user}"
+        self._call(ROOT, "PATCH", path, 200, json={"disabled": disabled}, headers={"If-Match": "*"})
+        (self.world.disabled.add if disabled else self.world.disabled.discard)(user)
+
+    # -- comparing ----------------------------------------------------------------------------------------------------
+
+    def _anyone(self, caller: Caller, scope: str) -> int:
+        if self.world.refused(caller):
+            return 401
+        return 200 if caller.user is None or scope in caller.scopes else 403
+
+    def _user(self, caller: Caller, scope: str) -> int:
+        if caller.user is None or self.world.refused(caller):
+            return 401
+        return 0 if scope in caller.scopes else 403
+
+    def _last_owner(self, project: str, user: str) -> bool:
+        owners = [name for (place, name), role in self.world.roles.items() if (place, role) == (project, Role.OWNER)]
+        return owners == [user]
+
+    def _call(
+        self, caller: Caller, method: str, path: str, expected: int, *, new: bool = False, **rest: Any
+    ) -> httpx.Response:
+        """Send a request; note a difference if its status or a mark in its answer is not as expected."""
+        self.calls += 1
+        answer = self.people.client(self.tokens[caller]).request(method, path, **rest)
+        if answer.status_code != expected and not (new and expected == 200 and answer.status_code == 201):
+            self._differ(answer, caller, f"expected {expected}")
+        for project in re.findall(r"mark-(\w+)", answer.text):
+            if not self.world.sees_contents(caller, project) and f"mark-{project}" not in str(rest):
+                self._differ(answer, caller, f"a mark of {project} leaked")
+        return answer
+
+    def _compare(self, answer: httpx.Response, caller: Caller, expected: set[str], key: str = "name") -> None:
+        found = {one[key] for one in answer.json()["items"]} if answer.is_success else expected
+        if found != expected:
+            self._differ(answer, caller, f"listed {sorted(found)} in place of {sorted(expected)}")
+
+    def _differ(self, answer: httpx.Response, caller: Caller, what: str) -> None:
+        request = answer.request
+        self.differences.append(
+            f"call {self.calls}: {request.method} {request.url.path} as {caller.name}: {answer.status_code}, {what}: "
+            f"{answer.text[:200]}"
+        )
