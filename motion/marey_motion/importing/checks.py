@@ -272,7 +272,7 @@ def _gait(clip: Clip, tracks: Tracks) -> list[CheckWarning]:
         return []
     soles = tracks.soles
     heights = soles[1:, :, 1] - tracks.floor_height
-    weights = 2.0 - 2.0 ** (np.clip(heights, 0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
+    weights = 2.0 - 2.0 ** (heights.clip(0.0, SKATE_HEIGHT_M) / SKATE_HEIGHT_M)
     standing = float(weights.sum())
     if standing < 2:
         return []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -119,18 +120,28 @@ def _measure(source: SourceMotion, anatomy: Anatomy, file: str) -> _Measurements
     rest = skeleton.rest_global_positions
     positions: NDArray[np.floating[Any]] = rest[None]
     if source.rotations is not None and source.root_positions is not None:
-        spaced = np.linspace(0, len(source.rotations) - 1, _SAMPLED_FRAMES).astype(np.int64)
-        frames = spaced[np.concatenate(([True], spaced[1:] > spaced[:-1]))]
-        rotations = source.rotations[frames].astype(np.float64).reshape(len(frames), -1)
+        frames = _sampled_frames(len(source.rotations))
+        poses = np.empty((len(frames), 3 + 4 * skeleton.joint_count))
+        poses[:, :3] = source.root_positions[frames]
+        poses[:, 3:] = source.rotations[frames].reshape(len(frames), -1)
         translations = None if source.translations is None else source.translations[frames]
         positions = forward_kinematics(
             skeleton,
-            np.concatenate([source.root_positions[frames], rotations], axis=1),
+            poses,
             translations=translations,
             translated_joints=source.translated_joints,
         )
     of_joints = np.ascontiguousarray(positions.transpose(1, 0, 2), np.float64)
     return _Measurements(file, landmarks, of_joints, rest, anatomy.leg)
+
+
+@lru_cache(maxsize=256)
+def _sampled_frames(count: int) -> NDArray[np.int64]:
+    """Choose at most 64 different frames of a motion of `count` frames, evenly spaced."""
+    spaced = np.linspace(0, count - 1, _SAMPLED_FRAMES).astype(np.int64)
+    frames: NDArray[np.int64] = spaced[np.concatenate(([True], spaced[1:] > spaced[:-1]))]
+    frames.setflags(write=False)
+    return frames
 
 
 # Up axis
@@ -202,25 +213,23 @@ def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[Up
     The cosine is 0 if legs and trunk are folded onto each other, as by a rest pose with all bones on one line.
     """
     assert landmarks.feet is not None
-    feet = _mean_point(positions, landmarks.feet)
+    assert landmarks.hips is not None
+    feet, hips = _mean_point(positions, landmarks.feet), positions[landmarks.hips]
     if landmarks.head is None:
-        assert landmarks.hips is not None
-        mean, folded = _mean_direction(positions[landmarks.hips] - feet), False
+        (mean,), folded = _mean_directions((hips - feet)[None]), False
     else:
-        head, hips = positions[landmarks.head], positions[landmarks.hips]
-        mean = _mean_direction(head - feet)
-        folded = float(_mean_direction(head - hips) @ _mean_direction(hips - feet)) < _FOLDED_COSINE
+        head = positions[landmarks.head]
+        mean, trunk, legs = _mean_directions(np.stack((head - feet, head - hips, hips - feet)))
+        folded = float(trunk @ legs) < _FOLDED_COSINE
     axis = int(np.argmax(np.abs(mean)))
     return _axis_name(axis, mean[axis]), 0.0 if folded else float(abs(mean[axis]))
 
 
-def _mean_direction(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the mean direction (3,) of vectors (F, 3); those of length zero are ignored."""
+def _mean_directions(ways: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the mean direction (k, 3) of vectors (k, F, 3); those of length zero are ignored."""
     lengths = _lengths(ways)
-    count, moving = len(ways), lengths > 0
-    if not moving.all():
-        ways, lengths = ways[moving], lengths[moving]
-    mean: NDArray[np.float64] = np.add.reduce(ways / lengths[:, None], axis=0) / count
+    lengths[lengths == 0] = 1.0
+    mean: NDArray[np.float64] = np.add.reduce(ways / lengths[..., None], axis=1) / ways.shape[1]
     return mean
 
 
@@ -234,8 +243,8 @@ def _mean_point(positions: NDArray[np.float64], joints: Sequence[int]) -> NDArra
 
 
 def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the lengths (F,) of vectors (F, 3)."""
-    lengths: NDArray[np.float64] = np.sqrt(np.add.reduce(vectors * vectors, axis=1))
+    """Compute the lengths (...) of vectors (..., 3)."""
+    lengths: NDArray[np.float64] = np.sqrt(np.add.reduce(vectors * vectors, axis=-1))
     return lengths
 
 
