@@ -80,6 +80,13 @@ class LruCache(Generic[Key, Value]):
         self.put(key, value)
         return value
 
+    def pop(self, key: Key) -> Value | None:
+        """Remove the value of `key` and return it, or None."""
+        with self._lock:
+            value, size = self._entries.pop(key, (None, 0))
+            self._held_bytes -= size
+            return value
+
     def _is_over(self) -> bool:
         if self._max_entries is not None and len(self._entries) > self._max_entries:
             return True

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from marey_schemas.items import Upload, UploadCreate
+from marey_server.access.principal import ANONYMOUS
 from marey_server.errors import BadRequestProblem, ConflictProblem
 from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import uploads
-from marey_server.store.transaction import Transaction
 
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
@@ -19,14 +19,6 @@ def upload_reply(upload: uploads.StoredUpload) -> Reply:
     shown = Upload(id=upload.id, length=upload.length, offset=upload.offset, digest=upload.digest)
     headers = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length), "Cache-Control": "no-store"}
     return Reply(shown, headers=headers)
-
-
-def finish_upload(tx: Transaction, upload_id: str) -> uploads.StoredUpload:
-    """Store an upload as a blob if all its bytes were received; otherwise leave it unchanged."""
-    upload = uploads.read_upload(tx, upload_id)
-    if upload.offset == upload.length:
-        uploads.finish(tx, upload_id)
-    return uploads.read_upload(tx, upload_id)
 
 
 class Uploads(Resource):
@@ -74,6 +66,8 @@ class UploadResource(Resource):
         except ConflictProblem as error:
             error.headers["Upload-Offset"] = str(error.context.get("offset", ""))
             raise
+        if data:
+            await self.compute(self.services.upload_hashes.add, self.upload_id, self.offset, data)
         self.offset = moved.offset
 
     @reads(access=Access.SIGNED_IN, answer=Upload)
@@ -87,14 +81,29 @@ class UploadResource(Resource):
         answer=Upload,
         headers=("Upload-Offset",),
     )
-    async def patch(self, upload: str) -> Rendered:
+    async def patch(self, upload: str) -> Reply:
         """Send the next piece. With the last one the upload becomes a blob, whose digest is returned.
 
         For a wrong offset, the answer is 409 with the current one in the header Upload-Offset and in the context.
         """
         if self.piece:
             await self._append()
-        return await self.answer_with(upload_reply, finish_upload, upload)
+        found = await self.look_up(uploads.read_upload, upload)
+        if found.is_received:
+            found = await self._finish(found)
+        uploads.require_intact(found)
+        return upload_reply(found)
+
+    async def _finish(self, upload: uploads.StoredUpload) -> uploads.StoredUpload:
+        """Hash what is not hashed yet, then store the upload as a blob."""
+        hashes = self.services.upload_hashes
+        while (content := await self.compute(hashes.finish, self.caller.principal or ANONYMOUS, upload)) is None:
+            upload = await self.look_up(uploads.read_upload, upload.id)
+            if not upload.is_received:  # another request has finished it
+                return upload
+        upload = await self.change(uploads.finish, upload.id, *content)
+        hashes.forget(upload.id)
+        return upload
 
     @writes(access=Access.SIGNED_IN)
     async def delete(self, upload: str) -> Rendered:

@@ -26,6 +26,7 @@ from marey_server.store import events, tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
+from marey_server.store.upload_hashes import UploadHashes
 
 LARGEST_ANSWER_SHARE = 8
 """Largest part of the cache of answers that one body may take; larger bodies would displace all others."""
@@ -75,6 +76,7 @@ class Services:
         self.refused_tries = RefusedTries()
         self.compute_threads = ComputeThreads()
         self.memory = RequestMemory(settings.request_memory_bytes)
+        self.upload_hashes = UploadHashes(database)
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
         self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from sqlalchemy import Connection, bindparam, delete, insert, select
 
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.tables import blob_chunk
+from marey_server.store.tables import blob, blob_chunk, upload_chunk
 
 CHUNK_BYTES = 2**20
 BYTES_PER_STATEMENT = 4 * CHUNK_BYTES
@@ -47,6 +47,14 @@ class BlobBacking(Protocol):
         """Remove bytes that have no row."""
         ...
 
+    def new_copy(self) -> Path | None:
+        """Return a new file to which an upload is copied as it arrives; None if its pieces stay where they are."""
+        ...
+
+    def adopt(self, copy: Path, digest: str) -> None:
+        """Make a complete copy of an upload the bytes of a blob, in the transaction that inserts the blob's row."""
+        ...
+
     def check_writable(self) -> None:
         """Raise `OSError` if bytes cannot be written."""
         ...
@@ -60,10 +68,28 @@ _CHUNK = Prepared(
 
 
 _INSERT_CHUNK = Prepared(insert(blob_chunk))
+_UPLOAD = Prepared(select(blob.c.upload_id).where(blob.c.digest == bindparam("digest")))
+_PIECE = Prepared(
+    select(upload_chunk.c.offset, upload_chunk.c.data)
+    .where(upload_chunk.c.upload_id == bindparam("upload_id"), upload_chunk.c.offset <= bindparam("at"))
+    .order_by(upload_chunk.c.offset.desc())
+    .limit(1)
+)
+
+
+def read_pieces(connection: Connection, upload_id: str, start: int, stop: int) -> Iterator[bytes]:
+    """Yield bytes `start` to `stop` of an upload as they were received, in pieces of at most `CHUNK_BYTES`."""
+    while start < stop and (rows := _PIECE.run(connection, {"upload_id": upload_id, "at": start})):
+        base, piece = rows[0].offset, rows[0].data
+        part: bytes = piece[start - base : stop - base]
+        if not part:
+            return
+        yield part
+        start += len(part)
 
 
 class DatabaseBlobs:
-    """Blobs stored in the database, in rows of 1 MiB."""
+    """Blobs stored in the database, in rows of 1 MiB; blobs from uploads stay in the rows of their pieces."""
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
         """Store the bytes of blobs in rows of 1 MiB, several rows with one statement."""
@@ -83,13 +109,22 @@ class DatabaseBlobs:
         for position in range(start // CHUNK_BYTES, -(-stop // CHUNK_BYTES)):
             rows = _CHUNK.run(connection, {"digest": digest, "position": position})
             if not rows:
+                if position == start // CHUNK_BYTES and (upload_id := self._upload_of(connection, digest)):
+                    yield from read_pieces(connection, upload_id, start, stop)
                 return
             data: bytes = rows[0].data
             base = position * CHUNK_BYTES
             yield data if start <= base and base + len(data) <= stop else data[max(start - base, 0) : stop - base]
 
+    def _upload_of(self, connection: Connection, digest: str) -> str | None:
+        rows = _UPLOAD.run(connection, {"digest": digest})
+        return rows[0].upload_id if rows else None
+
     def release(self, connection: Connection, digest: str) -> None:
-        """Delete the rows of a blob's bytes, in the transaction that deletes the blob's row."""
+        """Delete the rows of a blob's bytes, in the transaction that deletes the blob's row.
+
+        Pieces of an upload are deleted later, a few at a time, because they may be many.
+        """
         connection.execute(delete(blob_chunk).where(blob_chunk.c.digest == digest))
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:  # noqa: ARG002
@@ -98,6 +133,13 @@ class DatabaseBlobs:
 
     def remove_stray(self, digest: str) -> None:
         """Do nothing: there are no bytes without a row."""
+
+    def new_copy(self) -> None:
+        """Return None: the pieces of an upload become the blob."""
+
+    def adopt(self, copy: Path, digest: str) -> None:
+        """Refuse: there are no copies."""
+        raise AssertionError(f"{copy} was not made here, for {digest}")
 
     def check_writable(self) -> None:
         """Do nothing: the server checks the database separately."""
@@ -164,6 +206,24 @@ class DirectoryBlobs:
                             path.unlink()
                         else:
                             yield f"sha256:{folder.name}{path.name}"
+
+    def new_copy(self) -> Path:
+        """Create a file for the copy of an upload; the sweep removes it if nobody adopts it."""
+        handle, name = tempfile.mkstemp(dir=self._incoming)
+        os.close(handle)
+        return Path(name)
+
+    def adopt(self, copy: Path, digest: str) -> None:
+        """Rename a synced copy; do nothing if an earlier try of the same transaction did so."""
+        path = self._path(digest)
+        path.parent.mkdir(exist_ok=True)
+        try:
+            os.replace(copy, path)
+        except FileNotFoundError:
+            if not path.exists():
+                raise
+        _sync_directory(path.parent)
+        _sync_directory(self.root)
 
     def remove_stray(self, digest: str) -> None:
         """Remove the file of a blob."""

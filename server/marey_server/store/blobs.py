@@ -7,8 +7,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from types import TracebackType
 from typing import Any, Self
@@ -86,14 +85,6 @@ class Spool:
         self.close()
 
 
-@dataclass(frozen=True, slots=True)
-class Pieces:
-    """Bytes in another store, read in pieces of 1 MiB on demand."""
-
-    size_bytes: int
-    chunks: Callable[[], Iterable[bytes]]
-
-
 def digest_of(data: bytes) -> str:
     """Return the digest `sha256:<hex>` of bytes."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
@@ -126,7 +117,7 @@ def require_sender(principal: Principal) -> None:
         raise ForbiddenProblem("This token may not write.", code="insufficient-scope")
 
 
-def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool | Pieces]) -> None:
+def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> None:
     """Store bytes under their digests; if some are stored already, renew their age."""
     rows = [
         {"digest": digest, "size_bytes": _size_bytes(content), "created_us": tx.now_us}
@@ -136,11 +127,11 @@ def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool | Pieces])
     tx.blobs.write(tx.connection, {digest: _chunks(contents[digest]) for digest in contents if digest in new})
 
 
-def _size_bytes(content: bytes | Spool | Pieces) -> int:
+def _size_bytes(content: bytes | Spool) -> int:
     return len(content) if isinstance(content, bytes) else content.size_bytes
 
 
-def _chunks(content: bytes | Spool | Pieces) -> Iterable[bytes]:
+def _chunks(content: bytes | Spool) -> Iterable[bytes]:
     if not isinstance(content, bytes):
         return content.chunks()
     if len(content) <= CHUNK_BYTES:

@@ -196,7 +196,7 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    if row.finished_digest is not None:
+    if row.finished_digest is not None or row.dropped:
         return []
     held = select(func.coalesce(func.sum(func.length(upload_chunk.c.data)), 0)).where(
         upload_chunk.c.upload_id == row.id

@@ -30,7 +30,6 @@ from marey_server.store.tables import (
     job_blob,
     revision_part,
     staged_output,
-    upload,
 )
 from marey_server.store.tokens import forget_ended
 from marey_server.store.transaction import Transaction
@@ -60,7 +59,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
         stray_files=_sweep_strays(database, grace_us),
-        uploads=database.write(SYSTEM, _drop_old_uploads),
+        uploads=_delete_uploads(database),
         keys=database.write(SYSTEM, _drop_old_keys),
         coverage_streams=database.write(SYSTEM, drop_old_streams),
         tokens=database.write(SYSTEM, forget_ended),
@@ -148,12 +147,13 @@ def _remove_stray(tx: Transaction, digest: str) -> int:
     return 1
 
 
-def _drop_old_uploads(tx: Transaction) -> int:
-    old = upload.c.updated_us < tx.now_us - uploads.LIFETIME_US
-    some = select(upload.c.id).where(old).limit(MOST_UPLOADS).with_for_update(skip_locked=True)
-    found = list(tx.execute(some).scalars())
-    uploads.drop(tx, found)
-    return len(found)
+def _delete_uploads(database: Database) -> int:
+    """Delete abandoned uploads, and the pieces that no upload and no blob needs, in short transactions."""
+    dropped = database.write(SYSTEM, uploads.drop_old, MOST_UPLOADS)
+    while database.write(SYSTEM, uploads.delete_pieces):
+        pass
+    database.write(SYSTEM, uploads.delete_dropped, MOST_UPLOADS)
+    return dropped
 
 
 def _drop_old_keys(tx: Transaction) -> int:

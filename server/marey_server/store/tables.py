@@ -188,12 +188,16 @@ document_blob = Table(
     Column("blob_digest", DIGEST, ForeignKey("blob.digest"), nullable=False, index=True),
 )
 
+_OF_UPLOAD = text("upload_id IS NOT NULL")
+
 blob = Table(
     "blob",
     metadata,
     Column("digest", DIGEST, primary_key=True),
     Column("size_bytes", BigInteger, nullable=False),
     Column("created_us", Micros, nullable=False, index=True),
+    Column("upload_id", ID),  # of the upload whose pieces are the bytes; null: they are in the backing
+    Index("ix_blob_upload", "upload_id", sqlite_where=_OF_UPLOAD, postgresql_where=_OF_UPLOAD),
 )
 
 blob_chunk = Table(
@@ -435,6 +439,8 @@ upload = Table(
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False, index=True),
     Column("finished_digest", DIGEST),
+    Column("actual_digest", DIGEST),  # of all bytes, if it is not the expected one
+    Column("dropped", Boolean, nullable=False, default=False, server_default=false()),  # its pieces can be deleted
 )
 
 upload_chunk = Table(

@@ -1,17 +1,19 @@
 """Resumable uploads: bytes sent in pieces, over several connections if necessary, that become a blob at the end.
 
-Pieces are stored in rows until then. The offset is updated by compare-and-swap, so that two senders cannot interleave.
+Pieces are stored in rows. The offset is updated by compare-and-swap, so that two senders cannot interleave. No
+transaction reads, hashes or copies all bytes: `UploadHashes` does so outside, and a finished upload keeps its pieces
+as those of its blob (docs/decisions/0029-large-blobs.md).
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Row, delete, insert, select, update
+from sqlalchemy import Row, and_, delete, exists, insert, or_, select, update
 
+from marey_server import faults
 from marey_server.errors import (
     ConflictProblem,
     ForbiddenProblem,
@@ -20,25 +22,36 @@ from marey_server.errors import (
     TooLargeProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import blobs
+from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.ids import new_id
-from marey_server.store.tables import upload, upload_chunk
+from marey_server.store.tables import blob, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
 LIFETIME_US = 7 * 86400 * 1_000_000
 """Time without a new piece after which an upload is deleted."""
+PIECES_AT_ONCE = 8
+"""Number of pieces, each of at most 1 MiB, that one transaction deletes, so that others do not wait long for it."""
+
+_HAS_BLOB = exists().where(blob.c.upload_id == upload.c.id)
 
 
 @dataclass(frozen=True, slots=True)
 class StoredUpload:
-    """State of an upload; `digest` is set once it is complete."""
+    """State of an upload; `digest` is set once it is a blob, `actual_digest` if it has not the announced one."""
 
     id: str
     length: int
     offset: int
     digest: str | None
+    announced: str | None = None
+    actual_digest: str | None = None
+
+    @property
+    def is_received(self) -> bool:
+        """Return whether all bytes are there, but are no blob and were not refused yet."""
+        return self.offset == self.length and self.digest is None and self.actual_digest is None
 
 
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
@@ -87,66 +100,82 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
     return StoredUpload(upload_id, found.length, offset + len(data), None)
 
 
-def finish(tx: Transaction, upload_id: str) -> str:
-    """Store a complete upload as a blob and return its digest; a repeated call returns the same.
+def read_pieces(tx: Transaction, upload_id: str, start: int, size_bytes: int) -> list[bytes]:
+    """Return at most `size_bytes` of the received bytes of an upload of the caller, from `start`."""
+    found = _find(tx, upload_id)
+    stop = min(start + size_bytes, found.offset)
+    return list(blob_backings.read_pieces(tx.connection, upload_id, start, stop))
 
-    Raises `ConflictProblem` if bytes are missing, and `InvalidProblem` if the bytes do not have the announced digest;
-    they are kept until the upload is deleted or expires.
+
+def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> StoredUpload:
+    """Store a complete upload, whose bytes have the given digest, as a blob; a repeated call changes nothing.
+
+    The bytes are not read: either the pieces become the blob's, or `copy`, a file that the backing made. If another
+    digest was announced, no blob is made and the actual digest is recorded, see `require_intact`.
+
+    Raises `ConflictProblem` if bytes are missing.
     """
     found = _find(tx, upload_id)
-    if found.finished_digest is not None:
-        return str(found.finished_digest)
+    if found.finished_digest is not None or found.actual_digest is not None:
+        return _shown(found)
     if found.offset != found.length:
         raise _elsewhere(found.offset)
-    hashed = hashlib.sha256()
-    for piece in _pieces(tx, upload_id):
-        hashed.update(piece)
-    digest = f"sha256:{hashed.hexdigest()}"
     if found.digest not in (None, digest):
-        detail = f"The bytes are {digest}, not {found.digest}. Upload them again."
-        raise InvalidProblem(detail, code="digest-mismatch")
+        tx.execute(update(upload).where(upload.c.id == upload_id).values(actual_digest=digest))
+        return _shown(_find(tx, upload_id))
     claimed = update(upload).where(upload.c.id == upload_id, upload.c.finished_digest.is_(None))
-    if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount == 0:
-        return digest
-    blobs.store_blobs(tx, {digest: blobs.Pieces(found.length, lambda: _even(_pieces(tx, upload_id)))})
-    blobs.add_holder(tx, digest)
-    tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id == upload_id))
-    return digest
+    if tx.execute(claimed.values(finished_digest=digest, updated_us=tx.now_us)).rowcount:
+        row = {"digest": digest, "size_bytes": found.length, "created_us": tx.now_us}
+        row["upload_id"] = upload_id if copy is None else None
+        if blobs.insert_new(tx, blob, [row]) and copy is not None:
+            tx.blobs.adopt(copy, digest)
+        blobs.add_holder(tx, digest)
+    faults.point("upload.finish.before_commit")
+    tx.after_commit(lambda: faults.point("upload.finish.after_commit"))
+    return _shown(_find(tx, upload_id))
+
+
+def require_intact(found: StoredUpload) -> None:
+    """Raise `InvalidProblem` if the bytes do not have the announced digest."""
+    if found.actual_digest is not None:
+        detail = f"The bytes are {found.actual_digest}, not {found.announced}. Delete this upload and make another one."
+        raise InvalidProblem(detail, code="digest-mismatch")
 
 
 def abandon(tx: Transaction, upload_id: str) -> None:
     """Delete an upload; a blob made from it is kept."""
     found = _find(tx, upload_id)
-    drop(tx, [found.id])
+    tx.execute(update(upload).where(upload.c.id == found.id).values(dropped=True))
 
 
-def drop(tx: Transaction, upload_ids: list[str]) -> None:
-    """Delete uploads and the bytes received so far."""
-    tx.execute(delete(upload_chunk).where(upload_chunk.c.upload_id.in_(upload_ids)))
-    tx.execute(delete(upload).where(upload.c.id.in_(upload_ids)))
+# -- garbage ----------------------------------------------------------------------------------------------------------
 
 
-def _pieces(tx: Transaction, upload_id: str) -> Iterator[bytes]:
-    """Yield the pieces in order, with one in memory at a time."""
-    offset = 0
-    one = select(upload_chunk.c.data)
-    while data := tx.execute(
-        one.where(upload_chunk.c.upload_id == upload_id, upload_chunk.c.offset == offset)
-    ).scalar():
-        offset += len(data)
-        yield data
+def drop_old(tx: Transaction, limit: int) -> int:
+    """Give up uploads that nobody has continued for `LIFETIME_US`; return their number."""
+    old = select(upload.c.id).where(upload.c.updated_us < tx.now_us - LIFETIME_US, upload.c.dropped.is_(False))
+    found = list(tx.execute(old.limit(limit).with_for_update(skip_locked=True)).scalars())
+    tx.execute(update(upload).where(upload.c.id.in_(found)).values(dropped=True))
+    return len(found)
 
 
-def _even(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """Yield the same bytes in pieces of `CHUNK_BYTES`; the last one may be shorter."""
-    held = bytearray()
-    for piece in pieces:
-        held += piece
-        while len(held) >= CHUNK_BYTES:
-            yield bytes(held[:CHUNK_BYTES])
-            del held[:CHUNK_BYTES]
-    if held:
-        yield bytes(held)
+def delete_pieces(tx: Transaction) -> int:
+    """Delete a few pieces that no upload and no blob needs any more; return their number, 0 if there are none left."""
+    over = or_(upload.c.dropped, upload.c.finished_digest.is_not(None))
+    useless = select(upload_chunk.c.upload_id, upload_chunk.c.offset).join(upload).where(over, ~_HAS_BLOB)
+    found = tx.execute(useless.limit(PIECES_AT_ONCE)).all()
+    for piece in found:
+        chosen = and_(upload_chunk.c.upload_id == piece.upload_id, upload_chunk.c.offset == piece.offset)
+        tx.execute(delete(upload_chunk).where(chosen))
+    faults.point("upload.pieces.before_commit")
+    return len(found)
+
+
+def delete_dropped(tx: Transaction, limit: int) -> int:
+    """Delete the rows of dropped uploads that have no pieces; return their number."""
+    has_pieces = exists().where(upload_chunk.c.upload_id == upload.c.id)
+    empty = select(upload.c.id).where(upload.c.dropped, ~_HAS_BLOB, ~has_pieces).limit(limit)
+    return tx.execute(delete(upload).where(upload.c.id.in_(list(tx.execute(empty).scalars())))).rowcount
 
 
 def _sender(tx: Transaction) -> str:
@@ -160,7 +189,7 @@ def _find(tx: Transaction, upload_id: str) -> Row[Any]:
     if tx.principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to upload.")
     statement = select(upload).where(upload.c.id == upload_id, upload.c.user_id == (tx.principal.user_id or ""))
-    row = tx.execute(statement).first()
+    row = tx.execute(statement.where(upload.c.dropped.is_(False))).first()
     if row is None:
         raise NotFoundProblem(f"You have no upload {upload_id!r}.", code="no-upload")
     return row
@@ -173,4 +202,4 @@ def _elsewhere(offset: int) -> ConflictProblem:
 
 
 def _shown(row: Row[Any]) -> StoredUpload:
-    return StoredUpload(row.id, row.length, row.offset, row.finished_digest)
+    return StoredUpload(row.id, row.length, row.offset, row.finished_digest, row.digest, row.actual_digest)
