@@ -138,18 +138,13 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
     """Compare the clock that an SQLite database keeps with that of this machine; with `set_now`, set it to this one."""
-    from sqlalchemy.exc import OperationalError
-
     from marey_server.store.clock_setting import read_clock, set_clock
     from marey_server.store.database.opening import alone
 
-    file = _sqlite_file(read_settings(**settings), must_exist=True)
-    try:
-        with alone(file) as connection:
-            state = read_clock(connection)
-            moved = set_clock(connection) if set_now else None
-    except OperationalError as error:
-        raise CommandFailed(f"{file} is in use or cannot be read ({error.orig}); stop the server first") from None
+    chosen = read_settings(**settings)
+    with _database_of(chosen), alone(_sqlite_file(chosen, must_exist=True)) as connection:
+        state = read_clock(connection)
+        moved = set_clock(connection) if set_now else None
     _say(str(state))
     if moved is not None:
         _say(f"the database now uses the time of this machine; {moved:,} times that were later were set back")
@@ -175,18 +170,13 @@ def purge(**settings: Any) -> None:
 
 def _shrink(file: Path) -> None:
     """Give the free pages of an SQLite database back to the disk, unless a server is running."""
-    from sqlalchemy.exc import OperationalError
-
-    from marey_server.store.database.opening import vacuum
+    from marey_server.store.database.opening import DatabaseUnusable, vacuum
 
     before = file.stat().st_size
     try:
         vacuum(file)
-    except OperationalError as error:
-        raise CommandFailed(
-            f"{file} was not made smaller ({error.orig}); stop the server, and leave as much space free as the "
-            "database needs"
-        ) from None
+    except DatabaseUnusable as error:
+        raise CommandFailed(f"the database was not made smaller: {error}") from None
     _say(f"the database takes {file.stat().st_size:,} bytes; it took {before:,}")
 
 

@@ -57,12 +57,16 @@ def sqlite_file(url: str) -> Path | None:
 def alone(file: Path) -> Iterator[Connection]:
     """Connect to an SQLite file that no other process has open, in one transaction.
 
-    Raises `sqlalchemy.exc.OperationalError` if another process has it open.
+    Raises `DatabaseUnusable` if another process has it open.
     """
     engine = create_engine(f"sqlite:///{file}", poolclass=NullPool, connect_args={"timeout": 1.0})
     with engine.connect() as connection:
-        connection.exec_driver_sql("PRAGMA locking_mode = EXCLUSIVE")  # also excludes those that only have it open
-        connection.exec_driver_sql("BEGIN EXCLUSIVE")
+        try:
+            connection.exec_driver_sql("PRAGMA locking_mode = EXCLUSIVE")  # also excludes those that only have it open
+            connection.exec_driver_sql("BEGIN EXCLUSIVE")
+        except exc.OperationalError as error:
+            reason = f"{file} is in use or cannot be read ({_reason(error)}); stop the server first"
+            raise DatabaseUnusable(reason) from None
         yield connection
         connection.commit()
 
@@ -71,7 +75,11 @@ def vacuum(file: Path) -> None:
     """Copy an SQLite file without its free pages. Raises like `alone`, and if the disk has no room for the copy."""
     with alone(file) as connection:
         connection.commit()  # a vacuum runs outside of transactions; the lock stays
-        connection.exec_driver_sql("VACUUM")
+        try:
+            connection.exec_driver_sql("VACUUM")
+        except exc.OperationalError as error:
+            reason = f"{file} cannot be copied ({_reason(error)}); leave as much space free as the database needs"
+            raise DatabaseUnusable(reason) from None
 
 
 def _shown(url: str) -> str:
