@@ -49,6 +49,7 @@ test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can brea
 soak: $(VENV)/.installed-dev lint ## Every fault on both databases, hours of generated files, requests and state machines
 	$(PYTEST) --tier soak -o timeout=7200 tests
 	$(BIN)/python -m tests.support.motion_fuzz 3600
+	$(BIN)/python -m tests.support.hostile_figures
 
 lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from docs.generate import REFERENCE, ROOT, pages
+from tests.support.who_may import table
 from typer import Context
 from typer.main import get_command
 
@@ -19,6 +20,11 @@ WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 def test_the_pages_that_come_from_the_code_are_current() -> None:
     stale = [name for name, text in pages().items() if (REFERENCE / name).read_text(encoding="utf-8") != text]
     assert stale == [], "run `make docs`"
+
+
+def test_the_threat_model_shows_the_callers_of_the_model() -> None:
+    page = (ROOT / "docs" / "explanation" / "threat-model.md").read_text(encoding="utf-8")
+    assert table() in page, "copy the table of `tests.support.who_may.table()`"
 
 
 @pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(ROOT)))
