@@ -16,6 +16,9 @@ OCTETS = "application/octet-stream"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time in a ZIP archive; every file gets it, so that the same content gives the same bytes."""
 
+MOST_UNPACKED_BYTES = 1 << 29
+"""Greatest number of bytes that a compressed file may unpack to; readers stop unpacking there."""
+
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 
 AnnotationForm = Literal["labels", "list", "frames"]

@@ -28,6 +28,7 @@ from tornado.web import RequestHandler
 from marey_schemas.access import TokenCreate
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.processes.environment import clean_environment
+from marey_schemas.processes.memory import keep_freed_memory
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.accepting import (
@@ -42,7 +43,8 @@ from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
 from marey_server.launchers.local import local_workers
 from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
-from marey_server.process.computing import compute_on_one_thread_each, keep_freed_memory
+from marey_server.process.children import Children
+from marey_server.process.computing import compute_on_one_thread_each
 from marey_server.process.data_folder import BLOB_FOLDER, WORKER_CACHE, prepare_data_folder
 from marey_server.process.feed import following_feed
 from marey_server.process.housekeeping import keeping_house
@@ -71,9 +73,9 @@ class CannotListen(Exception):
 class Application(TornadoApplication):
     """Tornado application: all routes, and the services that their handlers share."""
 
-    def __init__(self, settings: Settings, database: Database) -> None:
+    def __init__(self, settings: Settings, database: Database, children: Children | None = None) -> None:
         self.routes = RouteTable(self, RESOURCES)
-        self.services = Services(settings, database, cache(partial(describe, self.routes)))
+        self.services = Services(settings, database, cache(partial(describe, self.routes)), children)
         super().__init__([Rule(AnyMatches(), self.routes)], log_function=self.record_request)
 
     def record_request(self, handler: RequestHandler) -> None:
@@ -105,9 +107,9 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
     }
 
 
-def create_app(settings: Settings, database: Database) -> Application:
-    """Return an application over a database whose schema is current."""
-    return Application(settings, database)
+def create_app(settings: Settings, database: Database, children: Children | None = None) -> Application:
+    """Return an application over a database whose schema is current; `children` may be shared by several."""
+    return Application(settings, database, children)
 
 
 def describe(routes: RouteTable) -> Description:
@@ -214,7 +216,7 @@ async def serve(settings: Settings) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with serving(settings) as running, compiling_kernels():
+    async with serving(settings) as running, warming(running.app.services.children):
         for line in greeting(settings, running.address, running.app.services.database):
             log.info("%s", line)
         await stop.wait()
@@ -222,14 +224,21 @@ async def serve(settings: Settings) -> None:
 
 
 @asynccontextmanager
-async def compiling_kernels() -> AsyncIterator[None]:
-    """Compile the kernels of imports in a separate process while the server already answers."""
+async def warming(children: Children) -> AsyncIterator[None]:
+    """Compile all kernels in a separate process, then start the children, while the server already answers."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
     )
+
+    async def warm() -> None:
+        await process.wait()
+        children.warm()
+
+    warming = asyncio.create_task(warm())
     try:
         yield
     finally:
+        warming.cancel()
         if process.returncode is None:
             process.kill()
             await process.wait()

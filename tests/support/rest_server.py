@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ import pytest
 from marey_schemas.access import MemberChange, ProjectCreate, Role, TokenCreate, UserCreate
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.app import Application, create_app, listening
+from marey_server.process.children import Children
 from marey_server.process.settings import Settings
 from marey_server.store import members, projects, tokens, users
 from marey_server.store.database.connections import Database
@@ -78,6 +80,19 @@ class Server(People):
         self.stop()
 
 
+class SharedChildren(Children):
+    """Child processes that all servers of a test run use, because starting them takes long; they are never closed."""
+
+    def close(self) -> None:
+        """Leave the children to the next server."""
+
+
+@functools.cache
+def shared_children() -> SharedChildren:
+    """Return the children of this test run with the default limits."""
+    return SharedChildren(Settings().child_limits)
+
+
 @contextlib.contextmanager
 def running(database: Database, folder: Path, **settings: Any) -> Iterator[Server]:
     """Serve a database until the block ends."""
@@ -86,7 +101,9 @@ def running(database: Database, folder: Path, **settings: Any) -> Iterator[Serve
 
     async def main() -> None:
         stop = asyncio.Event()
-        app = create_app(Settings(data=folder, port=0, drain_s=5, **settings), database)
+        chosen = Settings(data=folder, port=0, drain_s=5, **settings)
+        children = shared_children() if chosen.child_limits == Settings().child_limits else None
+        app = create_app(chosen, database, children)
         try:
             async with listening(app) as listener:
                 loop = asyncio.get_running_loop()

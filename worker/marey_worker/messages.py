@@ -16,6 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from marey_schemas.items import PartPlace
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.processes.child_process import BadMessage
 from marey_schemas.worker_protocol import PinnedInput
 
 # From the supervisor
@@ -146,10 +147,6 @@ _FORMS = {
         Run, ChildReply, ReadParts, ReadItem, FindItems, ReadBlob, ReadResults, PutFile, Stage, Made, Done, Failed,
     )
 }  # fmt: skip
-
-
-class BadMessage(Exception):
-    """Bytes that are not a message."""
 
 
 def pack(message: Any) -> bytes:

@@ -30,10 +30,10 @@ from marey_motion.formats.quaternion_rows import as_rotations
 from marey_motion.importing.source import SourceMotion
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.skeletons import MAX_JOINTS
+from marey_schemas.formats import MOST_UNPACKED_BYTES
 
 FORMAT = "npz"
 MARK = "marey/clip-npz@1"
-MAX_BYTES = 1 << 29
 _MEMBERS_SHOWN = 12
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _SKELETON_MEMBERS = (
@@ -110,7 +110,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Raises
     ------
-    FormatError    naming the member that is missing or wrong; nothing larger than `MAX_BYTES` is unpacked
+    FormatError    naming the member that is missing or wrong; nothing larger than `MOST_UNPACKED_BYTES` is unpacked
     """
     arrays = _read_members(data, file)
     if "format" not in arrays or str(arrays["format"]) != MARK:
@@ -188,10 +188,10 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [info for info in archive.infolist() if info.filename.removesuffix(".npy") in known]
             total = sum(info.file_size for info in members)
-            if total > MAX_BYTES or len(members) > len(known):
+            if total > MOST_UNPACKED_BYTES or len(members) > len(known):
                 raise FormatLimit(
-                    f"the archive unpacks to {total} bytes in {len(members)} files; at most {MAX_BYTES} bytes in "
-                    f"{len(known)} files are accepted",
+                    f"the archive unpacks to {total} bytes in {len(members)} files; at most {MOST_UNPACKED_BYTES} "
+                    f"bytes in {len(known)} files are accepted",
                     file=file,
                 )
             return {info.filename.removesuffix(".npy"): _read_member(archive, info) for info in members}

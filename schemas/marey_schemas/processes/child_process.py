@@ -37,10 +37,15 @@ class ChildBroken(Exception):
         self.status = status
 
 
+class BadMessage(Exception):
+    """Bytes that are not a message."""
+
+
 class ChildProcess:
     """Child process in its own session, which runs `python -m module <file descriptor> <arguments>`.
 
-    One thread starts, uses and kills it; the child is killed when this thread ends. Other threads may send messages.
+    One thread starts, uses and kills it; the child is killed when this thread ends. Other threads may send messages and
+    abort it.
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
@@ -92,8 +97,8 @@ class ChildProcess:
             except (BrokenPipeError, ConnectionResetError):
                 return
 
-    def receive(self, timeout_s: float) -> bytes | None:
-        """Return the next message, or None if none came in time.
+    def receive(self, timeout_s: float | None = None) -> bytes | None:
+        """Return the next message, or None if none came in time; without a time, wait for it.
 
         Raises `EOFError` if the child has died, and `OSError` if the message is too long.
         """
@@ -124,6 +129,11 @@ class ChildProcess:
         with self._sending:
             self._pipe.close()
             self._socket.close()
+
+    def abort(self) -> None:
+        """Kill the process at once, from any thread; `receive` then reports its end."""
+        if self.alive:
+            self._signal(signal.SIGKILL)
 
     def _signal(self, number: signal.Signals) -> None:
         try:

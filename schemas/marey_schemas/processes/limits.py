@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import resource
 import signal
@@ -36,6 +37,16 @@ def allow_memory(limit_bytes: int | None) -> None:
     if hard != resource.RLIM_INFINITY:
         soft = hard if soft == resource.RLIM_INFINITY else min(soft, hard)
     resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def allow_processor_time(seconds: float) -> None:
+    """Let this process use at most `seconds` more of processor time; beyond that, the kernel sends SIGXCPU.
+
+    The limit has a resolution of one second, and is rounded up.
+    """
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + seconds), hard))
 
 
 def resident_bytes(pid: int) -> int:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
@@ -12,7 +13,7 @@ from pydantic import ValidationError
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
-from marey_server.errors import BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
+from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
 from marey_server.http.declarations import MIB, Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
@@ -127,7 +128,8 @@ class ProjectImports(Resource):
             raise BadRequestProblem("The request contains no files.", code="no-files")
         if self._is_large(self.files):
             return await self._submit(project, options)
-        return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
+        async with self.using_children():
+            return Reply(ImportAnswer(entries=tuple(await self._import_now(project, options))))
 
     async def _read_request(self) -> ImportRequest:
         return await self.compute(_decode, bytes(self.body), body_type(self.request.headers.get("Content-Type")))
@@ -143,7 +145,7 @@ class ProjectImports(Resource):
         return Reply(job, status=202, location=f"/jobs/{job.id}", headers={"Retry-After": "1"})
 
     async def _import_now(self, project: str, options: ImportOptions) -> list[ImportEntry]:
-        """Read files in threads while earlier ones are stored; return one entry for each file, in order."""
+        """Read files in child processes while earlier ones are stored; return one entry for each file, in order."""
         skeleton = None
         if options.skeleton is not None:
             skeleton = await self.look_up(importing.read_skeleton, project, options.skeleton)
@@ -153,25 +155,34 @@ class ProjectImports(Resource):
         reading = deque(plans)
         ahead: deque[asyncio.Task[PreparedImport]] = deque()
         storing: asyncio.Task[list[ImportEntry]] | None = None
-        while reading or ahead:
-            ready: list[PreparedImport] = []
-            while (reading or ahead) and len(ready) < FILES_PER_WRITE:
-                while reading and len(ahead) <= FILES_AHEAD:
-                    work = self._prepare(reading.popleft(), by_name, options, skeleton)
-                    ahead.append(asyncio.ensure_future(work))
-                ready.append(await ahead.popleft())
+        try:
+            while reading or ahead:
+                ready: list[PreparedImport] = []
+                while (reading or ahead) and len(ready) < FILES_PER_WRITE:
+                    while reading and len(ahead) <= FILES_AHEAD:
+                        work = self._prepare(reading.popleft(), by_name, options, skeleton)
+                        ahead.append(asyncio.ensure_future(work))
+                    ready.append(await ahead.popleft())
+                if storing is not None:
+                    entries += await storing
+                storing = asyncio.ensure_future(self._store(project, ready))
             if storing is not None:
                 entries += await storing
-            storing = asyncio.ensure_future(self._store(project, ready))
-        if storing is not None:
-            entries += await storing
+        finally:
+            await _give_up(one for one in (*ahead, storing) if one is not None)
         for entry in entries:
             self.services.metrics.imports.labels(entry.status).inc()
         return entries
 
     async def _store(self, project: str, files: list[PreparedImport]) -> list[ImportEntry]:
-        if new := await self.look_up(importing.new_skeletons, project, files):
-            files = await self.compute(importing.add_mappings, files, new)
+        new = await self.look_up(importing.new_skeletons, project, files)
+        for digest, first in importing.firsts_of_skeletons(files, new).items():
+            make = partial(importing.mapping_order, first)
+            try:
+                mapping = await self.compute_in_child(importing.FIND_MAPPING, make, importing.found_mapping)
+                files = importing.add_mapping(files, digest, mapping)
+            except ApiProblem as error:
+                files = importing.refuse_with_skeleton(files, digest, error)
         return await self.change(importing.publish, project, files)
 
     async def _prepare(
@@ -181,10 +192,18 @@ class ProjectImports(Resource):
         options: ImportOptions,
         skeleton: GivenSkeleton | None,
     ) -> PreparedImport:
+        if (entry := importing.planned_entry(planned)) is not None:
+            return entry
         names = [planned.name] if planned.companion is None else [planned.name, planned.companion]
-        read = planned.role not in ("refused", "companion")
-        sources = [await self._with_bytes(by_name[name]) for name in names] if read else []
-        return await self.compute(importing.prepare, planned, sources, options, skeleton)
+        sources = [await self._with_bytes(by_name[name]) for name in names]
+        try:
+            return await self.compute_in_child(
+                importing.READ_FILE,
+                partial(importing.file_order, planned, sources, options, skeleton),
+                partial(importing.prepared_import, planned.name, sources),
+            )
+        except ApiProblem as error:
+            return importing.refused_import(planned.name, error)
 
     async def _with_bytes(self, file: SourceFile) -> SourceFile:
         if file.content is not None:
@@ -200,6 +219,14 @@ class ProjectImports(Resource):
         for file in getattr(self, "files", ()):
             if isinstance(file.content, blobs.Spool):
                 file.content.close()
+
+
+async def _give_up(tasks: Iterable[asyncio.Task[Any]]) -> None:
+    """Cancel tasks that have not ended, and wait for all."""
+    left = list(tasks)
+    for task in left:
+        task.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
 
 
 def _decode(data: bytes, media_type: str) -> ImportRequest:

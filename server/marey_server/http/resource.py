@@ -22,7 +22,8 @@ import asyncio
 import hashlib
 import re
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import cached_property, partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
@@ -33,7 +34,7 @@ from tornado.web import stream_request_body
 from marey_schemas.encoding.codecs import JSON, unpacked_limit
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import ApiProblem, BadRequestProblem, TooLargeProblem
+from marey_server.errors import ApiProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
 from marey_server.http import negotiation
 from marey_server.http.calls import Call, Caller, admission_of, admit, require_access, run_call, run_plain
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation
@@ -41,6 +42,7 @@ from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
+from marey_server.process.children import ChildTask
 from marey_server.process.memory import Holding
 from marey_server.process.password_lanes import limited_address
 from marey_server.store.database.lanes import Client
@@ -51,6 +53,7 @@ T = TypeVar("T")
 
 INLINE_BYTES = 4 * 1024
 """Greatest size of JSON bodies that are decoded on the event loop; larger ones, and other forms, in a thread."""
+CLIENT_GONE = "The client closed the connection before this was computed."
 ADMISSION_S = 5.0
 """Time in seconds for which a caller who was admitted may send further bodies without another look at the database."""
 _METHODS = ("get", "post", "put", "patch", "delete")
@@ -81,6 +84,7 @@ class Resource(Exchange):
         """Set up the state of one request."""
         super().initialize()
         self._received = bytearray()
+        self._in_children: set[ChildTask[Any]] = set()
 
     @property
     def principal(self) -> Principal | None:
@@ -165,6 +169,39 @@ class Resource(Exchange):
         """Run a computation that may take seconds, like `compute`; some threads are reserved for short ones."""
         async with self.services.compute_threads.long_place():
             return await self.compute(function, *args, **kwargs)
+
+    @asynccontextmanager
+    async def using_children(self) -> AsyncIterator[None]:
+        """Count this request as one that reads untrusted files. Raises `UnavailableProblem` if there are too many."""
+        if self.principal is None:  # children are shared among users, not among their tokens
+            await self.look_up(_identify)
+        with self.services.children.request(self._child_user):
+            yield
+
+    async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
+        """Call `function` (`module:name`) in a child process, with `make()` as argument, and return `read(result)`.
+
+        Raises `ClientGoneProblem` if the client goes away; the child is killed then.
+        """
+        if self._gone:
+            raise ClientGoneProblem(CLIENT_GONE)
+        task = self.services.children.submit(self._child_user, function, make, read)
+        self._in_children.add(task)
+        try:
+            return await asyncio.wrap_future(task.future)
+        except asyncio.CancelledError:
+            task.abandon()
+            if self._gone:
+                raise ClientGoneProblem(CLIENT_GONE) from None
+            raise
+        finally:
+            self._in_children.discard(task)
+
+    @property
+    def _child_user(self) -> str:
+        """The user among whom children are shared; for guests, their address."""
+        user = self.principal.user_id if self.principal is not None else None
+        return user or f"address {limited_address(self.client_address)}"
 
     def on_finish(self) -> None:
         """Note the use of the caller's token after the answer was written."""
@@ -342,8 +379,10 @@ class Resource(Exchange):
             self.send(outcome)
 
     def on_connection_close(self) -> None:
-        """Release the received part of a body whose client has gone; a method that runs does so itself."""
+        """Release the received part of a body whose client has gone, unless a method runs; give up work of children."""
         super().on_connection_close()
+        for task in list(self._in_children):
+            task.abandon()
         if not self.performing and hasattr(self, "operation"):
             self.holding.release()
 
@@ -390,3 +429,7 @@ def _apply(function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, 
 def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int, *, keep_blocks: bool) -> Any:
     tree = decode_body(data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks)
     return tree if content is Document else validate_body(content, tree)
+
+
+def _identify(_tx: Transaction) -> None:
+    """Do nothing: identifying the caller is part of every transaction."""

@@ -1,17 +1,15 @@
-"""Import of uploaded files: read and encoded in threads, then stored, several in one transaction."""
+"""Import of uploaded files: read and encoded in child processes, then stored, several in one transaction."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from marey_schemas.documents.clips import Check
-from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
-from marey_schemas.lru import LruCache
 from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import ApiProblem, InvalidProblem
 from marey_server.store import blobs, items, projects
@@ -22,14 +20,15 @@ from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
 
 if TYPE_CHECKING:  # numeric modules take a second to load: only who imports files pays for them
-    from marey_motion.importing.items import GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
+    from marey_motion.importing.items import GivenSkeleton, ImportedGraph
     from marey_motion.importing.plan import PlannedFile
 
-REFUSED_ALTOGETHER = (401, 403, 404, 503, 507)
+REFUSED_ALTOGETHER = (401, 403, 404, 499, 503, 507)
 """Errors that concern the whole request and not a single file."""
 
-_SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=64)
-"""Cache of checked and encoded skeleton hierarchies, by their JSON."""
+READ_FILE = "marey_server.motions.reading:read_file"
+FIND_MAPPING = "marey_server.motions.reading:find_mapping"
+"""Functions that child processes run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +53,6 @@ class PreparedImport:
     name: str
     sources: tuple[SourceFile, ...] = ()
     drafts: tuple[Draft, ...] = ()
-    found: ImportedFile | None = None
     checks: tuple[Check, ...] = ()
     frames: int | None = None
     graph: ImportedGraph | None = None
@@ -76,35 +74,54 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
     return plan_imports(names)
 
 
-def prepare(
-    planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
-) -> PreparedImport:
-    """Read a file with its companion and encode its documents. This is the slow part and needs no database."""
-    from marey_motion.importing.files import import_file, planned_entry
-    from marey_motion.importing.items import FileToImport
+def planned_entry(planned: PlannedFile) -> PreparedImport | None:
+    """Return the entry of a file that is not read itself, or None."""
+    from marey_motion.importing.files import planned_entry
 
-    if (entry := planned_entry(planned)) is not None:
-        return PreparedImport(planned.name, entry=entry)
+    entry = planned_entry(planned)
+    return None if entry is None else PreparedImport(planned.name, entry=entry)
+
+
+def file_order(
+    planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
+) -> bytes:
+    """Return the order to read a file with its companion."""
+    from marey_server.motions.reading import FileOrder, packed_skeleton
+
     file, companion = sources[0], sources[1] if len(sources) > 1 else None
-    found = import_file(
-        FileToImport(
-            planned,
-            file.read(),
-            file.digest,
-            options,
-            companion=None if companion is None else companion.read(),
-            companion_digest=None if companion is None else companion.digest,
-            skeleton=skeleton,
-        )
-    )
+    return FileOrder(
+        planned=planned,
+        content=file.read(),
+        digest=file.digest,
+        options=options,
+        companion=None if companion is None else companion.read(),
+        companion_digest=None if companion is None else companion.digest,
+        skeleton=packed_skeleton(skeleton),
+    ).pack()
+
+
+def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> PreparedImport:
+    """Return what a child process read from a file, ready to be stored."""
+    from marey_server.motions.reading import ReadFile
+
+    found = ReadFile.unpack(answer)
     if found.refusal is not None:
-        return PreparedImport(planned.name, entry=refused_entry(planned.name, found.refusal))
-    try:
-        drafts = tuple(map(_draft, found.items))
-    except ApiProblem as error:
-        return PreparedImport(planned.name, entry=_refused(planned.name, error))
-    checks = tuple(map(Check.model_validate, found.checks))
-    return PreparedImport(planned.name, tuple(sources), drafts, found, checks, found.frames, graph=found.graph)
+        return PreparedImport(name, entry=refused_entry(name, found.refusal))
+    drafts = tuple(
+        Draft(
+            item.name, item.kind, item.item_name, item.documents(), item.collection, item.tags, reuse=item.reuse
+        )
+        for item in found.items
+    )  # fmt: skip
+    graph = None if found.graph is None else found.graph.graph()
+    return PreparedImport(name, tuple(sources), drafts, found.checks, found.frames, graph=graph)
+
+
+def refused_import(name: str, error: ApiProblem) -> PreparedImport:
+    """Return the entry of a file that was refused; errors that concern the whole request are raised again."""
+    if error.status in REFUSED_ALTOGETHER:
+        raise error
+    return PreparedImport(name, entry=_refused(name, error))
 
 
 def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> set[str]:
@@ -113,44 +130,65 @@ def new_skeletons(tx: Transaction, project: str, files: Sequence[PreparedImport]
     return digests - items.find_contents(tx, project, Kind.SKELETON, "hierarchy", digests)
 
 
-def add_mappings(files: Sequence[PreparedImport], new: Collection[str]) -> list[PreparedImport]:
-    """Add joint mapping and axes to new skeletons, derived from the first file of each skeleton."""
-    mappings: dict[str, PreparedDocument] = {}
-    return [_with_mapping(file, new, mappings) for file in files]
+def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -> dict[str, PreparedImport]:
+    """Return the first file of each new skeleton, by the skeleton's digest."""
+    firsts: dict[str, PreparedImport] = {}
+    for file in files:
+        for digest in new:
+            if _has_skeleton(file, digest):
+                firsts.setdefault(digest, file)
+    return firsts
 
 
-def _with_mapping(file: PreparedImport, new: Collection[str], mappings: dict[str, PreparedDocument]) -> PreparedImport:
-    from marey_motion.importing.files import mapping_part
+def mapping_order(file: PreparedImport) -> bytes:
+    """Return the order to derive the joint mapping and axes of a file's skeleton."""
+    from marey_server.motions.reading import MappingOrder, ReadDocument
 
-    drafts = []
-    for draft in file.drafts:
-        if draft.kind is Kind.SKELETON and (digest := _hierarchy(draft).digest) in new:
-            assert file.found is not None
-            if digest not in mappings:
-                mappings[digest] = prepare_document(mapping_part(file.found))
-            draft = replace(draft, parts={**draft.parts, "mapping": mappings[digest]})
-        drafts.append(draft)
-    return replace(file, drafts=tuple(drafts))
+    motion = next((_part(draft, "motion") for draft in file.drafts if draft.kind is Kind.CLIP), None)
+    return MappingOrder(
+        hierarchy=ReadDocument.of(_hierarchy(file.drafts[0])),
+        motion=None if motion is None else ReadDocument.of(motion),
+    ).pack()
+
+
+def found_mapping(answer: bytes) -> PreparedDocument:
+    """Return the part `mapping` that a child process derived."""
+    from marey_server.motions.reading import ReadDocument
+
+    return ReadDocument.unpack(answer).document()
+
+
+def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedDocument) -> list[PreparedImport]:
+    """Add joint mapping and axes to a new skeleton, which is given by its digest."""
+
+    def with_mapping(draft: Draft) -> Draft:
+        if draft.kind is not Kind.SKELETON:
+            return draft
+        return replace(draft, parts={**draft.parts, "mapping": mapping})
+
+    return [
+        replace(file, drafts=tuple(map(with_mapping, file.drafts))) if _has_skeleton(file, digest) else file
+        for file in files
+    ]
+
+
+def refuse_with_skeleton(files: Sequence[PreparedImport], digest: str, error: ApiProblem) -> list[PreparedImport]:
+    """Refuse the files with a new skeleton whose mapping could not be derived."""
+    return [refused_import(file.name, error) if _has_skeleton(file, digest) else file for file in files]
+
+
+def _has_skeleton(file: PreparedImport, digest: str) -> bool:
+    return any(draft.kind is Kind.SKELETON and _hierarchy(draft).digest == digest for draft in file.drafts)
 
 
 def _hierarchy(draft: Draft) -> PreparedDocument:
-    document = draft.parts["hierarchy"]
+    return _part(draft, "hierarchy")
+
+
+def _part(draft: Draft, part: str) -> PreparedDocument:
+    document = draft.parts[part]
     assert isinstance(document, PreparedDocument)
     return document
-
-
-def _draft(item: ImportedItem) -> Draft:
-    def prepared(tree: dict[str, Any]) -> PreparedDocument:
-        return prepare_document(tree, schema=tree["schema"])
-
-    if item.kind is Kind.SKELETON:  # many files of an upload have the same one
-        parts = {
-            part: _SKELETONS.get_or_make(encode_tree(tree, JSON), lambda tree=tree: prepared(tree))  # type: ignore[misc]
-            for part, tree in item.parts.items()
-        }
-    else:
-        parts = {part: prepared(tree) for part, tree in item.parts.items()}
-    return Draft(item.name, item.kind, item.item_name, parts, item.collection, item.tags, reuse=item.reuse)
 
 
 def _refused(name: str, error: ApiProblem) -> ImportEntry:
@@ -219,9 +257,11 @@ def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
         return page.count or 0, [NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in page.items]
 
     try:
-        return _draft(graph_item(graph, find))
+        item = graph_item(graph, find)
     except MotionError as error:
         raise InvalidProblem(str(error), code=error.code) from error
+    parts = {part: prepare_document(tree, schema=tree["schema"]) for part, tree in item.parts.items()}
+    return Draft(item.name, item.kind, item.item_name, parts, item.collection, item.tags, reuse=item.reuse)
 
 
 def _entry(file: PreparedImport, published: Sequence[Published]) -> ImportEntry:

@@ -1,15 +1,11 @@
-"""Threads for computations, a limit on long computations, and memory settings of the C library.
+"""Threads for computations, and a limit on long computations.
 
 Long computations must leave a thread for short ones: exports, documents, passwords.
-
-By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. For a
-clip, this takes as long as the rest of a read.
 """
 
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import logging
 import os
 import sys
@@ -32,11 +28,6 @@ LONGEST_WAIT_FOR_PLACE_S = 20.0
 """Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
 ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-KEPT_BLOCK_BYTES = 20 * 2**20
-"""Size in bytes above which freed blocks are returned to the system at once; writing a clip as JSON takes 17 MB."""
-KEPT_BYTES = 32 * 2**20
-"""Free bytes at the end of a heap above which they are returned; each thread has its own heap."""
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 
 class ComputeThreads:
@@ -98,11 +89,3 @@ def leave() -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
-
-
-def keep_freed_memory() -> None:
-    """Keep freed memory for the next request. Affects glibc only."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, KEPT_BYTES)

@@ -17,6 +17,7 @@ from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
 from marey_server.motions.searching import size_bytes as searchable_bytes
+from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
@@ -50,7 +51,13 @@ class Description:
 class Services:
     """Database, threads, metrics and the state of a server that is starting, serving or draining."""
 
-    def __init__(self, settings: Settings, database: Database, description: Callable[[], Description]) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        database: Database,
+        description: Callable[[], Description],
+        children: Children | None = None,
+    ) -> None:
         self.settings = settings
         self.database = database
         self.description = description
@@ -75,6 +82,7 @@ class Services:
         """For all other sign-ins."""
         self.refused_tries = RefusedTries()
         self.compute_threads = ComputeThreads()
+        self.children = children or Children(settings.child_limits)
         self.memory = RequestMemory(settings.request_memory_bytes)
         self.upload_hashes = UploadHashes(database)
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
@@ -107,6 +115,7 @@ class Services:
 
     def close(self) -> None:
         """Wait for running transactions, then close everything."""
+        self.children.close()
         self.compute_threads.close()
         self.password_lane.close()
         self.stranger_lane.close()

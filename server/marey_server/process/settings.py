@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_server.process.children import ChildLimits
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.retention import Retention
 
@@ -111,6 +113,26 @@ class Settings(BaseSettings):
         ge=0,
         description="Greatest number of bytes in an import that runs at once; larger imports become a job.",
     )
+    child_processes: int | None = Field(
+        None,
+        ge=2,
+        le=64,
+        description="Processes in which the server reads uploaded files and draws samples of models; nobody uses all "
+        "of them at once. Absent: one more than there are processors, but 3 to 5.",
+    )
+    child_requests: int = Field(
+        32,
+        ge=2,
+        description="Greatest number of requests that use these processes or wait for one; a user has half of them. "
+        "Others are answered with 503.",
+    )
+    child_memory_mb: int = Field(
+        1024, ge=64, description="Memory in MiB that such a process may use to read a file or to draw samples."
+    )
+    child_processor_s: float = Field(
+        30.0, ge=1, description="Greatest processor time in seconds to read a file or to draw samples."
+    )
+    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds to read a file or to draw samples.")
     lease_ttl_s: float = Field(
         QueuePolicy.lease_ttl_s,
         ge=1,
@@ -175,6 +197,17 @@ class Settings(BaseSettings):
     def retention(self) -> Retention:
         """Return for how long events, logs and jobs are kept."""
         return Retention(self.events_days, self.logs_days, self.jobs_days)
+
+    @property
+    def child_limits(self) -> ChildLimits:
+        """Return the limits of child processes."""
+        return ChildLimits(
+            children=self.child_processes or min(max(2, os.cpu_count() or 2), 4) + 1,
+            requests=self.child_requests,
+            memory_mb=self.child_memory_mb,
+            processor_s=self.child_processor_s,
+            wall_s=self.child_wall_s,
+        )
 
     @property
     def resolved_database_threads(self) -> int:

@@ -71,15 +71,35 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
         raise InvalidProblem(f"This cannot be stored as a document: {error}", code="bad-document") from error
     if _NUL.search(canonical):
         raise InvalidProblem("Text in documents must not contain the character U+0000.", code="bad-text")
+    return _of_canonical(name, canonical, lambda _, leaf: encoded[leaf["content"]])
+
+
+def document_of_bytes(schema: str, canonical: bytes, arrays: Mapping[str, bytes]) -> PreparedDocument:
+    """Return a document that another process of this server has checked and encoded.
+
+    `canonical` is its JSON with references to arrays, which are given by JSON Pointer.
+    """
+    return _of_canonical(schema, canonical, lambda pointer, _: arrays[pointer])
+
+
+def _of_canonical(schema: str, canonical: bytes, array_of: Callable[[str, Tree], bytes]) -> PreparedDocument:
     body = json.loads(canonical)
-    leaves, files = references_of(name, body)
-    arrays = {
-        pointer: (blobs.digest_of(encoded[leaf["content"]]), encoded[leaf["content"]])
-        for pointer, leaf in leaves.items()
-    }
-    _check_pointers([*arrays, *files])
-    size_bytes = len(canonical) + sum(len(data) for data in encoded.values())
-    return PreparedDocument(blobs.digest_of(canonical), name, body, size_bytes, arrays, files)
+    leaves, files = references_of(schema, body)
+    encoded = {pointer: array_of(pointer, leaf) for pointer, leaf in leaves.items()}
+    _check_pointers([*encoded, *files])
+    arrays = {pointer: (blobs.digest_of(data), data) for pointer, data in encoded.items()}
+    size_bytes = len(canonical) + sum(map(len, {leaf["content"]: encoded[at] for at, leaf in leaves.items()}.values()))
+    return PreparedDocument(blobs.digest_of(canonical), schema, body, size_bytes, arrays, files)
+
+
+def decoded_tree(content: PreparedDocument) -> Tree:
+    """Return the tree that a document was prepared from."""
+    tree: Tree = json.loads(canonical_json(content.body))
+    for pointer, (_, data) in content.arrays.items():
+        holder, key = _place(tree, pointer)
+        leaf = holder[key]
+        holder[key] = EncodedArray(leaf["dtype"], tuple(leaf["shape"]), data).decode()
+    return tree
 
 
 def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:

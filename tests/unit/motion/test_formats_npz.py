@@ -122,7 +122,7 @@ def test_an_archive_of_another_kind_is_told_what_it_is(members: tuple[str, ...],
 def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
     archive: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(npz, "MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(npz, "MOST_UNPACKED_BYTES", 1 << 20)
     archive["poses.npy"] = member(np.zeros(1 << 20))
     bomb = packed(archive, zipfile.ZIP_DEFLATED)
     assert len(bomb) < 1 << 16

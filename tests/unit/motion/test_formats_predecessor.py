@@ -215,7 +215,7 @@ def test_damaged_documents_are_refused(data: bytes) -> None:
 
 
 def test_a_document_that_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predecessor_encoding, "MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(predecessor_encoding, "MOST_UNPACKED_BYTES", 1 << 20)
     bomb = bz2.compress(bytes(1 << 22))
     assert len(bomb) < 1 << 10
     with pytest.raises(FormatLimit, match="unpacks to more"):

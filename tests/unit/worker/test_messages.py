@@ -10,8 +10,9 @@ import pytest
 from marey_schemas.items import PartPlace
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.processes.child_process import BadMessage
 from marey_schemas.worker_protocol import PinnedInput
-from marey_worker.messages import BadMessage, ChildReply, Done, Made, PutFile, ReadParts, ReadResults, Run, pack, unpack
+from marey_worker.messages import ChildReply, Done, Made, PutFile, ReadParts, ReadResults, Run, pack, unpack
 
 PIN = PinnedInput(item="clip_1", revision=2, kind=Kind.CLIP, name="walk", collection="takes")
 RUN = Run("job_1", "align", {"window": 3}, {"clips": (PIN,)}, 7, 1 << 29, Path("/tmp/log"), Path("/tmp/job"), 2)

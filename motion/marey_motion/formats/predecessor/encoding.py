@@ -9,9 +9,9 @@ from typing import Any, Literal
 import bson
 
 from marey_motion.errors import FormatError, FormatLimit
+from marey_schemas.formats import MOST_UNPACKED_BYTES
 
 Encoding = Literal["json", "bson", "bson.bz2"]
-MAX_BYTES = 1 << 27
 _BZ2_MARK = b"BZh"
 
 
@@ -34,7 +34,7 @@ def encode_document(document: dict[str, Any], encoding: Encoding) -> bytes:
 
 
 def decode_document(data: bytes, file: str) -> dict[str, Any]:
-    """Decode a document; nothing larger than `MAX_BYTES` is unpacked.
+    """Decode a document; nothing larger than `MOST_UNPACKED_BYTES` is unpacked.
 
     Parameters
     ----------
@@ -57,6 +57,8 @@ def decode_document(data: bytes, file: str) -> dict[str, Any]:
         else:
             document = bson.decode(data)
     except (ValueError, RecursionError, OverflowError, bson.errors.BSONError) as error:
+        if isinstance(error, bson.errors.BSONError) and not str(error):
+            raise MemoryError from error  # which bson replaces by an error of its own without a text
         raise FormatError(f"the document cannot be read: {error}", code="document-damaged", file=file) from error
     if not isinstance(document, dict):
         raise FormatError("the file contains no document", code="document-damaged", file=file)
@@ -70,11 +72,11 @@ def _is_bson(data: bytes) -> bool:
 def _decompressed(data: bytes, file: str) -> bytes:
     decompressor = bz2.BZ2Decompressor()
     try:
-        document = decompressor.decompress(data, MAX_BYTES + 1)
+        document = decompressor.decompress(data, MOST_UNPACKED_BYTES + 1)
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(f"the bz2 data is damaged: {error}", code="document-damaged", file=file) from error
-    if len(document) > MAX_BYTES:
-        raise FormatLimit(f"the document unpacks to more than {MAX_BYTES} bytes", file=file)
+    if len(document) > MOST_UNPACKED_BYTES:
+        raise FormatLimit(f"the document unpacks to more than {MOST_UNPACKED_BYTES} bytes", file=file)
     if not decompressor.eof:
         raise FormatError("the bz2 data is cut off", code="file-truncated", file=file)
     return document

@@ -1,0 +1,110 @@
+"""Child process of the server that reads untrusted files: it runs one order after another, within limits.
+
+Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
+
+Arguments: the pipe's file descriptor, the memory in bytes that orders may use, and functions to call before the first
+order, which load modules. The parent kills this process if an order takes too long, or if its client has gone away.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Self
+
+import msgpack
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from marey_schemas.problems import FieldError
+from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
+from marey_schemas.processes.limits import allow_memory, allow_processor_time
+from marey_schemas.processes.memory import keep_freed_memory
+from marey_server.errors import ApiProblem
+
+
+class Message(BaseModel):
+    """Message with named fields."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def pack(self) -> bytes:
+        """Return the message as bytes."""
+        packed: bytes = msgpack.packb(self.model_dump(by_alias=True))
+        return packed
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self:
+        """Return the message that the bytes contain. Raises `BadMessage`."""
+        try:
+            fields: Any = msgpack.unpackb(data)
+            return cls.model_validate(fields)
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException, ValidationError) as error:
+            raise BadMessage(f"a child process sent {len(data)} bytes that are no {cls.__name__}: {error}") from error
+
+
+class ChildOrder(Message):
+    """Order to call a function, named `module:function`, which takes and returns bytes."""
+
+    function: str
+    payload: bytes
+    processor_s: float
+
+
+class ChildRefusal(Message):
+    """Refusal by a function: the status, code and text of an `ApiProblem`."""
+
+    status: int
+    code: str
+    detail: str
+    errors: tuple[FieldError, ...] = ()
+
+
+class ChildAnswer(Message):
+    """End of an order: its result, or one reason why there is none."""
+
+    payload: bytes = b""
+    refusal: ChildRefusal | None = None
+    out_of_memory: bool = False
+    traceback: str = ""
+
+
+def main() -> None:
+    """Run orders until the pipe closes."""
+    pipe = connect_to_parent()
+    keep_freed_memory()
+    for name in sys.argv[3:]:
+        _function(name)()
+    pipe.send_bytes(READY)
+    allow_memory(int(sys.argv[2]))
+    while True:
+        try:
+            order = ChildOrder.unpack(pipe.recv_bytes())
+        except EOFError:
+            return
+        allow_processor_time(order.processor_s)
+        pipe.send_bytes(run(order).pack())
+
+
+def run(order: ChildOrder) -> ChildAnswer:
+    """Call the function of an order and return its end."""
+    try:
+        return ChildAnswer(payload=_function(order.function)(order.payload))
+    except MemoryError:
+        return ChildAnswer(out_of_memory=True)
+    except ApiProblem as error:
+        refusal = ChildRefusal(status=error.status, code=error.error_code, detail=error.detail, errors=error.errors)
+        return ChildAnswer(refusal=refusal)
+    except Exception as error:  # noqa: BLE001 - whatever a file causes ends its order, not the process
+        return ChildAnswer(traceback="".join(traceback.format_exception(error)))
+
+
+def _function(name: str) -> Callable[..., bytes]:
+    module, _, function = name.partition(":")
+    found: Callable[..., bytes] = getattr(import_module(module), function)
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Reading of uploaded files in a child process: orders of imports, and the documents that answer them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Self
+
+from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
+from marey_motion.importing.files import import_file, mapping_part
+from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
+from marey_motion.importing.plan import PlannedFile
+from marey_motion.warm_up import compile_kernels
+from marey_schemas.documents.clips import Check
+from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.encoding.codecs import JSON, MSGPACK, decode_tree, encode_tree
+from marey_schemas.imports import Refusal
+from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
+from marey_schemas.options.imports import ImportOptions
+from marey_server.motions.child import Message
+from marey_server.store.documents import PreparedDocument, decoded_tree, document_of_bytes, prepare_document
+
+_SKELETONS_KEPT = 64
+
+
+class FileOrder(Message):
+    """Order to read a file with its companion."""
+
+    planned: PlannedFile
+    content: bytes
+    digest: str
+    options: ImportOptions
+    companion: bytes | None = None
+    companion_digest: str | None = None
+    skeleton: tuple[str, int, bytes] | None = None
+    """Item, revision and hierarchy of the skeleton that the clips must use."""
+
+    def file(self) -> FileToImport:
+        """Return the file with everything that its import needs."""
+        given = None
+        if self.skeleton is not None:
+            item, revision, hierarchy = self.skeleton
+            given = GivenSkeleton(item, revision, decode_tree(hierarchy, MSGPACK))
+        return FileToImport(
+            self.planned, self.content, self.digest, self.options, self.companion, self.companion_digest, given
+        )
+
+
+def packed_skeleton(given: GivenSkeleton | None) -> tuple[str, int, bytes] | None:
+    """Return a stored skeleton in the form of `FileOrder`."""
+    if given is None:
+        return None
+    return given.item, given.revision, encode_tree(given.hierarchy, MSGPACK, arrays="blocks")
+
+
+class ReadDocument(Message):
+    """Document that was checked and encoded; digests are computed by the receiver."""
+
+    schema_name: str
+    body: bytes
+    arrays: dict[str, bytes]
+
+    @classmethod
+    def of(cls, document: PreparedDocument) -> Self:
+        """Return the message of a prepared document."""
+        arrays = {pointer: data for pointer, (_, data) in document.arrays.items()}
+        return cls(schema_name=document.schema, body=canonical_json(document.body), arrays=arrays)
+
+    def document(self) -> PreparedDocument:
+        """Return the prepared document."""
+        return document_of_bytes(self.schema_name, self.body, self.arrays)
+
+
+_READ_SKELETONS: LruCache[bytes, ReadDocument] = LruCache(max_entries=_SKELETONS_KEPT)
+"""Cache of a child: encoded hierarchies by their JSON; many files of an upload have the same one."""
+_SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=_SKELETONS_KEPT)
+"""Cache of the server: hierarchies by the JSON that a child sent."""
+
+
+class ReadDraft(Message):
+    """Item that a file becomes."""
+
+    name: str
+    kind: Kind
+    item_name: str
+    collection: str
+    parts: dict[str, ReadDocument]
+    tags: tuple[str, ...]
+    reuse: Literal["by_name", "by_content"]
+
+    def documents(self) -> dict[str, PreparedDocument]:
+        """Return the parts as prepared documents."""
+        if self.kind is not Kind.SKELETON:
+            return {part: read.document() for part, read in self.parts.items()}
+        return {part: _SKELETONS.get_or_make(read.body, read.document) for part, read in self.parts.items()}
+
+
+class ReadGraph(Message):
+    """Graph of models of the predecessor; a node is its action, name, id, type and transitions."""
+
+    name: str
+    collection: str
+    tags: tuple[str, ...]
+    file: str
+    digest: str
+    nodes: tuple[tuple[str, str, str, str, tuple[tuple[str, str], ...]], ...]
+    start: tuple[str, str]
+
+    @classmethod
+    def of(cls, graph: ImportedGraph) -> Self:
+        """Return the message of a graph."""
+        nodes = tuple((*place, node.model_id, node.type, node.transitions) for place, node in graph.graph.nodes.items())
+        return cls(
+            name=graph.name, collection=graph.collection, tags=tuple(graph.tags), file=graph.file, digest=graph.digest,
+            nodes=nodes, start=graph.graph.start,
+        )  # fmt: skip
+
+    def graph(self) -> ImportedGraph:
+        """Return the graph."""
+        nodes = {(action, name): GraphNode(model, form, onwards) for action, name, model, form, onwards in self.nodes}
+        graph = PredecessorGraph(nodes, self.start)
+        return ImportedGraph(self.name, self.collection, self.tags, graph, self.file, self.digest)
+
+
+class ReadFile(Message):
+    """Items of a file, or the reason why it was refused."""
+
+    items: tuple[ReadDraft, ...] = ()
+    checks: tuple[Check, ...] = ()
+    frames: int | None = None
+    graph: ReadGraph | None = None
+    refusal: Refusal | None = None
+
+
+class MappingOrder(Message):
+    """Order to find the joint mapping and axes of a skeleton, with the motion of a clip that uses it."""
+
+    hierarchy: ReadDocument
+    motion: ReadDocument | None
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def load() -> None:
+    """Load what reading needs; kernels are compiled where necessary, which takes far longer than reading a file."""
+    compile_kernels(["files"])
+
+
+def read_file(order: bytes) -> bytes:
+    """Carry out a `FileOrder` and return a `ReadFile`. Raises `InvalidProblem` for documents that cannot be stored."""
+    found = import_file(FileOrder.unpack(order).file())
+    return ReadFile(
+        items=tuple(map(_read_item, found.items)),
+        checks=tuple(map(Check.model_validate, found.checks)),
+        frames=found.frames,
+        graph=None if found.graph is None else ReadGraph.of(found.graph),
+        refusal=found.refusal,
+    ).pack()
+
+
+def find_mapping(order: bytes) -> bytes:
+    """Carry out a `MappingOrder` and return the part `mapping` as a `ReadDocument`."""
+    wanted = MappingOrder.unpack(order)
+    skeleton = ImportedItem("", Kind.SKELETON, "", "", {"hierarchy": decoded_tree(wanted.hierarchy.document())})
+    items = [skeleton]
+    if wanted.motion is not None:
+        items.append(ImportedItem("", Kind.CLIP, "", "", {"motion": decoded_tree(wanted.motion.document())}))
+    return ReadDocument.of(prepare_document(mapping_part(ImportedFile("", tuple(items))))).pack()
+
+
+def _read_item(item: ImportedItem) -> ReadDraft:
+    return ReadDraft(
+        name=item.name, kind=item.kind, item_name=item.item_name, collection=item.collection,
+        parts={part: _read_document(item.kind, tree) for part, tree in item.parts.items()},
+        tags=tuple(item.tags), reuse=item.reuse,
+    )  # fmt: skip
+
+
+def _read_document(kind: Kind, tree: dict[str, Any]) -> ReadDocument:
+    def read() -> ReadDocument:
+        return ReadDocument.of(prepare_document(tree, schema=tree["schema"]))
+
+    return _READ_SKELETONS.get_or_make(encode_tree(tree, JSON), read) if kind is Kind.SKELETON else read()

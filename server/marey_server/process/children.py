@@ -1,0 +1,346 @@
+"""Child processes in which the server reads untrusted files: a bounded number, shared fairly, within limits.
+
+Each child has a thread, which starts it, sends it one order after another, and replaces it. Of the waiting orders, the
+next is one of the caller who uses the fewest children, and nobody uses all of them.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, InvalidStateError
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from marey_schemas.processes.child_process import BadMessage, ChildBroken, ChildProcess
+from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
+from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
+from marey_server.process.computing import ASK_AGAIN_S
+
+T = TypeVar("T")
+
+CHILD_MODULE = "marey_server.motions.child"
+LOADED_FIRST = ("marey_server.motions.reading:load",)
+"""Functions that a new child calls, so that its first order does not wait for modules."""
+ORDERS_PER_CHILD = 1000
+"""Number of orders after which a child is replaced, so that memory that a library loses does not add up."""
+ABANDONED_S = 1.0
+"""Time in seconds in which an order may end by itself after its client has gone; a new child takes longer to start."""
+CLOSING_S = 10.0
+MIB = 1 << 20
+JOB_ADVICE = "split it, or submit a job, which may have more"
+_PROBLEMS = {one.status: one for one in (InvalidProblem, NotFoundProblem, TooLargeProblem)}
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ChildLimits:
+    """Limits of all children together, and of each order."""
+
+    children: int
+    requests: int
+    memory_mb: int
+    processor_s: float
+    wall_s: float
+
+    @property
+    def children_each(self) -> int:
+        """Greatest number of children that one caller uses at the same time."""
+        return max(1, self.children - 1)
+
+    @property
+    def requests_each(self) -> int:
+        """Greatest number of requests of one caller that use children or wait for one."""
+        return max(1, self.requests // 2)
+
+
+@dataclass(eq=False)
+class ChildTask(Generic[T]):
+    """Call of a function in a child: `make` returns its argument, and `read` converts its result."""
+
+    caller: str
+    function: str
+    make: Callable[[], bytes]
+    read: Callable[[bytes], T]
+    future: Future[T] = field(default_factory=Future)
+    stopped: str = ""
+    """Reason why the child was killed: `time`, `abandoned` or `closing`."""
+    _child: ChildProcess | None = None
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def assign(self, child: ChildProcess | None) -> None:
+        """Set the child that runs this task; None once it has ended."""
+        with self._lock:
+            self._child = child
+
+    def stop(self, reason: str) -> None:
+        """Kill the child that runs this task, if one does."""
+        with self._lock:
+            if self._child is not None and not self.stopped:
+                self.stopped = reason
+                self._child.abort()
+
+    def abandon(self) -> None:
+        """Give the task up, because its client has gone away; a child that works on it is killed after a moment."""
+        if self.future.cancel():
+            _after(ABANDONED_S, self.stop, "abandoned")
+
+    def succeed(self, payload: bytes) -> None:
+        """Convert the result and end the task."""
+        try:
+            result = self.read(payload)
+        except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
+            self.fail(error)
+            return
+        with suppress(InvalidStateError):
+            self.future.set_result(result)
+
+    def fail(self, error: Exception) -> None:
+        """End the task without a result."""
+        with suppress(InvalidStateError):
+            self.future.set_exception(error)
+
+
+class Children:
+    """Pool of child processes; they are started when they are first needed."""
+
+    def __init__(self, limits: ChildLimits, loaded_first: Sequence[str] = LOADED_FIRST) -> None:
+        self.limits = limits
+        self._arguments = [str(limits.memory_mb * MIB), *loaded_first]
+        self._changed = threading.Condition()
+        self._waiting: list[ChildTask[Any]] = []
+        self._running: list[ChildTask[Any]] = []
+        self._requests: Counter[str] = Counter()
+        self._turns: dict[str, int] = {}
+        """Number of the last turn of each caller, of whom no one has two before another has one."""
+        self._turn = 0
+        self._threads: list[threading.Thread] = []
+        self._starting: set[ChildProcess] = set()
+        self._closed = False
+
+    @contextmanager
+    def request(self, caller: str) -> Iterator[None]:
+        """Count a request inside the block. Raises `UnavailableProblem` if too many use children or wait for one."""
+        with self._changed:
+            if self._requests[caller] >= self.limits.requests_each:
+                raise _busy(f"{self._requests[caller]} of your requests")
+            if self._requests.total() >= self.limits.requests:
+                raise _busy(f"{self._requests.total()} requests")
+            self._requests[caller] += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._requests[caller] -= 1
+                if not self._requests[caller]:
+                    del self._requests[caller]
+                    self._turns.pop(caller, None)
+
+    def submit(self, caller: str, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> ChildTask[T]:
+        """Call `function` (`module:name`) in a child with what `make` returns; the task's future gets `read` of it."""
+        task = ChildTask(caller, function, make, read)
+        with self._changed:
+            if self._closed:
+                raise _stopping()
+            self._waiting.append(task)
+            callers = Counter(task.caller for task in (*self._waiting, *self._running))
+            if sum(min(count, self.limits.children_each) for count in callers.values()) > len(self._threads):
+                self._start_thread()
+            self._changed.notify_all()
+        return task
+
+    def warm(self) -> None:
+        """Start as many children as one caller uses; the others are started when several need them."""
+        with self._changed:
+            while not self._closed and len(self._threads) < self.limits.children_each:
+                self._start_thread()
+
+    def close(self) -> None:
+        """Kill all children; what they work on and what waits fails."""
+        with self._changed:
+            self._closed = True
+            left, self._waiting = self._waiting, []
+            for task in self._running:
+                task.stop("closing")
+            for child in self._starting:
+                child.abort()
+            self._changed.notify_all()
+        for task in left:
+            task.fail(_stopping())
+        for thread in self._threads:
+            thread.join(CLOSING_S)
+
+    def _start_thread(self) -> None:
+        if len(self._threads) == self.limits.children:
+            return
+        thread = threading.Thread(target=self._work, name=f"marey-child-{len(self._threads) + 1}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def _eligible(self) -> list[ChildTask[Any]]:
+        """Return the waiting tasks whose callers may use one more child; given up tasks are removed."""
+        self._waiting = [task for task in self._waiting if not task.future.cancelled()]
+        using = Counter(task.caller for task in self._running)
+        return [task for task in self._waiting if using[task.caller] < self.limits.children_each]
+
+    # -- the thread of one child --
+
+    def _work(self) -> None:
+        """Run one task after another until the pool is closed."""
+        child, orders = self._started(), 0
+        while (task := self._next_task()) is not None:
+            if child is None or not child.alive or orders >= ORDERS_PER_CHILD:
+                _discard(child)
+                child, orders = self._started(), 0
+            orders += 1
+            if child is None:
+                task.fail(UnavailableProblem("The server cannot start a process that reads files; its log says why."))
+            elif not self._perform(task, child):
+                _discard(child)
+                child = None
+            with self._changed:
+                self._running.remove(task)
+                self._changed.notify_all()
+        _discard(child)
+
+    def _started(self) -> ChildProcess | None:
+        """Return a new child that is ready, or None if it cannot be started."""
+        child = ChildProcess(CHILD_MODULE, self._arguments, threads=1)
+        with self._changed:
+            self._starting.add(child)
+            if self._closed:
+                child.abort()
+        try:
+            child.wait_until_ready()
+        except ChildBroken as error:
+            if not self._closed:
+                log.error("%s", error)
+            _discard(child)
+            return None
+        finally:
+            with self._changed:
+                self._starting.discard(child)
+        return child
+
+    def _next_task(self) -> ChildTask[Any] | None:
+        """Wait for the next task; None if the pool is closed."""
+        with self._changed:
+            while not self._closed:
+                if eligible := self._eligible():
+                    using = Counter(task.caller for task in self._running)
+                    task = min(eligible, key=lambda one: (using[one.caller], self._turns.get(one.caller, 0)))
+                    self._waiting.remove(task)
+                    self._running.append(task)
+                    self._turn += 1
+                    self._turns[task.caller] = self._turn
+                    return task
+                self._changed.wait()
+        return None
+
+    def _perform(self, task: ChildTask[Any], child: ChildProcess) -> bool:
+        """Run a task in a child; return whether the child can run another one."""
+        try:
+            order = ChildOrder(function=task.function, payload=task.make(), processor_s=self.limits.processor_s).pack()
+        except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it
+            task.fail(error)
+            return True
+        task.assign(child)
+        if self._closed:
+            task.stop("closing")
+        timer = _after(self.limits.wall_s, task.stop, "time")
+        try:
+            child.send(order)
+            outcome = ChildAnswer.unpack(child.receive() or b"")
+        except (EOFError, OSError):
+            child.abort()
+            task.fail(self._problem_of_end(task, child.wait()))
+            return False
+        except BadMessage as error:
+            log.error("%s", error)
+            task.fail(ApiProblem("A process that reads files failed; the server's log says why."))
+            return False
+        finally:
+            timer.cancel()
+            task.assign(None)
+        self._settle(task, outcome)
+        return not task.stopped and not outcome.out_of_memory
+
+    def _settle(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
+        if outcome.out_of_memory:
+            task.fail(self._too_much_memory())
+        elif outcome.refusal is not None:
+            task.fail(_as_error(outcome.refusal))
+        elif outcome.traceback:
+            log.error("%s failed in a child process:\n%s", task.function, outcome.traceback)
+            task.fail(ApiProblem("The server failed to read this; its log says why."))
+        else:
+            task.succeed(outcome.payload)
+
+    def _problem_of_end(self, task: ChildTask[Any], status: int) -> ApiProblem:
+        """Return the reason why a child ended while it ran a task."""
+        if task.stopped == "closing":
+            return _stopping()
+        if task.stopped == "time":
+            return _too_long(f"{self.limits.wall_s:g} s", "child_wall_s")
+        if status == -signal.SIGXCPU:
+            return _too_long(f"{self.limits.processor_s:g} s of processor time", "child_processor_s")
+        ended = f"was ended by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        return InvalidProblem(
+            f"The process that read this {ended}; it may be damaged, or need more memory than there is.",
+            code="child-died",
+        )
+
+    def _too_much_memory(self) -> ApiProblem:
+        return TooLargeProblem(
+            f"This needs more than the {self.limits.memory_mb} MB of memory that the server uses to answer at once "
+            f"(child_memory_mb); {JOB_ADVICE}.",
+            code="memory-limit",
+        )
+
+
+def _after(seconds: float, function: Callable[[str], None], argument: str) -> threading.Timer:
+    timer = threading.Timer(seconds, function, [argument])
+    timer.daemon = True
+    timer.start()
+    return timer
+
+
+def _discard(child: ChildProcess | None) -> None:
+    if child is not None:
+        child.kill(grace_s=0.0)
+
+
+def _busy(which: str) -> UnavailableProblem:
+    return UnavailableProblem(
+        f"{which} use the processes that read files and draw samples, or wait for one; try again in a few seconds.",
+        code="children-busy",
+        headers={"Retry-After": str(ASK_AGAIN_S)},
+    )
+
+
+def _stopping() -> UnavailableProblem:
+    return UnavailableProblem("The server is stopping; try again.", headers={"Retry-After": str(ASK_AGAIN_S)})
+
+
+def _too_long(limit: str, setting: str) -> TooLargeProblem:
+    return TooLargeProblem(
+        f"This takes longer than the {limit} that the server uses to answer at once ({setting}); {JOB_ADVICE}.",
+        code="time-limit",
+    )
+
+
+def _as_error(problem: ChildRefusal) -> ApiProblem:
+    kind = _PROBLEMS.get(problem.status, InvalidProblem)
+    return kind(problem.detail, code=problem.code, errors=problem.errors)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -1,0 +1,69 @@
+"""Functions that tests run in child processes of the server."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from marey_server.errors import InvalidProblem
+
+
+def echo(payload: bytes) -> bytes:
+    """Return the payload and the number of the process."""
+    return payload + f" {os.getpid()}".encode()
+
+
+def environment(_payload: bytes) -> bytes:
+    """Return all variables of the process."""
+    return "\n".join(f"{name}={text}" for name, text in os.environ.items()).encode()
+
+
+def refuse(_payload: bytes) -> bytes:
+    """Refuse the payload."""
+    raise InvalidProblem("no walk", code="no-walk")
+
+
+def fail(_payload: bytes) -> bytes:
+    """Fail as a function with a mistake does."""
+    raise KeyError("walk")
+
+
+def eat(_payload: bytes) -> bytes:
+    """Fill the memory."""
+    return b"x" * (1 << 40)
+
+
+def burn(_payload: bytes) -> bytes:
+    """Use the processor for ever."""
+    while True:
+        pass
+
+
+def wait_for(payload: bytes) -> bytes:
+    """Note the number of the process in a file, and wait until a file beside it exists."""
+    noted = Path(payload.decode())
+    noted.with_suffix(".part").write_text(str(os.getpid()))
+    noted.with_suffix(".part").rename(noted)
+    while not noted.with_suffix(".go").exists():
+        time.sleep(0.01)
+    return b"waited"
+
+
+def wait_in_import(order: bytes) -> bytes:
+    """Wait as `wait_for` does; the file to import contains the path."""
+    from marey_server.motions.reading import FileOrder  # which loads far more than the other functions need
+
+    return wait_for(FileOrder.unpack(order).content)
+
+
+def stop(payload: bytes) -> bytes:
+    """Stop the whole process, which then neither answers nor ends."""
+    Path(payload.decode()).write_text(str(os.getpid()))
+    os.kill(os.getpid(), signal.SIGSTOP)
+    return b""
+
+
+def crash(_payload: bytes) -> bytes:
+    """End by a fault of native code."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+    return b""

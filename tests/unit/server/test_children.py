@@ -1,0 +1,176 @@
+"""Child processes that read untrusted files: limits, shares, and their ends."""
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from tests.support.rest_server import PATIENCE_S
+
+from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem, UnavailableProblem
+from marey_server.process.children import ChildLimits, Children, ChildTask
+
+FUNCTIONS = "tests.support.child_functions"
+LIMITS = ChildLimits(children=2, requests=4, memory_mb=256, processor_s=1, wall_s=PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def children() -> Iterator[Children]:
+    """Two children."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MAREY_DATABASE_URL", "postgresql://marey:hunter2@db/marey")
+        patch.setenv("MAREY_TOKEN", "hunter2")
+        pool = Children(LIMITS, ())
+        yield pool
+        pool.close()
+
+
+def run(pool: Children, function: str, payload: bytes = b"", *, caller: str = "rita") -> bytes:
+    """Return the result of a function in a child."""
+    return start(pool, function, payload, caller=caller).future.result(PATIENCE_S)
+
+
+def start(pool: Children, function: str, payload: bytes = b"", *, caller: str = "rita") -> ChildTask[bytes]:
+    """Start a function in a child."""
+    return pool.submit(caller, f"{FUNCTIONS}:{function}", lambda: payload, bytes)
+
+
+def until(condition: Callable[[], Any]) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def wait_for(pool: Children, folder: Path, name: str, *, caller: str) -> ChildTask[bytes]:
+    """Start a function that waits for a file, and wait until a child runs it."""
+    task = start(pool, "wait_for", str(folder / name).encode(), caller=caller)
+    until(lambda: (folder / name).exists() or task.future.done())
+    assert not task.future.done(), task.future.exception()
+    return task
+
+
+def let_go(folder: Path, name: str) -> None:
+    """Let a function that waits return."""
+    (folder / f"{name}.go").touch()
+
+
+def note(ended: list[str], caller: str, _future: object) -> None:
+    """Note whose order ended."""
+    ended.append(caller)
+
+
+def process_id(pool: Children) -> int:
+    """Return the process that ran a short function."""
+    return int(run(pool, "echo").split()[-1])
+
+
+def test_a_child_stays_for_the_next_order(children: Children) -> None:
+    assert process_id(children) == process_id(children)
+
+
+def test_no_child_sees_a_secret(children: Children) -> None:
+    seen = run(children, "environment").decode()
+    assert "PATH=" in seen
+    assert "hunter2" not in seen
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "code", "detail", "survives"),
+    [
+        ("refuse", InvalidProblem, "no-walk", "no walk", True),
+        ("fail", ApiProblem, "internal", "log says why", True),
+        ("eat", TooLargeProblem, "memory-limit", "256 MB of memory .*child_memory_mb", False),
+        ("burn", TooLargeProblem, "time-limit", "1 s of processor time .*child_processor_s", False),
+        ("crash", InvalidProblem, "child-died", "SIGSEGV", False),
+    ],
+)
+def test_each_end_of_an_order_has_its_reason_and_the_next_order_is_carried_out(
+    children: Children, function: str, kind: type[ApiProblem], code: str, detail: str, *, survives: bool
+) -> None:
+    before = process_id(children)
+    with pytest.raises(kind, match=detail) as caught:
+        run(children, function)
+    assert caught.value.error_code == code
+    assert (process_id(children) == before) is survives
+
+
+def test_a_child_that_hangs_is_killed(tmp_path: Path) -> None:
+    pool = Children(ChildLimits(2, 4, 256, 60, wall_s=0.5), ())
+    try:
+        with pytest.raises(TooLargeProblem, match=r"0.5 s .*child_wall_s"):
+            run(pool, "stop", str(tmp_path / "stopped").encode())
+        until(lambda: not psutil.pid_exists(int((tmp_path / "stopped").read_text() or 0)))
+    finally:
+        pool.close()
+
+
+def test_what_somebody_kills_fails_and_the_next_order_is_carried_out(children: Children, tmp_path: Path) -> None:
+    task = wait_for(children, tmp_path, "walk", caller="rita")
+    os.kill(int((tmp_path / "walk").read_text()), signal.SIGKILL)
+    with pytest.raises(InvalidProblem, match="SIGKILL"):
+        task.future.result(PATIENCE_S)
+    assert run(children, "echo", b"next").startswith(b"next ")
+
+
+def test_one_caller_never_uses_all_children(children: Children, tmp_path: Path) -> None:
+    long = wait_for(children, tmp_path, "long", caller="mallory")
+    more = start(children, "echo", caller="mallory")
+    assert run(children, "echo", b"mine", caller="rita").startswith(b"mine ")
+    assert not more.future.done()
+    let_go(tmp_path, "long")
+    assert (long.future.result(PATIENCE_S), bool(more.future.result(PATIENCE_S))) == (b"waited", True)
+
+
+def test_callers_take_turns(children: Children, tmp_path: Path) -> None:
+    ended: list[str] = []
+    blocked = [wait_for(children, tmp_path, name, caller=name) for name in ("otto", "olga")]
+    for caller in ("mallory", "mallory", "mallory", "rita"):
+        start(children, "echo", caller=caller).future.add_done_callback(partial(note, ended, caller))
+    let_go(tmp_path, "otto")
+    until(lambda: len(ended) == 4)
+    assert ended.index("rita") <= 1
+    let_go(tmp_path, "olga")
+    assert [task.future.result(PATIENCE_S) for task in blocked] == [b"waited", b"waited"]
+
+
+def test_work_for_a_client_that_left_is_stopped(children: Children, tmp_path: Path) -> None:
+    task = wait_for(children, tmp_path, "walk", caller="rita")
+    waiting = start(children, "wait_for", str(tmp_path / "never").encode(), caller="rita")
+    waiting.abandon()
+    task.abandon()
+    process = int((tmp_path / "walk").read_text())
+    until(lambda: not psutil.pid_exists(process))
+    assert run(children, "echo", b"next").startswith(b"next ")
+    assert not (tmp_path / "never").exists()
+
+
+def test_requests_are_bounded_together_and_for_each_caller(children: Children) -> None:
+    with children.request("mallory"), children.request("mallory"):
+        with pytest.raises(UnavailableProblem, match=r"^2 of your requests use") as caught, children.request("mallory"):
+            pass
+        assert (caught.value.error_code, "Retry-After" in caught.value.headers) == ("children-busy", True)
+        too_many = pytest.raises(UnavailableProblem, match=r"^4 requests use")
+        with children.request("rita"), children.request("olga"), too_many, children.request("otto"):
+            pass
+    with children.request("mallory"), children.request("mallory"):
+        pass
+
+
+def test_a_pool_that_closes_kills_its_children_and_fails_what_waits(tmp_path: Path) -> None:
+    pool = Children(LIMITS, ())
+    running = wait_for(pool, tmp_path, "walk", caller="rita")
+    waiting = start(pool, "echo", caller="rita")
+    pool.close()
+    for task in (running, waiting):
+        with pytest.raises(UnavailableProblem, match="stopping"):
+            task.future.result(PATIENCE_S)
+    assert not psutil.pid_exists(int((tmp_path / "walk").read_text()))
+    with pytest.raises(UnavailableProblem):
+        start(pool, "echo")
