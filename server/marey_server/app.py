@@ -85,8 +85,10 @@ class Application(TornadoApplication):
         duration_s = handler.request.request_time()
         route = handler.template()
         status = handler.get_status()
-        method = handler.request.method or ""
+        method = handler.request.method if handler.request.method in handler.SUPPORTED_METHODS else "(unknown)"
         self.services.metrics.count_request(method, route, status, duration_s, handler.received_bytes)
+        if handler.problem_code is not None:
+            self.services.metrics.refusals.labels(handler.problem_code, route).inc()
         level = logging.ERROR if status >= 500 else logging.INFO
         if handler.uneventful and status < 400:
             level = logging.DEBUG
@@ -165,7 +167,9 @@ def accept_connections(app: Application, server: HTTPServer, sockets: list[socke
         most_each=most if settings.trust_proxy else int(most * ADDRESS_SHARE),
         write_timeout_s=settings.write_timeout_s,
         busy=lambda: {request.stream for request in in_flight},
+        count_closed=lambda reason: app.services.metrics.closed.labels(reason).inc(),
     )
+    app.services.metrics.connections.set_function(lambda: len(connections))
     connections.accept_from(sockets)
     return connections
 

@@ -12,6 +12,7 @@ from typer import Context
 from typer.main import get_command
 
 from marey_client.cli.app import app
+from marey_server.process.observe import Metrics
 
 COMMANDS = get_command(app)
 WRITTEN = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
@@ -38,6 +39,19 @@ def test_every_decision_is_listed() -> None:
     listed = (ROOT / "docs" / "decisions" / "README.md").read_text(encoding="utf-8")
     numbered = [file.name for file in (ROOT / "docs" / "decisions").glob("0*.md")]
     assert [name for name in numbered if name not in listed] == []
+
+
+def test_metrics_that_a_page_names_exist_with_these_labels() -> None:
+    page = (ROOT / "docs" / "how-to" / "see-attacks.md").read_text(encoding="utf-8")
+    metrics = {
+        vars(metric)["_name"]: set(vars(metric)["_labelnames"])
+        for metric in vars(Metrics()).values()
+        if "_labelnames" in vars(metric)
+    }
+    named = re.findall(r"\b(marey_[a-z_]+?)(?:_total)?(?:\{(\w+))?\b", page)
+    assert named
+    wrong = [name for name, label in named if name not in metrics or (label and label not in metrics[name])]
+    assert wrong == []
 
 
 def told_commands() -> list[tuple[str, str]]:

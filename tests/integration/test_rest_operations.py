@@ -23,6 +23,7 @@ from marey_server.access.passwords import hash_password
 from marey_server.access.principal import SYSTEM
 from marey_server.store import users
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import SERVER
 
 SERVE = "import asyncio; from marey_server.app import serve; from marey_server.process.settings import Settings; "
 
@@ -163,6 +164,55 @@ def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.C
     assert counted % 200 in text
     assert counted % 404 in text
     assert "private-name" not in text
+
+
+def metrics(server: Server) -> str:
+    return httpx.get(f"{server.address}/metrics").text
+
+
+def test_metrics_count_refusals_by_code_and_route_and_name_nobody(server: Server, owner: httpx.Client) -> None:
+    invented = "marey_aaaaaaaaaaaa_" + "b" * 64
+    for _ in range(2):
+        server.client(invented).get("/projects/secret-name")
+    httpx.post(f"{server.api}/login", json={"name": "secret-name", "password": "secret-word"})
+    owner.post("/projects", json={"name": "lab"})
+    httpx.get(f"{server.address}/secret-path")
+    text = metrics(server)
+    for code, route, count in (
+        ("bad-token", "/api/v1/projects/{project}", 2),
+        ("wrong-password", "/api/v1/login", 1),
+        ("name-taken", "/api/v1/projects", 1),
+        ("not-found", "(unknown)", 1),
+    ):
+        assert f'marey_refusals_total{{code="{code}",route="{route}"}} {count}.0' in text
+    for private in ("secret", "olga", "aaaaaaaa", "bbbbbbbb", "127.0.0.1"):
+        assert private not in text
+
+
+def test_metrics_do_not_grow_with_invented_methods_and_paths(server: Server) -> None:
+    def series() -> int:
+        for number in range(3):
+            httpx.request(f"INVENTED{number}", f"{server.address}/path{number}")
+        return metrics(server).count("\n")
+
+    series()
+    assert series() == series()
+    assert "INVENTED" not in metrics(server)
+
+
+def test_metrics_tell_the_sizes_of_queues_and_pools(server: Server) -> None:
+    going_on = threading.Event()
+    reads = [server.database.queue_read(SERVER, SYSTEM, lambda _tx: going_on.wait(PATIENCE_S)) for _ in range(20)]
+    try:
+        sizes = dict(line.rsplit(" ", 1) for line in metrics(server).splitlines() if line.startswith("marey_"))
+    finally:
+        going_on.set()
+    assert not any(read.exception() for read in reads)
+    assert float(sizes['marey_waiting{lane="database"}']) >= 12
+    assert float(sizes['marey_waiting{lane="passwords"}']) == 0
+    assert float(sizes["marey_database_connections"]) >= 0
+    assert float(sizes["marey_connections"]) >= 1
+    assert float(sizes["marey_request_memory_bytes"]) >= 0
 
 
 def test_metrics_tell_how_many_requests_are_under_way(server: Server) -> None:

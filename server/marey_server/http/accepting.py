@@ -104,6 +104,7 @@ class Connections:
     most_each : greatest number of connections of one address
     write_timeout_s : time in seconds in which a client must take `LEAST_TAKEN_BYTES`, or all that waits for it
     busy : returns the streams on which a request is being answered; others are idle
+    count_closed : counts a refused or closed connection by its reason
     """
 
     def __init__(
@@ -114,12 +115,14 @@ class Connections:
         most_each: int,
         write_timeout_s: float,
         busy: Callable[[], Collection[object]],
+        count_closed: Callable[[str], None],
     ) -> None:
         self._server = server
         self._most = most
         self._most_each = most_each
         self._write_timeout_s = write_timeout_s
         self._busy = busy
+        self._count_closed = count_closed
         self._open: dict[_Connection, None] = {}  # in the order of their acceptance
         self._by_address: Counter[str] = Counter()
         self._listening: list[socket.socket] = []
@@ -230,7 +233,8 @@ class Connections:
                 one.start_count(now_s)
 
     def _log(self, kind: str, text: str, *args: object) -> None:
-        """Log a warning, at most one of each kind in `LOG_EVERY_S`."""
+        """Count what happened, and log a warning, at most one of each kind in `LOG_EVERY_S`."""
+        self._count_closed(kind)
         now_s = time.monotonic()
         if now_s - self._logged_s.get(kind, -LOG_EVERY_S) >= LOG_EVERY_S:
             self._logged_s[kind] = now_s

@@ -50,6 +50,7 @@ class Exchange(RequestHandler):
         self.request_id = request_id(self.request.headers.get("X-Request-Id"))
         self.set_header("X-Request-Id", self.request_id)
         self.received_bytes = 0
+        self.problem_code: str | None = None
         self.refused = self.performing = self._gone = False
 
     @classmethod
@@ -170,6 +171,7 @@ class Exchange(RequestHandler):
             self.finish()
 
     def _write_problem(self, error: BaseException) -> None:
+        self.problem_code = problem_code(error)
         self.send(render_problem(error, self.request_id))
 
     def log_exception(self, _type: Any, value: Any, _traceback: Any) -> None:
@@ -197,6 +199,15 @@ def forwarded_address(header: str, hops: int) -> str | None:
         return None
 
 
+def problem_code(error: BaseException) -> str:
+    """Return the code of the problem document of an error."""
+    if isinstance(error, ApiProblem):
+        return error.error_code
+    if isinstance(error, HTTPError):
+        return responses.get(error.status_code, "Error").lower().replace(" ", "-")
+    return ApiProblem.code
+
+
 def render_problem(error: BaseException, request_id: str) -> Rendered:
     """Return the problem document of an error; for internal errors, it contains only the request id."""
     if isinstance(error, ApiProblem):
@@ -204,11 +215,11 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
         headers = dict(error.headers)
     elif isinstance(error, HTTPError):
         title = responses.get(error.status_code, "Error")
-        problem = _problem(error.status_code, title.lower().replace(" ", "-"), title, f"{title}.", request_id)
+        problem = _problem(error.status_code, problem_code(error), title, f"{title}.", request_id)
         headers = {}
     else:
         detail = "Something went wrong here. It is in the server's log under this request id."
-        problem = _problem(500, ApiProblem.code, "The server failed.", detail, request_id)
+        problem = _problem(500, problem_code(error), "The server failed.", detail, request_id)
         headers = {}
     if problem.status == 401:
         headers.setdefault("WWW-Authenticate", 'Bearer realm="marey"')

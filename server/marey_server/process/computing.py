@@ -39,6 +39,11 @@ class ComputeThreads:
         self._long_places = asyncio.Semaphore(count - 1)
         self.rendering = Lane(f"{THREAD_NAME}-rendering", RENDERING_THREADS, most_each=RENDERING_THREADS - 1)
 
+    @property
+    def lanes(self) -> dict[str, Lane]:
+        """The lanes by name."""
+        return {"computing": self._lane, "rendering": self.rendering}
+
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run a computation or file access of the server itself in a thread, away from the event loop."""
         return self._lane.submit(SERVER, function, *args, **kwargs)

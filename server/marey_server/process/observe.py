@@ -1,6 +1,7 @@
 """Logs, request ids and metrics.
 
-Metrics are labelled with route templates, not with addresses, so that their number does not grow with the data.
+Metrics are labelled with route templates, methods and codes that the server knows, never with anything that a client
+sent, so that they reveal no names, and their number grows neither with the data nor under attack.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import logging
 import re
 import secrets
+from collections.abc import Mapping, Sized
+from functools import partial
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
@@ -73,8 +76,23 @@ class Metrics:
             "marey_http_request_seconds", "Time from the headers of a request to the end of its answer.",
             ("method", "route"), buckets=_BUCKETS_S, registry=self.registry,
         )  # fmt: skip
+        self.refusals = Counter(
+            "marey_refusals", "Requests refused, by problem code.", ("code", "route"), registry=self.registry
+        )
+        self.closed = Counter(
+            "marey_connections_closed", "Connections refused or closed to protect others: full, evicted, exhausted "
+            "(no file descriptors left) or slow.", ("reason",), registry=self.registry,
+        )  # fmt: skip
         self.received = Counter("marey_http_received_bytes", "Bytes of request bodies.", registry=self.registry)
         self.in_flight = Gauge("marey_http_in_flight", "Requests under way.", registry=self.registry)
+        self.connections = Gauge("marey_connections", "Open connections.", registry=self.registry)
+        self.waiting = Gauge("marey_waiting", "Calls that wait for a thread.", ("lane",), registry=self.registry)
+        self.request_memory = Gauge(
+            "marey_request_memory_bytes", "Memory counted for bodies and unsent answers.", registry=self.registry
+        )
+        self.database_connections = Gauge(
+            "marey_database_connections", "Connections to the database in use.", registry=self.registry
+        )
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
 
@@ -88,3 +106,8 @@ class Metrics:
         self.seconds.labels(method, route).observe(duration_s)
         if bytes_in:
             self.received.inc(bytes_in)
+
+    def watch(self, lanes: Mapping[str, Sized]) -> None:
+        """Show how many calls wait in each lane."""
+        for name, lane in lanes.items():
+            self.waiting.labels(name).set_function(partial(len, lane))

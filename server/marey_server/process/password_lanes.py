@@ -53,9 +53,7 @@ class PasswordLane:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"marey-password-{name}")
         self._places: Counter[str] = Counter()
 
-    @property
-    def taken(self) -> int:
-        """The number of requests in the lane."""
+    def __len__(self) -> int:
         return self._places.total()
 
     @contextmanager
@@ -70,7 +68,7 @@ class PasswordLane:
                 code="too-many-sign-ins",
                 headers={"Retry-After": "1"},
             )
-        if self.taken >= PLACES:
+        if len(self) >= PLACES:
             raise UnavailableProblem(
                 f"The server checks as many passwords at once as it may ({PLACES}); try again in 2 s.",
                 code="too-many-passwords",

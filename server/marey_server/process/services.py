@@ -75,7 +75,6 @@ class Services:
         """Times at which callers were admitted, by what the admission depends on."""
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
-        self.metrics.in_flight.set_function(lambda: len(self.in_flight))
         self.password_lane = PasswordLane("known")
         """For signed-in users, and sign-ins from addresses that the user has signed in from before."""
         self.stranger_lane = PasswordLane("stranger")
@@ -89,6 +88,15 @@ class Services:
         self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
         self.start_grace = StartGrace(self.queue_policy)
+        self._watch()
+
+    def _watch(self) -> None:
+        """Show the sizes of queues and pools in the metrics."""
+        passwords = {"passwords": self.password_lane, "passwords-of-strangers": self.stranger_lane}
+        self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
+        self.metrics.in_flight.set_function(lambda: len(self.in_flight))
+        self.metrics.request_memory.set_function(lambda: self.memory.held_bytes)
+        self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def knows(self, token: str) -> bool:
         """Return whether a request with this token was accepted before, so that its caller has lines of its own."""

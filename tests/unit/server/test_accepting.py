@@ -60,7 +60,12 @@ def serve(
         server = Kept(lambda _request: None)
         server.streams = []
         connections = Connections(
-            server, most=most, most_each=most, write_timeout_s=TIMEOUT_S, busy=lambda: busy(server)
+            server,
+            most=most,
+            most_each=most,
+            write_timeout_s=TIMEOUT_S,
+            busy=lambda: busy(server),
+            count_closed=lambda _reason: None,
         )
         one = listening(socket.AF_INET, socket.SOCK_STREAM)
         one.bind(("127.0.0.1", 0))

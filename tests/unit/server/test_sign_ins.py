@@ -176,7 +176,7 @@ def test_a_lane_is_bounded_and_one_address_takes_a_part_of_it() -> None:
     assert full.value.error_code == "too-many-passwords"
     for place in (*held, *more):
         place.__exit__(None, None, None)
-    assert lane.taken == 0
+    assert len(lane) == 0
     with lane.place("10.0.0.1"):
         assert asyncio.run(lane.run(sum, [1, 2])) == 3
     lane.close()

@@ -100,6 +100,18 @@ class Database:
             return str(self.url.database)
         return self.url.set(query={}).render_as_string(hide_password=True)
 
+    @property
+    def lanes(self) -> dict[str, Lane | WriteLane]:
+        """The lanes by name."""
+        lanes: dict[str, Lane | WriteLane] = {"database": self._ordinary, "database-reserved": self._reserved}
+        return lanes if self._write_lane is None else {**lanes, "database-writing": self._write_lane}
+
+    @property
+    def connections_in_use(self) -> int:
+        """The number of connections that run a transaction."""
+        pools = {self.engine.pool, self._read_engine.pool}
+        return sum(pool.checkedout() for pool in pools if isinstance(pool, sqlalchemy.QueuePool))
+
     # -- running functions in transactions ----------------------------------------------------------------------------
 
     def read(

@@ -134,6 +134,9 @@ class Lane:
         self._strangers = 0
         self._lock = threading.Lock()
 
+    def __len__(self) -> int:
+        return len(self._line)
+
     def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Queue a call for a client. Raises `UnavailableProblem` if the line is full."""
         future: Future[T] = Future()

@@ -49,6 +49,9 @@ class WriteLane:
         self._lock = threading.Lock()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="marey-write")
 
+    def __len__(self) -> int:
+        return len(self._ordinary) + len(self._reserved)
+
     def submit(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
