@@ -134,6 +134,22 @@ class GoneProblem(ApiProblem):
     code = "gone"
 
 
+class AuthorLostProblem(LeaseLostProblem):
+    """The author of the job may no longer run jobs in its project; stop working on it."""
+
+    def __init__(self, job_id: str, fence: int) -> None:
+        super().__init__(
+            f"The author of {job_id} is disabled or no longer has the role that the job needs. Stop working on it.",
+            context={"reason": AUTHOR_LOST},
+        )
+        self.job_id = job_id
+        self.fence = fence
+
+
+AUTHOR_LOST = "author-lost-access"
+"""Reason why an attempt is stopped, and code of the failure of its job."""
+
+
 class PreconditionFailedProblem(ApiProblem):
     """The resource has changed since you read it."""
 

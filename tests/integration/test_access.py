@@ -19,7 +19,7 @@ from marey_server.store.transaction import Transaction
 REFUSALS = {
     "unauthenticated", "bad-token", "no-project", "insufficient-role", "insufficient-scope", "scope-missing",
     "administrators-only", "attempt-only", "not-for-attempts", "users-only", "forbidden", "no-user", "no-job",
-    "no-blob", "no-attempt", "not-yours",
+    "no-blob", "no-attempt", "not-yours", "lease-lost",
 }  # fmt: skip
 """Problem codes that say: you may not, or you may not know."""
 
@@ -140,7 +140,7 @@ def test_an_attempt_ends_with_its_own_token_and_no_other(house: House) -> None:
             assert refused.status_code in ((404,) if role == "ended" else (401, 403)), (role, refused.text)
     attempt = house.people.client(house.tokens["attempt"])
     assert attempt.post(template, json=body).status_code == 200
-    assert attempt.get("/projects/lab").status_code in (401, 404)
+    assert attempt.get("/projects/lab").status_code == 409
 
 
 def test_a_public_project_is_read_by_everybody_but_not_its_members_and_events(house: House) -> None:

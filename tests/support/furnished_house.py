@@ -123,6 +123,8 @@ class House:
                 content = json.dumps(BODIES[name]).encode()
                 headers["Content-Type"] = "application/json"
         query = "?format=original" if template.endswith("{item}/export") else ""
+        if template.endswith("{project}/{kind}") and operation.method == "GET":
+            query = f"?name={CANARY}"  # attempts may only look up names
         return Planned(operation.method, template.replace(":int", "").format(**variables) + query, headers, content)
 
 
@@ -143,7 +145,9 @@ def build_house(people: People) -> House:
     tokens |= {"attempt": running["attempt_token"], "ended": ended["attempt_token"]}
     end = f"/jobs/{ended['job']}/attempts/{ended['fence']}/fail"
     assert people.client(tokens["ended"]).post(end, json={"write_id": "12345678", "code": "x"}).is_success
-    assert owner.post("/projects", json={"name": "gone"}).is_success
+    for name in ("gone", "elsewhere"):
+        assert owner.post("/projects", json={"name": name}).is_success
+    assert owner.put("/projects/elsewhere/members/bound", json={"role": "owner"}).is_success
     for name in ("reader", "contributor", "maintainer"):
         assert owner.put(f"/projects/gone/members/{name}", json={"role": name}).is_success
     variables |= {

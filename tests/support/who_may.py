@@ -19,7 +19,7 @@ RANK = {role: rank for rank, role in enumerate(Role)}
 
 LET_THROUGH: frozenset[int] = frozenset()
 """Verdict on callers who are not refused: the answer depends on the request alone."""
-SIGN_IN, FORBIDDEN, HIDDEN = frozenset({401}), frozenset({403}), frozenset({404})
+SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset({404}), frozenset({409})
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def verdict(person: Person, operation: Operation, *, public: bool = False) -> fr
     if person.standing == "none":
         return _of_guest(operation, public=public)
     if person.standing in ("attempt", "ended"):
-        return _of_attempt(person, operation, public=public)
+        return _of_attempt(person, operation)
     return _of_user(person, operation, public=public)
 
 
@@ -95,17 +95,11 @@ def _of_guest(operation: Operation, *, public: bool) -> frozenset[int]:
     return LET_THROUGH if public else HIDDEN
 
 
-def _of_attempt(person: Person, operation: Operation, *, public: bool) -> frozenset[int]:
-    """An attempt reads its project and writes through its own operations only; an ended one reads like a guest."""
-    if operation.access in (Access.USER, Access.ADMINISTRATOR, Access.WORKER):
-        return FORBIDDEN
-    if operation.access in (Access.ATTEMPT, Access.SIGNED_IN):
-        return LET_THROUGH
-    if operation.access is Access.READER:
-        if person.standing == "attempt":
-            return LET_THROUGH
-        return (LET_THROUGH if operation.public else FORBIDDEN) if public else HIDDEN
-    return FORBIDDEN if person.standing == "attempt" or public else HIDDEN
+def _of_attempt(person: Person, operation: Operation) -> frozenset[int]:
+    """An attempt reads its inputs and writes through its own operations; an ended one repeats what ended it."""
+    if person.standing == "ended":
+        return LET_THROUGH if operation.replays else OVER
+    return LET_THROUGH if operation.access is Access.ATTEMPT or operation.attempts else FORBIDDEN
 
 
 def _of_user(person: Person, operation: Operation, *, public: bool) -> frozenset[int]:
@@ -132,7 +126,7 @@ def _of_outsider(operation: Operation, *, public: bool) -> frozenset[int]:
 
 def table() -> str:
     """Return the Markdown table of the page on threats: one line per kind of caller, one column per access."""
-    words = {LET_THROUGH: "yes", SIGN_IN: "401", FORBIDDEN: "403", HIDDEN: "404"}
+    words = {LET_THROUGH: "yes", SIGN_IN: "401", FORBIDDEN: "403", HIDDEN: "404", OVER: "409"}
     columns = [access for access in Access if access is not Access.ANYONE]
     lines = ["| caller | " + " | ".join(access.value for access in columns) + " |", "|---" * (len(columns) + 1) + "|"]
     for person in PEOPLE.values():
@@ -150,5 +144,5 @@ def _sample(access: Access) -> Operation:
     return Operation(
         "GET", "", "", access, _SCOPES.get(access, usual), None, None, None, 200, paged=False, etag=False,
         precondition="none", idempotency="nature", answer_types=(), also=(), public=True, headers=(), stream=False,
-        reserved=False,
+        reserved=False, attempts=False, replays=False,
     )  # fmt: skip

@@ -23,8 +23,6 @@ PROJECTS = ("red", "green", "blue")
 USERS = ("ann", "bob", "cleo", "dora")
 BLOBS = tuple(f"bytes {number}".encode() for number in range(6))
 DIGESTS = tuple(f"sha256:{hashlib.sha256(data).hexdigest()}" for data in BLOBS)
-POSSESSION_BY_PROJECT = False
-"""Whether bytes that a token of one project has sent are unknown to the other tokens of its user."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +105,8 @@ class World:
         return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
 
     def may_refer(self, caller: Caller, blob: int) -> bool:
-        """Return whether the caller may read a blob, or refer to it."""
-        places = (None, caller.bound) if POSSESSION_BY_PROJECT and caller.bound else (None, *PROJECTS)
+        """Return whether the caller may read a blob, or refer to it; a bound token sends for its project."""
+        places = (caller.bound,) if caller.bound else (None, *PROJECTS)
         held = any((caller.user, place, blob) in self.held for place in places)
         return held or self.referring(caller, blob)
 
@@ -189,6 +187,9 @@ class Program:
     def send_blob(self, caller: Caller, _project: str) -> None:
         blob = self.chance.randrange(len(BLOBS))
         expected = self._user(caller, "write") or 204
+        if expected == 204 and caller.bound:  # the bytes are for this project
+            role = self.world.role(caller, caller.bound)
+            expected = 403 if role is None or RANK[role] < RANK[Role.CONTRIBUTOR] else 204
         if self._call(caller, "PUT", f"/blobs/{DIGESTS[blob]}", expected, content=BLOBS[blob]).is_success:
             self.world.held.add((str(caller.user), caller.bound, blob))
 

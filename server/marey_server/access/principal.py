@@ -12,8 +12,9 @@ from marey_schemas.access import Scope
 class Principal:
     """Caller, with the scopes of its credential.
 
-    `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job: it may
-    read the project of the job, and write only through the endpoints of its attempt.
+    `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. It is no
+    user, not even the author of the job: it reads the inputs of the job and what they name, and writes only what
+    belongs to its attempt. After its end (`ended`), it may only repeat the request that ended it.
     """
 
     kind: Literal["anonymous", "user", "attempt", "system"]
@@ -28,6 +29,7 @@ class Principal:
     project_id: str | None = None
     claim_key: bytes = field(default=b"", repr=False)
     """Secret from which the tokens of repeatable claims are derived; empty without a user's token."""
+    ended: bool = False
 
     @property
     def actor(self) -> str | None:

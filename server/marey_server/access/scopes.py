@@ -22,3 +22,8 @@ def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
     """Return the scopes in `wanted` that `held` does not include."""
     held = set(held)
     return [scope for scope in wanted if scope not in held and scope.partition("!")[0] not in held]
+
+
+def projects_of(scopes: Iterable[str], *needs: str) -> set[str]:
+    """Return the names of the projects to which `needs` are bound; the empty name if one of them is unbound."""
+    return {name for need, _, name in (scope.partition("!project=") for scope in scopes) if need in needs}

@@ -59,7 +59,7 @@ class MeResource(Resource):
     path = "/me"
     tag = "Access"
 
-    @reads(access=Access.SIGNED_IN, scope=None, answer=Me, reserved=True)
+    @reads(access=Access.SIGNED_IN, scope=None, answer=Me, attempts=True, reserved=True)
     async def get(self) -> Rendered:
         """Return your user and the scopes of your token."""
         return await self.answer(read_me)

@@ -38,7 +38,11 @@ class Blob(BlobSender):
         """Store the next bytes."""
         await self.receiver.write(chunk)
 
-    @writes(access=Access.SIGNED_IN, body=RequestBody(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False))
+    @writes(
+        access=Access.SIGNED_IN,
+        body=RequestBody(Bytes, max_bytes=MAX_BLOB_BYTES, streamed=True, required=False),
+        attempts=True,
+    )
     async def put(self, digest: str) -> Rendered:
         """Store bytes under their digest.
 
@@ -54,6 +58,7 @@ class Blob(BlobSender):
         etag=True,
         also=((206, None), (416, None)),
         headers=("Range", "If-Range"),
+        attempts=True,
     )
     async def get(self, digest: str) -> Rendered | None:
         """Return the bytes of a blob, or a range of them."""

@@ -24,7 +24,7 @@ from marey_server.http.resource import Resource
 from marey_server.http.validation import decode_body, validate_body
 from marey_server.motions import importing
 from marey_server.motions.importing import PreparedImport, SourceFile
-from marey_server.store import blobs
+from marey_server.store import blobs, projects
 from marey_server.store.jobs import submission
 from marey_server.store.transaction import Transaction
 
@@ -95,9 +95,13 @@ class ProjectImports(Resource):
         file = SourceFile(name, spool.digest, spool.size_bytes, spool)
         if self._is_large([*self.files, file]):
             with spool:
-                await self.change(blobs.put_blob, spool)
+                await self._keep(spool)
             file = SourceFile(name, file.digest, file.size_bytes, None)
         self.files.append(file)
+
+    async def _keep(self, spool: blobs.Spool) -> None:
+        """Store a file as a blob that the caller possesses in the project of the import."""
+        await self.change(_keep, self.path_kwargs["project"], spool)
 
     def _is_large(self, files: Sequence[SourceFile]) -> bool:
         settings = self.services.settings
@@ -138,7 +142,7 @@ class ProjectImports(Resource):
         for file in self.files:
             if isinstance(file.content, blobs.Spool):
                 with file.content as spool:
-                    await self.change(blobs.put_blob, spool)
+                    await self._keep(spool)
         files = [{"name": file.name, "blob": file.digest} for file in self.files]
         params = {**options.model_dump(mode="json", exclude_unset=True), "files": files}
         (job,) = await self.change(submission.submit, project, [JobCreate(kind="import", params=params)])
@@ -231,6 +235,10 @@ async def _give_up(tasks: Iterable[asyncio.Task[Any]]) -> None:
 
 def _decode(data: bytes, media_type: str) -> ImportRequest:
     return validate_body(ImportRequest, decode_body(data, media_type, max_array_bytes=0))
+
+
+def _keep(tx: Transaction, project: str, spool: blobs.Spool) -> None:
+    blobs.put_blob(tx, spool, project_id=projects.require(tx, project).id)
 
 
 def _form_options(form: dict[str, bytearray]) -> ImportOptions:

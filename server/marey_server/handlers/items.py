@@ -78,7 +78,7 @@ class ItemsOfKind(Resource):
     path = "/projects/{project}/{kind}"
     tag = "ItemsOfKind"
 
-    @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True)
+    @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True, attempts=True)
     async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
         """List items of a kind, filtered and sorted."""
         return await self.answer(
@@ -119,7 +119,7 @@ class ItemResource(Resource):
     path = "/projects/{project}/{kind}/{item}"
     tag = "ItemsOfKind"
 
-    @reads(access=Access.READER, answer=Item, etag=True)
+    @reads(access=Access.READER, answer=Item, etag=True, attempts=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
         """Return an item at its newest revision: name, folder, tags, summary, documents."""
         return await self.answer(items.read_item, project, kind_of(kind), item)

@@ -205,7 +205,7 @@ class JobResults(Resource):
     path = "/jobs/{job}/results"
     tag = "Jobs"
 
-    @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True)
+    @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True, attempts=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
         """Return the results of the tasks of a gathering job in order; the blobs they name are kept until it ends."""
         return await self.answer(reading.list_results, job, query.cursor, query.limit)

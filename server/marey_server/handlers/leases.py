@@ -133,7 +133,7 @@ class AttemptOutputs(Resource):
     @writes(
         access=Access.ATTEMPT,
         scope=None,
-        body=RequestBody(StageRequest, max_bytes=MAX_STAGED_BYTES),
+        body=RequestBody(StageRequest, max_bytes=MAX_STAGED_BYTES, results=True),
         answer=StageAnswer,
     )
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
@@ -160,6 +160,7 @@ class AttemptCompletion(Resource):
         body=RequestBody(CompleteRequest, max_bytes=16 * MIB),
         answer=CompleteAnswer,
         reserved=True,
+        replays=True,
     )
     async def post(self, job: str, fence: int, body: CompleteRequest) -> Rendered:
         """Publish the staged outputs and end the job; a request with the same `write_id` gets the same answer."""
@@ -172,7 +173,7 @@ class AttemptFailure(Resource):
     path = "/jobs/{job}/attempts/{fence:int}/fail"
     tag = "Work"
 
-    @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer, reserved=True)
+    @writes(access=Access.ATTEMPT, scope=None, body=FailRequest, answer=FailAnswer, replays=True, reserved=True)
     async def post(self, job: str, fence: int, body: FailRequest) -> Rendered:
         """End the attempt; the job is retried or fails. A request with the same `write_id` gets the same answer."""
         return await self.answer(completion.fail, job, fence, body, self.services.queue_policy)

@@ -109,7 +109,7 @@ class Parts(Resource):
     path = "/projects/{project}/parts"
     tag = "Items"
 
-    @reads(access=Access.READER, body=PartsRequest, answer=Document)
+    @reads(access=Access.READER, body=PartsRequest, answer=Document, attempts=True)
     async def post(self, project: str, body: PartsRequest) -> Rendered:
         """Return documents of several items.
 

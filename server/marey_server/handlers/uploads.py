@@ -27,7 +27,7 @@ class Uploads(Resource):
     path = "/uploads"
     tag = "Blobs"
 
-    @writes(access=Access.SIGNED_IN, body=UploadCreate, answer=Upload, status=201, idempotency="key")
+    @writes(access=Access.SIGNED_IN, body=UploadCreate, answer=Upload, status=201, idempotency="key", attempts=True)
     async def post(self, body: UploadCreate) -> Rendered:
         """Create an upload, whose bytes are then sent in pieces."""
 
@@ -70,7 +70,7 @@ class UploadResource(Resource):
             await self.compute(self.services.upload_hashes.add, self.upload_id, self.offset, data)
         self.offset = moved.offset
 
-    @reads(access=Access.SIGNED_IN, answer=Upload)
+    @reads(access=Access.SIGNED_IN, answer=Upload, attempts=True)
     async def get(self, upload: str) -> Rendered:
         """Return the state of an upload."""
         return await self.answer_with(upload_reply, uploads.read_upload, upload)
@@ -80,6 +80,7 @@ class UploadResource(Resource):
         body=RequestBody(Bytes, max_bytes=uploads.MAX_UPLOAD_BYTES, streamed=True, required=False),
         answer=Upload,
         headers=("Upload-Offset",),
+        attempts=True,
     )
     async def patch(self, upload: str) -> Reply:
         """Send the next piece. With the last one the upload becomes a blob, whose digest is returned.
@@ -105,7 +106,7 @@ class UploadResource(Resource):
         hashes.forget(upload.id)
         return upload
 
-    @writes(access=Access.SIGNED_IN)
+    @writes(access=Access.SIGNED_IN, attempts=True)
     async def delete(self, upload: str) -> Rendered:
         """Cancel an upload."""
         return await self.answer(uploads.abandon, upload)

@@ -17,6 +17,7 @@ from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
 from marey_server.store import idempotency, projects, tokens
+from marey_server.store.jobs.fencing import lease_lost, require_attempt
 from marey_server.store.transaction import Transaction
 
 T = TypeVar("T")
@@ -43,14 +44,23 @@ class Caller:
         tx.required_role = self.operation.required_role
 
 
-Admission = tuple[str, Access, str | None, bool, str | None]
-"""Hash of a token, the access that an operation declares, its scope, whether guests are accepted, and a project."""
+@dataclass(frozen=True, slots=True)
+class BodyTarget:
+    """Target of a request with a body: the project whose role it needs, or the attempt that it is for."""
+
+    project: str | None = None
+    attempt: tuple[str, int] | None = None
 
 
-def admission_of(caller: Caller, project: str | None) -> Admission:
-    """Return what the admission of a caller's body depends on: `project` is the one whose role is required, if any."""
+Admission = tuple[str, Access, str | None, bool, bool, bool, BodyTarget]
+"""Hash of a token, what an operation declares about its callers, and its target."""
+
+
+def admission_of(caller: Caller, target: BodyTarget) -> Admission:
+    """Return what the admission of a caller's body depends on."""
     operation = caller.operation
-    return hash_secret(caller.token or ""), operation.access, operation.scope, operation.public, project
+    declared = (operation.access, operation.scope, operation.public, operation.attempts, operation.replays)
+    return hash_secret(caller.token or ""), *declared, target
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
@@ -64,18 +74,27 @@ def require_access(operation: Operation, principal: Principal) -> None:
         if not guests:
             raise UnauthenticatedProblem("Send a token: Authorization: Bearer <token>.", headers=CHALLENGE)
         return
-    if access is Access.ATTEMPT and principal.kind != "attempt":
-        raise ForbiddenProblem("Only the token of a running job attempt may do this.", code="attempt-only")
     if principal.kind == "attempt":
-        if access in (Access.USER, Access.ADMINISTRATOR, Access.WORKER):
-            raise ForbiddenProblem("The token of a job attempt may not do this.", code="not-for-attempts")
+        _require_attempt_access(operation, principal)
         return
+    if access is Access.ATTEMPT:
+        raise ForbiddenProblem("Only the token of a running job attempt may do this.", code="attempt-only")
     if access is Access.ADMINISTRATOR and not principal.administrator:
         raise ForbiddenProblem("Only administrators may do this.", code="administrators-only")
     if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
         raise ForbiddenProblem(
             f"The token lacks the scope {operation.scope!r}.", code="scope-missing", context={"scope": operation.scope}
         )
+
+
+def _require_attempt_access(operation: Operation, principal: Principal) -> None:
+    """Refuse an attempt all but its own endpoints, its inputs, its files, and, after its end, all but a repetition."""
+    if operation.access is Access.ANYONE:
+        return
+    if principal.ended and not operation.replays:
+        raise lease_lost(principal.job_id or "", principal.fence or 0)
+    if operation.access is not Access.ATTEMPT and not operation.attempts:
+        raise ForbiddenProblem("The token of a job attempt may not do this.", code="not-for-attempts")
 
 
 @dataclass(frozen=True)
@@ -114,10 +133,15 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
     return rendered
 
 
-def admit(tx: Transaction, project: str | None) -> None:
-    """Refuse a caller without the declared role in `project`; `run_plain` has checked the credential before."""
-    if project is not None:
-        projects.require(tx, project)
+def admit(tx: Transaction, target: BodyTarget) -> None:
+    """Refuse a caller without the declared role in a project, or whose token is not that of the attempt.
+
+    `run_plain` has checked the credential before.
+    """
+    if target.project is not None:
+        projects.require(tx, target.project)
+    if target.attempt is not None:
+        require_attempt(tx.principal, *target.attempt)
 
 
 def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transaction) -> T:

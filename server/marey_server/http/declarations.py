@@ -66,7 +66,8 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
-    `streamed` bodies are passed to the resource piece by piece while they are received.
+    `streamed` bodies are passed to the resource piece by piece while they are received. `results` of a job may contain
+    arrays up to `max_bytes`, however few bytes encode them, and are stored as they are encoded.
     """
 
     content: Content | type[Files]
@@ -74,6 +75,7 @@ class RequestBody:
     alternative: type[Request] | None = None
     streamed: bool = False
     required: bool = True
+    results: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,10 @@ class Operation:
     headers: tuple[str, ...]
     stream: bool
     reserved: bool
+    attempts: bool
+    """Whether running attempts of jobs may do this, besides the callers that `access` names."""
+    replays: bool
+    """Whether an attempt that has ended may send the request again."""
 
     @property
     def required_role(self) -> RequiredRole:
@@ -128,6 +134,7 @@ def reads(
     headers: tuple[str, ...] = (),
     stream: bool = False,
     reserved: bool = False,
+    attempts: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
@@ -135,11 +142,12 @@ def reads(
     if they differ from those of models and documents. `stream`: the answer is also available as server-sent events.
     `public=False`: guests of a public project are refused. `also` lists further statuses, `headers` further request
     headers. A `body` is for queries that are too long for an address. `reserved`: it runs in threads that no other
-    requests occupy.
+    requests occupy. `attempts`: running attempts of jobs may do this.
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
         answer_types=answer_types, also=also, public=public, headers=headers, stream=stream, reserved=reserved,
+        attempts=attempts,
     )  # fmt: skip
 
 
@@ -157,20 +165,23 @@ def writes(
     also: tuple[tuple[int, type[Answer] | None], ...] = (),
     headers: tuple[str, ...] = (),
     reserved: bool = False,
+    attempts: bool = False,
+    replays: bool = False,
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
     `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts
     either or none. `idempotency`: `key` accepts Idempotency-Key; `nature` means that repeating the request has no
-    further effect. `reserved` is that of `reads`. `access` cannot be that of readers, because readers and guests of a
-    project may not change it.
+    further effect. `reserved` and `attempts` are those of `reads`; `replays`: ended attempts may repeat it. `access`
+    cannot be that of readers, because readers and guests of a project may not change it.
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer,
         status=status or (200 if answer else 204), precondition=precondition, idempotency=idempotency,
-        etag=etag, also=also, headers=headers, reserved=reserved,
+        etag=etag, also=also, headers=headers, reserved=reserved, attempts=attempts,
+        replays=replays,
     )  # fmt: skip
 
 
@@ -192,6 +203,8 @@ def _declare(
     headers: tuple[str, ...] = (),
     stream: bool = False,
     reserved: bool = False,
+    attempts: bool = False,
+    replays: bool = False,
 ) -> Callable[[Method], Declared]:
     def attach(method: Method) -> Declared:
         @wraps(method)
@@ -203,6 +216,7 @@ def _declare(
         perform.operation = Operation(  # type: ignore[attr-defined]
             method.__name__.upper(), summary.rstrip("."), description.strip(), access, scope, query, taken, answer,
             status, paged, etag, precondition, idempotency, answer_types, also, public, headers, stream, reserved,
+            attempts, replays,
         )  # fmt: skip
         return perform
 

@@ -34,9 +34,9 @@ from tornado.web import stream_request_body
 from marey_schemas.encoding.codecs import JSON, unpacked_limit
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import ApiProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
+from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
 from marey_server.http import negotiation
-from marey_server.http.calls import Call, Caller, admission_of, admit, require_access, run_call, run_plain
+from marey_server.http.calls import BodyTarget, Call, Caller, admission_of, admit, require_access, run_call, run_plain
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
@@ -203,6 +203,11 @@ class Resource(Exchange):
         user = self.principal.user_id if self.principal is not None else None
         return user or f"address {limited_address(self.client_address)}"
 
+    def _write_problem(self, error: BaseException) -> None:
+        super()._write_problem(error)
+        if isinstance(error, AuthorLostProblem):
+            self.services.end_attempt(error)
+
     def on_finish(self) -> None:
         """Note the use of the caller's token after the answer was written."""
         super().on_finish()
@@ -266,15 +271,20 @@ class Resource(Exchange):
     async def _admit(self) -> None:
         """Refuse callers who may not send the body, so that nothing of it is received or decoded for them.
 
-        The transaction of the request decides again; here, a decision may be `ADMISSION_S` old.
+        The transaction of the request decides again; here, a decision may be `ADMISSION_S` old, except for results of
+        jobs, whose bodies may be the largest.
         """
-        project = self.path_kwargs.get("project") if self.operation.access.role is not None else None
+        operation = self.operation
+        project = self.path_kwargs.get("project") if operation.access.role is not None else None
         if self.caller.token is None and project is None:
             return  # the head showed that anyone may do this
-        admission, now = admission_of(self.caller, project), time.monotonic()
+        of_attempt = operation.access is Access.ATTEMPT
+        target = BodyTarget(project, (self.path_variables["job"], self.path_variables["fence"]) if of_attempt else None)
+        admission, now = admission_of(self.caller, target), time.monotonic()
         admitted = self.services.admitted.get(admission)
-        if admitted is None or now - admitted > ADMISSION_S:
-            check = partial(run_plain, self.caller, partial(admit, project=project))
+        wide = operation.body is not None and operation.body.results
+        if admitted is None or wide or now - admitted > ADMISSION_S:
+            check = partial(run_plain, self.caller, partial(admit, target=target))
             await asyncio.wrap_future(self.services.database.queue_read(self.client, ANONYMOUS, check, reserved=True))
             self.services.admitted.put(admission, now)
 
@@ -397,9 +407,8 @@ class Resource(Exchange):
                 raise BadRequestProblem("A body is needed.", code="body-missing")
             return None
         # Workers compute: their results may be still motion of any length, which takes next to no bytes.
-        is_result = self.operation.access is Access.ATTEMPT
-        max_array_bytes = body.max_bytes if is_result else min(body.max_bytes, unpacked_limit(len(data)))
-        read = partial(_decode, data, self.body_type, body.content, max_array_bytes, keep_blocks=is_result)
+        max_array_bytes = body.max_bytes if body.results else min(body.max_bytes, unpacked_limit(len(data)))
+        read = partial(_decode, data, self.body_type, body.content, max_array_bytes, keep_blocks=body.results)
         inline = len(data) <= INLINE_BYTES and self.body_type == JSON  # a few bytes of blocks unpack to megabytes
         return read() if inline else await self.compute(read)
 

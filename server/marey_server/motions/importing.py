@@ -239,7 +239,7 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) 
             drafts[file.name] = file.drafts if file.graph is None else (graph_draft(tx, row.name, file.graph),)
             for source in file.sources:
                 if source.content is not None:
-                    blobs.put_blob(tx, source.content, expected=source.digest)
+                    blobs.put_blob(tx, source.content, expected=source.digest, project_id=row.id)
     every = [draft for some in drafts.values() for draft in some]
     published = iter(items.publish(tx, row, every, author_id=tx.principal.user_id))
     made = {name: list(itertools.islice(published, len(some))) for name, some in drafts.items()}

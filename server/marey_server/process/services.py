@@ -12,7 +12,7 @@ from typing import Any
 from marey_schemas.lru import LruCache
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import UnavailableProblem
+from marey_server.errors import AuthorLostProblem, UnavailableProblem
 from marey_server.motions.models import UsableModel
 from marey_server.motions.models import size_bytes as model_bytes
 from marey_server.motions.searching import Searchable, SearchableKey
@@ -25,6 +25,7 @@ from marey_server.process.password_lanes import PasswordLane, RefusedTries
 from marey_server.process.settings import Settings
 from marey_server.store import events, tokens
 from marey_server.store.database.connections import Database
+from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.upload_hashes import UploadHashes
@@ -120,6 +121,11 @@ class Services:
         numbered = 0 if self.database.is_sqlite else events.NUMBERED_AT_ONCE
         while numbered == events.NUMBERED_AT_ONCE:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
+
+    def end_attempt(self, lost: AuthorLostProblem) -> None:
+        """End a job whose author may no longer run it; if that fails, the reaper does it."""
+        with suppress(UnavailableProblem):
+            self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 
     def close(self) -> None:
         """Wait for running transactions, then close everything."""

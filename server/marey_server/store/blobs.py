@@ -1,5 +1,5 @@
 """Blobs: bytes named by their SHA-256, stored once, with the rules for access to them
-(docs/decisions/0006-possession.md).
+(docs/decisions/0006, 0021).
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from operator import itemgetter
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy import ColumnElement, Select, Table, select, update
+from sqlalchemy import ColumnElement, Select, Table, or_, select, update
 
+from marey_schemas.access import Scope
 from marey_schemas.problems import FieldError
 from marey_server import faults
+from marey_server.access import scopes
 from marey_server.access.principal import Principal
 from marey_server.errors import (
     ConflictProblem,
@@ -25,8 +27,10 @@ from marey_server.errors import (
     UnauthenticatedProblem,
 )
 from marey_server.store.blob_backings import CHUNK_BYTES
-from marey_server.store.projects import is_visible
+from marey_server.store.jobs import reach
+from marey_server.store.projects import is_visible, writable_projects
 from marey_server.store.tables import (
+    attempt_blob,
     blob,
     blob_holder,
     document_blob,
@@ -90,12 +94,16 @@ def digest_of(data: bytes) -> str:
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
-def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = None) -> str:
+def put_blob(
+    tx: Transaction, content: bytes | Spool, *, expected: str | None = None, project_id: str | None = None
+) -> str:
     """Store bytes that the caller sent, and let the caller refer to them by their digest.
 
-    Raises `InvalidProblem` if their digest is not `expected`.
+    The bytes are for `project_id`; without it, for the projects of the caller's token. Raises `InvalidProblem` if their
+    digest is not `expected`.
     """
     require_sender(tx.principal)
+    places = places_of_sender(tx) if project_id is None else (project_id,)
     digest = digest_of(content) if isinstance(content, bytes) else content.digest
     if expected is not None and digest != expected:
         raise InvalidProblem(
@@ -103,7 +111,7 @@ def put_blob(tx: Transaction, content: bytes | Spool, *, expected: str | None = 
             code="digest-mismatch",
         )
     store_blobs(tx, {digest: content})
-    add_holder(tx, digest)
+    add_holder(tx, digest, places)
     faults.point("blob.put.before_commit")
     tx.after_commit(lambda: faults.point("blob.put.after_commit"))
     return digest
@@ -115,6 +123,23 @@ def require_sender(principal: Principal) -> None:
         raise UnauthenticatedProblem("Sign in to send bytes.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
         raise ForbiddenProblem("This token may not write.", code="insufficient-scope")
+
+
+EVERY_PROJECT = ""
+"""Place of bytes that a token without binding sent: its user may use them in every project."""
+
+
+def places_of_sender(tx: Transaction) -> tuple[str, ...]:
+    """Return the ids of the projects for which the caller sends bytes, or `EVERY_PROJECT`.
+
+    Raises `ForbiddenProblem` if the user of a bound token may write in none of its projects.
+    """
+    names = scopes.projects_of(tx.principal.scopes, "write")
+    if tx.principal.kind != "user" or EVERY_PROJECT in names:
+        return (EVERY_PROJECT,)
+    if not (found := writable_projects(tx, names)):
+        raise ForbiddenProblem("This token may not write in any project.", code="insufficient-scope")
+    return tuple(found)
 
 
 def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> None:
@@ -169,12 +194,16 @@ def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
     return there
 
 
-def add_holder(tx: Transaction, digest: str) -> None:
-    """Record that the caller possesses the bytes and may refer to them."""
-    if tx.principal.user_id is None:
-        return
-    row = {"digest": digest, "user_id": tx.principal.user_id, "created_us": tx.now_us}
-    tx.execute(tx.insert_or_ignore(blob_holder, row))
+def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
+    """Record that the caller possesses the bytes and may refer to them: an attempt for itself, a user in `places`."""
+    caller = tx.principal
+    if caller.kind == "attempt":
+        row = {"digest": digest, "job_id": caller.job_id, "fence": caller.fence, "created_us": tx.now_us}
+        tx.execute(tx.insert_or_ignore(attempt_blob, row))
+    elif caller.user_id is not None:
+        common = {"digest": digest, "user_id": caller.user_id, "created_us": tx.now_us}
+        rows = [{**common, "project_id": place} for place in places]
+        tx.execute(tx.insert_or_ignore(blob_holder), rows)
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
@@ -190,7 +219,20 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
     wanted = set(digests)
     if lacking := wanted - hold(tx, wanted):
         raise missing_blobs(lacking)
-    for digest in sorted(wanted):
+    _name_for_job(tx, job_id, wanted)
+
+
+def share_with_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> bool:
+    """Protect the blobs of a result that a job takes over from an equal one; return whether all are still stored."""
+    wanted = set(digests)
+    if wanted - _renew(tx, blob, wanted):
+        return False
+    _name_for_job(tx, job_id, wanted)
+    return True
+
+
+def _name_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
+    for digest in sorted(digests):
         tx.execute(tx.insert_or_ignore(job_blob, {"job_id": job_id, "blob_digest": digest}))
 
 
@@ -250,19 +292,51 @@ def read_range(tx: Transaction, digest: str, start: int, stop: int) -> bytes:
 
 
 def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]:
-    user_id = tx.principal.user_id
-    if user_id is None:
+    caller = tx.principal
+    young = select(blob.c.digest).where(blob.c.created_us >= since_us)
+    if caller.kind == "attempt":
+        mine = (attempt_blob.c.job_id == caller.job_id, attempt_blob.c.fence == caller.fence)
+        statement = young.join(attempt_blob, attempt_blob.c.digest == blob.c.digest).where(*mine)
+    elif caller.user_id is not None:
+        statement = young.join(blob_holder, blob_holder.c.digest == blob.c.digest)
+        statement = statement.where(blob_holder.c.user_id == caller.user_id, *_within_reach(caller)).distinct()
+    else:
         return set()
-    statement = (
-        select(blob.c.digest)
-        .join(blob_holder, blob_holder.c.digest == blob.c.digest)
-        .where(blob_holder.c.user_id == user_id, blob.c.created_us >= since_us)
-    )
     return _collect(tx, statement, blob.c.digest, digests)
+
+
+def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
+    """Return the condition for rows of `blob_holder` in projects that a user's token reaches.
+
+    A token that may read everywhere reaches all; any other one reaches the projects to which it is bound, and with an
+    unbound scope what was sent for every project.
+    """
+    if scopes.allows(caller.scopes, "read"):
+        return ()
+    names = scopes.projects_of(caller.scopes, *_USES)
+    within = blob_holder.c.project_id.in_(_ids_of(names))
+    return (or_(within, blob_holder.c.project_id == EVERY_PROJECT) if EVERY_PROJECT in names else within,)
+
+
+def reaches(tx: Transaction, places: Collection[str]) -> bool:
+    """Return whether the token of a user reaches all projects for which bytes were sent."""
+    caller = tx.principal
+    names = scopes.projects_of(caller.scopes, *_USES)
+    return EVERY_PROJECT in names or set(places) <= set(tx.execute(_ids_of(names)).scalars())
+
+
+_USES = (Scope.READ, Scope.WRITE, Scope.JOBS)
+"""Scopes with which a token may use bytes that its user sent."""
+
+
+def _ids_of(names: Iterable[str]) -> Select[tuple[str]]:
+    return select(project.c.id).where(project.c.name.in_(list(names)), project.c.deleted_us.is_(None))
 
 
 def _referenced(tx: Transaction, digests: Iterable[str]) -> set[str]:
     digests = list(digests)
+    if tx.principal.kind == "attempt":
+        return reach.reachable_blobs(tx, digests)
     visible = is_visible(tx.principal)
     by_document = (
         select(document_blob.c.blob_digest)

@@ -20,7 +20,9 @@ from marey_server.store.blobs import GRACE_US
 from marey_server.store.coverage_streams import drop_old_streams
 from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
+from marey_server.store.jobs.fencing import RUNNING
 from marey_server.store.tables import (
+    attempt_blob,
     blob,
     blob_holder,
     document,
@@ -51,6 +53,7 @@ class Collected:
     keys: int
     coverage_streams: int = 0
     tokens: int = 0
+    ended_holdings: int = 0
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
@@ -63,6 +66,7 @@ def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collecte
         keys=database.write(SYSTEM, _drop_old_keys),
         coverage_streams=database.write(SYSTEM, drop_old_streams),
         tokens=database.write(SYSTEM, forget_ended),
+        ended_holdings=database.write(SYSTEM, _drop_ended_holdings),
     )
 
 
@@ -123,7 +127,8 @@ def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_
     going = _still_garbage(tx, blob, digests, grace_us)
     for digest in going:
         tx.blobs.release(tx.connection, digest)
-    tx.execute(delete(blob_holder).where(blob_holder.c.digest.in_(going)))
+    for holder in (blob_holder, attempt_blob):
+        tx.execute(delete(holder).where(holder.c.digest.in_(going)))
     tx.execute(delete(blob).where(blob.c.digest.in_(going)))
     faults.point("garbage.before_commit")
     return len(going)
@@ -159,3 +164,10 @@ def _delete_uploads(database: Database) -> int:
 def _drop_old_keys(tx: Transaction) -> int:
     old = idempotency_key.c.created_us < tx.now_us - KEY_LIFETIME_US
     return tx.execute(delete(idempotency_key).where(old)).rowcount
+
+
+def _drop_ended_holdings(tx: Transaction) -> int:
+    """Forget which blobs the attempts sent that no longer hold their jobs."""
+    same_attempt = (job.c.id == attempt_blob.c.job_id, job.c.fence == attempt_blob.c.fence)
+    held = exists().where(*same_attempt, job.c.state == RUNNING)
+    return tx.execute(delete(attempt_blob).where(~held)).rowcount

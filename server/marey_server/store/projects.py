@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +34,9 @@ from marey_server.store.ids import new_id
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
+
+WRITERS = tuple(role.value for role in Role if roles.includes(role, Role.CONTRIBUTOR))
+"""Roles of members who may add items and submit jobs."""
 
 SORT_KEYS: dict[str, ColumnElement[Any]] = {
     "name": project.c.name,
@@ -142,10 +146,10 @@ def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
 
 
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Return the condition for rows of `project`: not deleted, and readable by the caller."""
+    """Return the condition for rows of `project`: not deleted, and readable by the caller, as none is by an attempt."""
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":
-        return and_(alive, project.c.id == (principal.project_id or ""))
+        return false()
     own: ColumnElement[bool] = true()
     if not principal.administrator:
         own = project.c.id.in_(select(member.c.project_id).where(member.c.user_id == (principal.user_id or "")))
@@ -153,6 +157,15 @@ def is_visible(principal: Principal) -> ColumnElement[bool]:
         names = [scope.partition("!project=")[2] for scope in principal.scopes if scope.startswith("read!")]
         own = and_(own, project.c.name.in_(names)) if names else false()
     return and_(alive, or_(own, project.c.visibility == Visibility.PUBLIC.value))
+
+
+def writable_projects(tx: Transaction, names: Iterable[str]) -> list[str]:
+    """Return the ids of those of the named projects in which the caller's user may write."""
+    statement = select(project.c.id).where(project.c.name.in_(list(names)), project.c.deleted_us.is_(None))
+    if not tx.principal.administrator:
+        statement = statement.join(member, member.c.project_id == project.c.id)
+        statement = statement.where(member.c.user_id == tx.principal.user_id, member.c.role.in_(WRITERS))
+    return list(tx.execute(statement.order_by(project.c.id)).scalars())
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

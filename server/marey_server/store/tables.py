@@ -208,12 +208,23 @@ blob_chunk = Table(
     Column("data", LargeBinary, nullable=False),
 )
 
-blob_holder = Table(  # who has shown to possess the bytes, and so may refer to them by name
+blob_holder = Table(  # users who have shown to possess the bytes, and so may refer to them by name
     "blob_holder",
     metadata,
     Column("digest", DIGEST, ForeignKey("blob.digest"), primary_key=True),
     Column("user_id", ID, ForeignKey("user.id"), primary_key=True),
+    Column("project_id", ID, primary_key=True, default=""),  # empty: for every project of the user
     Column("created_us", Micros, nullable=False),
+)
+
+attempt_blob = Table(  # the same for attempts, which possess nothing of their authors
+    "attempt_blob",
+    metadata,
+    Column("digest", DIGEST, ForeignKey("blob.digest"), primary_key=True),
+    Column("job_id", ID, primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("created_us", Micros, nullable=False),
+    Index("ix_attempt_blob_attempt", "job_id", "fence"),
 )
 
 lineage = Table(
@@ -432,7 +443,10 @@ upload = Table(
     "upload",
     metadata,
     Column("id", ID, primary_key=True),
-    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),  # of an attempt: the author of its job
+    Column("job_id", ID),  # the attempt that sends
+    Column("fence", Integer),
+    Column("project_ids", Document),  # the projects for which a bound token sends
     Column("length", BigInteger, nullable=False),
     Column("offset", BigInteger, nullable=False, default=0),
     Column("digest", DIGEST),  # expected, checked at the end

@@ -8,7 +8,6 @@ from sqlalchemy import ColumnElement, Row, and_, bindparam, delete, insert, or_,
 
 from marey_schemas.access import EndTokens, NewToken, Token, TokenCreate
 from marey_schemas.items import Page
-from marey_schemas.jobs import JobState
 from marey_schemas.wording import counted
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -21,12 +20,12 @@ from marey_server.access.secret_tokens import (
     secret_matches,
     split_user_token,
 )
-from marey_server.errors import ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
+from marey_server.errors import AuthorLostProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import listing
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
-from marey_server.store.jobs.fencing import lease_lost
+from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
@@ -35,6 +34,9 @@ NOTE_USE_EVERY_S = 3600
 
 KEPT_AFTER_END_US = 30 * 86400 * 1_000_000
 """Time for which an expired token is listed, so that its owner can see why a program stopped."""
+
+REPLAY_GRACE_US = 900 * 1_000_000
+"""Time after the end of an attempt in which its last request may be repeated; workers repeat it for 600 s."""
 
 _ATTEMPT_SCOPES = ("read",)
 
@@ -46,9 +48,12 @@ _USER_TOKEN = Prepared(
     .where(token.c.prefix == bindparam("prefix"))
 )
 _ATTEMPT_TOKEN = Prepared(
-    select(job.c.id, job.c.project_id, job.c.author_id, job.c.state, attempt.c.fence, user.c.name)
-    .add_columns(job.c.fence.label("current_fence"))
-    .select_from(attempt.join(job, job.c.id == attempt.c.job_id).outerjoin(user, user.c.id == job.c.author_id))
+    select(job.c.id, job.c.project_id, attempt.c.fence, attempt.c.ended_us, attempt.c.write_id)
+    .add_columns(
+        and_(job.c.state == RUNNING, job.c.fence == attempt.c.fence, attempt.c.ended_us.is_(None)).label("holds"),
+        AUTHOR_MAY_RUN.label("author_may_run"),
+    )
+    .select_from(attempt.join(job, job.c.id == attempt.c.job_id))
     .where(attempt.c.token_hash == bindparam("hash"))
 )
 
@@ -97,26 +102,24 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 
 
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
-    """Return the principal of an attempt's token. Raises `LeaseLostProblem` if a later attempt has the job.
+    """Return the principal of an attempt's token.
 
-    The token is valid while its fence is the job's. After the end of the job, it only allows a repeated `complete` or
-    `fail`, which gets the stored answer; reads are refused.
+    Raises `LeaseLostProblem` if the attempt has lost the job, or its author the right to run it.
+    The token is valid while the attempt holds its job. After the end of the attempt, for `REPLAY_GRACE_US`, it only
+    allows a repeated `complete` or `fail`, which gets the stored answer.
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
         raise _unknown()
-    if row.fence != row.current_fence:
+    if row.holds and not row.author_may_run:
+        raise AuthorLostProblem(row.id, row.fence)
+    if row.holds:
+        return Principal("attempt", scopes=_ATTEMPT_SCOPES, job_id=row.id, fence=row.fence, project_id=row.project_id)
+    if row.write_id is None:  # it sent no last request that could be repeated
         raise lease_lost(row.id, row.fence)
-    running = row.state == JobState.RUNNING
-    return Principal(
-        "attempt",
-        row.author_id,
-        row.name,
-        scopes=_ATTEMPT_SCOPES if running else (),
-        job_id=row.id,
-        fence=row.fence,
-        project_id=row.project_id if running else None,
-    )
+    if row.ended_us + REPLAY_GRACE_US <= tx.now_us:
+        raise _unknown()
+    return Principal("attempt", job_id=row.id, fence=row.fence, ended=True)
 
 
 # -- a user's tokens --------------------------------------------------------------------------------------------------

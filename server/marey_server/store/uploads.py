@@ -25,7 +25,7 @@ from marey_server.errors import (
 from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.ids import new_id
-from marey_server.store.tables import blob, upload, upload_chunk
+from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
@@ -56,12 +56,12 @@ class StoredUpload:
 
 def create_upload(tx: Transaction, length: int, *, digest: str | None = None) -> StoredUpload:
     """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
-    user_id = _sender(tx)
+    sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
         raise TooLargeProblem(f"An upload must have 1 to {MAX_UPLOAD_BYTES} bytes.")
     upload_id = new_id("upload")
     row = {
-        "id": upload_id, "user_id": user_id, "length": length, "offset": 0, "digest": digest,
+        "id": upload_id, **sender, "length": length, "offset": 0, "digest": digest,
         "created_us": tx.now_us, "updated_us": tx.now_us,
     }  # fmt: skip
     tx.execute(insert(upload), row)
@@ -129,7 +129,7 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
         row["upload_id"] = upload_id if copy is None else None
         if blobs.insert_new(tx, blob, [row]) and copy is not None:
             tx.blobs.adopt(copy, digest)
-        blobs.add_holder(tx, digest)
+        blobs.add_holder(tx, digest, _places(found))
     faults.point("upload.finish.before_commit")
     tx.after_commit(lambda: faults.point("upload.finish.after_commit"))
     return _shown(_find(tx, upload_id))
@@ -178,19 +178,36 @@ def delete_dropped(tx: Transaction, limit: int) -> int:
     return tx.execute(delete(upload).where(upload.c.id.in_(list(tx.execute(empty).scalars())))).rowcount
 
 
-def _sender(tx: Transaction) -> str:
-    blobs.require_sender(tx.principal)
-    if tx.principal.user_id is None:
+def _sender(tx: Transaction) -> dict[str, Any]:
+    """Return the columns that say who sends an upload and for which projects."""
+    caller = tx.principal
+    blobs.require_sender(caller)
+    if caller.kind == "attempt":
+        author_id = tx.execute(select(job.c.author_id).where(job.c.id == caller.job_id)).scalar()
+        columns = {"user_id": author_id, "job_id": caller.job_id, "fence": caller.fence}
+    else:
+        places = blobs.places_of_sender(tx)
+        columns = {"user_id": caller.user_id, "project_ids": None if blobs.EVERY_PROJECT in places else list(places)}
+    if columns["user_id"] is None:
         raise ForbiddenProblem("Only users and their jobs can upload.", code="users-only")
-    return tx.principal.user_id
+    return columns
+
+
+def _places(row: Row[Any]) -> list[str]:
+    return [blobs.EVERY_PROJECT] if row.project_ids is None else list(row.project_ids)
 
 
 def _find(tx: Transaction, upload_id: str) -> Row[Any]:
-    if tx.principal.kind == "anonymous":
+    caller = tx.principal
+    if caller.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to upload.")
-    statement = select(upload).where(upload.c.id == upload_id, upload.c.user_id == (tx.principal.user_id or ""))
-    row = tx.execute(statement.where(upload.c.dropped.is_(False))).first()
-    if row is None:
+    if caller.kind == "attempt":
+        mine = and_(upload.c.job_id == caller.job_id, upload.c.fence == caller.fence)
+    else:
+        mine = and_(upload.c.user_id == (caller.user_id or ""), upload.c.job_id.is_(None))
+    statement = select(upload).where(upload.c.id == upload_id, mine, upload.c.dropped.is_(False))
+    row = tx.execute(statement).first()
+    if row is None or (caller.kind == "user" and not blobs.reaches(tx, _places(row))):
         raise NotFoundProblem(f"You have no upload {upload_id!r}.", code="no-upload")
     return row
 

@@ -1,11 +1,13 @@
 """Possession of blobs: access to bytes and references to them."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
+from marey_schemas.access import ProjectCreate
 from marey_schemas.items import Item, ItemCreate
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
@@ -109,11 +111,30 @@ def test_sending_bytes_needs_a_credential_that_writes(lab: Lab) -> None:
     assert lab.write(blobs.put_blob, FILE, who=bound) == DIGEST
 
 
-def test_what_an_attempt_sends_belongs_to_the_author_of_its_job(lab: Lab) -> None:
+def test_what_an_attempt_sends_belongs_to_the_attempt(lab: Lab) -> None:
     project_id = lab.read(projects.read_project, "lab").id
-    attempt = Principal(
-        "attempt", lab.contributor.user_id, scopes=("read",), job_id="job_1", fence=1, project_id=project_id
-    )
+    attempt = Principal("attempt", scopes=("read",), job_id="job_1", fence=1, project_id=project_id)
     lab.write(blobs.put_blob, FILE, who=attempt)
-    assert readers(lab) == {lab.contributor.user_name}
+    assert readers(lab) == set()
     assert lab.read(blobs.readable, [DIGEST], who=attempt) == {DIGEST}
+    for other in (replace(attempt, fence=2), replace(attempt, job_id="job_2")):
+        assert lab.read(blobs.readable, [DIGEST], who=other) == set()
+
+
+def test_bytes_sent_for_a_project_are_used_by_tokens_that_reach_it(lab: Lab) -> None:
+    lab.write(projects.create_project, ProjectCreate(name="other"))
+    sent = {"lab": b"for the lab", "other": b"for the other", "": b"for both"}
+    for name, data in sent.items():
+        place = lab.read(projects.read_project, name).id if name else None
+        lab.write(blobs.put_blob, data, project_id=place)
+
+    def seen(*scopes: str) -> set[str]:
+        who = replace(lab.owner, scopes=scopes)
+        found = lab.read(blobs.readable, [digest_of(data) for data in sent.values()], who=who)
+        return {name for name, data in sent.items() if digest_of(data) in found}
+
+    assert seen("read") == seen("read", "write!project=lab") == {"lab", "other", ""}
+    assert seen("read!project=lab") == seen("write!project=lab", "work", "admin") == {"lab"}
+    assert seen("read!project=lab", "jobs!project=other") == {"lab", "other"}
+    assert seen("read!project=lab", "write") == {"lab", ""}
+    assert seen("work", "admin") == seen("read!project=nowhere") == set()

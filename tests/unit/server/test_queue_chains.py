@@ -12,6 +12,7 @@ from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.jobs import JobCreate, JobState, Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import blobs, events, garbage, items, members, users
@@ -299,9 +300,9 @@ def a_survey(desk: Desk, tasks: int = 3, **fields: Any) -> str:
     return desk.submit("survey", inputs={"things": {"collection": "raw"}}, params={"number": tasks}, **fields)
 
 
-def kept_bytes(desk: Desk, data: bytes) -> str:
-    """Bytes that ann has sent, as her attempts do."""
-    return desk.database.write(desk.user, blobs.put_blob, data)
+def kept_bytes(desk: Desk, lease: Lease, data: bytes) -> str:
+    """Bytes that an attempt has sent."""
+    return desk.database.write(desk.attempt(lease), blobs.put_blob, data)
 
 
 def test_the_parameters_say_how_many_tasks_there_are_and_each_has_all_inputs(desk: Desk) -> None:
@@ -463,8 +464,9 @@ def test_progress_is_that_of_the_tasks_and_then_of_the_gathering(desk: Desk) -> 
 
 def test_what_tasks_brought_is_kept_until_it_has_been_gathered(desk: Desk) -> None:
     job = a_survey(desk, tasks=2)
-    digests = [kept_bytes(desk, f"record {n}".encode()) for n in range(2)]
-    for lease, digest in zip(desk.claim_many(), digests, strict=True):
+    digests = []
+    for number, lease in enumerate(desk.claim_many()):
+        digests.append(digest := kept_bytes(desk, lease, f"record {number}".encode()))
         desk.complete(lease, result={"record": {"blob": digest}})
     desk.clock.advance(3 * 86400)
     garbage.collect_garbage(desk.database)
@@ -508,7 +510,7 @@ def test_a_task_whose_source_was_gathered_away_before_its_turn_is_done_again(des
     leases = desk.claim_many()
     assert len(leases) == 2  # the tasks of all others wait for these
     for lease in leases:
-        digest = kept_bytes(desk, f"record {lease.position}".encode())
+        digest = kept_bytes(desk, lease, f"record {lease.position}".encode())
         desk.complete(lease, result={"record": {"blob": digest}})
     (late,) = [job for job in surveys if desk.job(job).children == {"waiting": 2}]
     for lease in desk.claim_many():

@@ -411,8 +411,7 @@ def test_the_token_of_an_attempt_dies_when_the_fence_moves(lab: Lab, running: st
 
 
 @pytest.mark.parametrize("state", [state for state in JobState if state is not JobState.RUNNING])
-def test_the_token_of_an_attempt_that_is_over_reads_nothing(lab: Lab, running: str, state: JobState) -> None:
+def test_the_token_of_an_attempt_that_is_over_is_refused(lab: Lab, running: str, state: JobState) -> None:
     change_job(lab, state=state)
-    found = lab.read(tokens.resolve_token, running)
-    with pytest.raises(NotFoundProblem):
-        lab.read(projects.read_project, "lab", who=found)
+    with pytest.raises(LeaseLostProblem):
+        lab.read(tokens.resolve_token, running)

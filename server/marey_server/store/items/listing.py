@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, func, select
 from marey_schemas.access import Role
 from marey_schemas.items import Item, Page
 from marey_schemas.kinds import Kind
-from marey_server.errors import BadRequestProblem
+from marey_server.errors import BadRequestProblem, ForbiddenProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
@@ -51,6 +51,11 @@ class ItemFilters:
     """Part of the name, without regard to case."""
     deleted: bool = False
 
+    @property
+    def looks_up_name(self) -> bool:
+        """Whether only items of one name match, or of names that begin with one that ends in `*`."""
+        return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
+
 
 def list_items(
     tx: Transaction,
@@ -64,7 +69,12 @@ def list_items(
     fields: Collection[str] | None = None,
     count: bool = False,
 ) -> Page:
-    """Return one page of a project's items of a kind; with `fields`, only these members of each item."""
+    """Return one page of a project's items of a kind; with `fields`, only these members of each item.
+
+    Attempts of jobs may only look up names. Raises `ForbiddenProblem`.
+    """
+    if tx.principal.kind == "attempt" and not filters.looks_up_name:
+        raise ForbiddenProblem("An attempt finds items by their names: send `name`.", code="not-for-attempts")
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]

@@ -15,6 +15,7 @@ from marey_server.store import documents, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared, padded
 from marey_server.store.items.slices import slice_motion
+from marey_server.store.jobs import reach
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, document, item, item_tag, revision_part
 from marey_server.store.transaction import Transaction
@@ -40,6 +41,8 @@ def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests:
 def read_item(tx: Transaction, project: str, kind: Kind, item_id: str) -> Item:
     """Return an item at its newest revision. Raises `NotFoundProblem`."""
     project_row = projects.require(tx, project)
+    if reach.unreachable_items(tx, [item_id]):
+        raise no_item(kind, item_id)
     return shown_items(tx, [find_item(tx, project_row, kind, item_id)])[0]
 
 
@@ -224,7 +227,10 @@ def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> li
         "numbers": padded({place.revision for place in wanted}),
     }
     rows = tx.run(_PARTS_OF_PROJECT, {"project_id": project_row.id, **keys})
-    found = {(row.kind, row.item_id, row.number, row.part): row for row in rows}
+    refused = reach.unreachable_places(tx, {(row.item_id, row.number) for row in rows})
+    found = {
+        (row.kind, row.item_id, row.number, row.part): row for row in rows if (row.item_id, row.number) not in refused
+    }
     chosen: list[str | None] = []
     size_bytes = 0
     for place in wanted:

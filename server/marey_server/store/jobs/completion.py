@@ -17,6 +17,7 @@ from marey_schemas.worker_protocol import (
     FailRequest,
 )
 from marey_server import faults
+from marey_server.access.principal import Principal
 from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.jobs import staging
@@ -24,6 +25,7 @@ from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as
 from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_outcome
 from marey_server.store.jobs.fan_out import release_tasks
 from marey_server.store.jobs.fencing import (
+    AUTHOR_MAY_RUN,
     COUNT_ATTEMPT,
     HELD,
     held,
@@ -79,7 +81,7 @@ def complete_many(tx: Transaction, completions: Sequence[BatchCompletion]) -> li
 
 _WIN = Prepared(
     update(job)
-    .where(HELD, job.c.cancel_requested_us.is_(None))
+    .where(HELD, AUTHOR_MAY_RUN, job.c.cancel_requested_us.is_(None))
     .values(state="succeeded", finished_us=bindparam("now"), lease_expires_us=None, rev=job.c.rev + 1, **COUNT_ATTEMPT)
     .returning(
         *ENDED_COLUMNS,
@@ -106,7 +108,8 @@ def _complete(
     for row in sorted(won, key=lambda row: row.id):
         request = requests[row.id, row.fence]
         outputs = staging.publish_drafts(tx, row, staged.get((row.id, row.fence), {}))
-        staging.keep_named_blobs(tx, row.id, set(staging.named_blobs(request.result)))
+        of_attempt = Principal("attempt", job_id=row.id, fence=row.fence, project_id=row.project_id)
+        staging.keep_named_blobs(tx.beside(of_attempt), row.id, set(staging.named_blobs(request.result)))
         records.append(
             {
                 "of_job": row.id,

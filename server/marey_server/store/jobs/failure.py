@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Row, update
+from sqlalchemy import ColumnElement, Row, and_, not_, select, update
 
 from marey_schemas.jobs import FailureReason
 from marey_schemas.worker_protocol import FailRequest
+from marey_server.errors import AUTHOR_LOST
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import AttemptEnd, end_attempts, end_jobs, failure_document
 from marey_server.store.jobs.events import emit_job_events, wake_workers
-from marey_server.store.jobs.fencing import lease_lost
+from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, held, lease_lost
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.tables import job
@@ -34,6 +35,7 @@ ENDING_COLUMNS = (
     job.c.deadline_us,
     job.c.lease_expires_us,
     job.c.time_limit_s,
+    AUTHOR_MAY_RUN.label("author_may_run"),
 )
 
 
@@ -53,6 +55,8 @@ def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, 
     """Return the outcome of an attempt that the worker reports as failed. `row` holds `ENDING_COLUMNS`."""
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
+    if not row.author_may_run:
+        return _of_lost_author()
     if request.interrupted:
         return _interrupted(row, policy)
     if request.code == TIME_LIMIT:
@@ -77,6 +81,8 @@ def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome
     """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")
+    if not row.author_may_run:
+        return _of_lost_author()
     if row.counted_fence < row.fence:
         return _unstarted(row, policy)
     if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
@@ -85,6 +91,11 @@ def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome
         detail = f"{row.attempt} attempts were made; the last worker was not heard of again."
         return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, attempt_outcome="lost")
     return AttemptOutcome("queued", "lost", 0)
+
+
+def _of_lost_author() -> AttemptOutcome:
+    detail = "The author of the job is disabled or no longer has the role that the job needs."
+    return _failed(FailureReason.ERROR, AUTHOR_LOST, detail)
 
 
 def _interrupted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
@@ -134,6 +145,15 @@ def apply_outcome(
     end_attempts(tx, [end])
     staging.drop_staged(tx, [(end.job_id, end.fence)])
     propagate_ends(tx, ended)
+
+
+def end_for_lost_author(tx: Transaction, job_id: str, fence: int) -> None:
+    """End a job whose author may no longer run it, if the attempt still holds the job."""
+    condition = and_(held(job_id, fence), not_(AUTHOR_MAY_RUN))
+    row = tx.execute(select(*ENDING_COLUMNS).where(condition).with_for_update()).one_or_none()
+    if row is not None:
+        outcome = _of_lost_author()
+        apply_outcome(tx, row, condition, outcome, AttemptEnd(job_id, fence, outcome.attempt_outcome, AUTHOR_LOST))
 
 
 _COUNTS: dict[str, dict[str, Any]] = {

@@ -10,11 +10,24 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from sqlalchemy import ColumnElement, Row, and_, bindparam, case, literal_column, select, tuple_, update
+from sqlalchemy import (
+    ColumnElement,
+    Row,
+    and_,
+    bindparam,
+    case,
+    exists,
+    literal_column,
+    or_,
+    select,
+    tuple_,
+    update,
+)
 
 from marey_server.access.principal import Principal
 from marey_server.errors import LeaseLostProblem, NotFoundProblem
-from marey_server.store.tables import attempt, job
+from marey_server.store.projects import WRITERS
+from marey_server.store.tables import attempt, job, member, user
 from marey_server.store.transaction import Transaction
 
 # Literals, not parameters: SQLite uses a partial index only where it can see that the condition is met.
@@ -52,6 +65,15 @@ UNCOUNTED: ColumnElement[int] = case((job.c.counted_fence < job.c.fence, 1), els
 COUNT_ATTEMPT: dict[str, Any] = {"attempt": job.c.attempt + UNCOUNTED, "counted_fence": job.c.fence}
 """Values that every write of an attempt sets in its job: an attempt counts from its first write, not from its claim,
 because the answer to the claim may have been lost."""
+
+_MAY_WRITE = or_(
+    user.c.administrator.is_(True),
+    exists().where(member.c.project_id == job.c.project_id, member.c.user_id == user.c.id, member.c.role.in_(WRITERS)),
+)
+AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
+    job.c.author_id.is_(None), exists().where(user.c.id == job.c.author_id, user.c.disabled.is_(False), _MAY_WRITE)
+)
+"""The condition that the author of a job still has the role with which jobs are submitted; the server needs none."""
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:

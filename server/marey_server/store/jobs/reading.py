@@ -207,7 +207,7 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
 def find_job(tx: Transaction, job_id: str) -> tuple[Row[Any], ProjectRow]:
     """Return the job and its project; raise `NotFoundProblem` if the caller may not see the project."""
     row = tx.execute(select_jobs().where(job.c.id == job_id)).one_or_none()
-    if row is not None:
+    if row is not None and (tx.principal.kind != "attempt" or tx.principal.job_id == job_id):
         try:
             return row, projects.require(tx, row.project_name)
         except NotFoundProblem:

@@ -251,10 +251,9 @@ def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
     drafts = staging.staged_drafts(tx, [place]).get(place, {})
     tx.shared_outputs += len(drafts)
     named = set(staging.named_blobs(row.result))
-    if not staging.take_up_documents(tx, drafts) or named - blobs.hold(tx, named):
+    if not staging.take_up_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
         return []
     outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
-    blobs.keep_for_job(tx, row.id, named)
     return end_jobs(
         tx,
         waits,
