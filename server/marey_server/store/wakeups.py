@@ -85,7 +85,8 @@ class Listener:
     async def wait(self, timeout_s: float) -> bool:
         """Wait for a wake-up for at most `timeout_s`; return whether there was one."""
         try:
-            await asyncio.wait_for(self._event.wait(), timeout_s)
+            async with asyncio.timeout(timeout_s):  # `wait_for` loses a cancellation that comes with a wake-up
+                await self._event.wait()
         except TimeoutError:
             return False
         self._event.clear()

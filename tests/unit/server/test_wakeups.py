@@ -3,6 +3,8 @@
 import asyncio
 import threading
 
+import pytest
+
 from marey_server.store.wakeups import Wakeups
 
 
@@ -47,3 +49,20 @@ def test_a_listener_whose_loop_has_ended_disturbs_nobody() -> None:
 
     asyncio.run(story())
     wakeups.announce(["job:1"])
+
+
+@pytest.mark.parametrize("turns", range(5))
+def test_a_wait_that_is_woken_and_cancelled_at_once_is_cancelled(turns: int) -> None:
+    async def main() -> None:
+        wakeups = Wakeups()
+        with wakeups.listen(["job"]) as listener:
+            waiting = asyncio.create_task(listener.wait(60))
+            await asyncio.sleep(0)
+            wakeups.announce(["job"])
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            if waiting.cancel():
+                with pytest.raises(asyncio.CancelledError):
+                    await waiting
+
+    asyncio.run(main())
