@@ -212,6 +212,7 @@ def test_metrics_tell_the_sizes_of_queues_and_pools(server: Server) -> None:
     assert float(sizes['marey_waiting{lane="passwords"}']) == 0
     assert float(sizes["marey_database_connections"]) >= 0
     assert float(sizes["marey_connections"]) >= 1
+    assert float(sizes["marey_children"]) == float(sizes['marey_waiting{lane="children"}']) == 0
     assert float(sizes["marey_request_memory_bytes"]) >= 0
 
 

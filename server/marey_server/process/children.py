@@ -123,6 +123,11 @@ class Children:
         self._starting: set[ChildProcess] = set()
         self._closed = False
 
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """The number of tasks that run in children, and of those that wait for one."""
+        return len(self._running), len(self._waiting)
+
     @contextmanager
     def request(self, caller: str) -> Iterator[None]:
         """Count a request inside the block. Raises `UnavailableProblem` if too many use children or wait for one."""

@@ -93,6 +93,7 @@ class Metrics:
         self.database_connections = Gauge(
             "marey_database_connections", "Connections to the database in use.", registry=self.registry
         )
+        self.children = Gauge("marey_children", "Child processes that read uploaded files.", registry=self.registry)
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
 

@@ -95,6 +95,8 @@ class Services:
         """Show the sizes of queues and pools in the metrics."""
         passwords = {"passwords": self.password_lane, "passwords-of-strangers": self.stranger_lane}
         self.metrics.watch({**self.database.lanes, **self.compute_threads.lanes, **passwords})
+        self.metrics.children.set_function(lambda: self.children.sizes[0])
+        self.metrics.waiting.labels("children").set_function(lambda: self.children.sizes[1])
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
         self.metrics.request_memory.set_function(lambda: self.memory.held_bytes)
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
