@@ -68,7 +68,7 @@ class Codec:
     def encode(self, tree: object) -> bytes:
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
-    def decode(self, data: bytes, **limits: int) -> Any:
+    def decode(self, data: bytes, **limits: Any) -> Any:
         return decode_tree(data, self.media_type, keep_blocks=False, **limits)
 
     def refusal(self, tree: object) -> CodecError:

@@ -2,22 +2,25 @@
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
 import msgpack
 import numpy as np
 import pytest
-from tests.support.rest_server import PATIENCE_S, Server
+from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.access import Role
 from marey_schemas.encoding import blocks
-from marey_schemas.encoding.codecs import FREE_ARRAY_BYTES
 from marey_server.access.principal import SYSTEM
+from marey_server.http.resource import GUEST_BODY_BYTES
 from marey_server.http.validation import decode_body
+from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
 
 INVENTED = "marey_aaaaaaaaaaaa_" + "b" * 64
+MIB = 2**20
 CLIPS = "/projects/lab/clips"
 MSGPACK = {"Content-Type": "application/msgpack"}
 
@@ -89,10 +92,35 @@ def test_a_sign_in_is_short(server: Server, decoded: list[int]) -> None:
     assert (answer.status_code, decoded) == (413, [])
 
 
-def test_a_small_body_unpacks_to_sixteen_megabytes_at_most(owner: httpx.Client) -> None:
-    fits, exceeds = (np.zeros((FREE_ARRAY_BYTES // 4 + more, 1), np.float32) for more in (0, 1))
-    codes = [owner.post(CLIPS, content=packed(array), headers=MSGPACK).json()["code"] for array in (fits, exceeds)]
+def test_still_motion_of_some_bytes_may_be_long(owner: httpx.Client) -> None:
+    still, beyond = (np.zeros((frames, 100, 4), np.float32) for frames in (10_500, 84_000))
+    codes = [owner.post(CLIPS, content=packed(array), headers=MSGPACK).json()["code"] for array in (still, beyond)]
     assert codes == ["invalid", "too-large"]
+
+
+def test_arrays_take_from_the_memory_of_requests_before_they_are_decoded(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(database, tmp_path, request_memory_bytes=MIB) as server:
+        client = server.client(server.make_project())
+        monkeypatch.setattr("marey_schemas.encoding.codecs.array_from_leaf", None)
+        body = packed(np.zeros((MIB, 1), np.float32))
+        server.app.services.memory.take("somebody else", 0, 1, reserved=False)
+        refused = client.post(CLIPS, content=body, headers=MSGPACK)
+        assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_guests_may_send_short_bodies_only(server: Server, owner: httpx.Client, *, chunked: bool) -> None:
+    etag = owner.get("/projects/lab").headers["ETag"]
+    assert owner.patch("/projects/lab", json={"visibility": "public"}, headers={"If-Match": etag}).is_success
+    body = b'{"parts": []}' + b" " * GUEST_BODY_BYTES
+    headers = {"Content-Type": "application/json"}
+    answers = [
+        client.post("/projects/lab/parts", content=in_chunks(body) if chunked else body, headers=headers)
+        for client in (server.client(), owner)
+    ]
+    assert [answer.status_code for answer in answers] == [413, 422]
 
 
 def test_callers_are_admitted_or_refused_while_all_threads_for_reads_are_busy(server: Server) -> None:

@@ -151,9 +151,14 @@ def test_a_stopping_server_says_that_it_is_not_ready(database: Database, tmp_pat
 
 def test_a_database_of_another_version_is_not_ready(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marey_server.store.fsck.schema_at_head", lambda _connection: False)
-    refused = httpx.get(f"{server.address}/readyz")
-    assert (refused.status_code, refused.json()["code"]) == (503, "not-ready")
-    assert "db upgrade" in refused.json()["detail"]
+    operator = server.client(server.make_user("ada", administrator=True)).headers["Authorization"]
+    told, not_told = (
+        httpx.get(f"{server.address}/readyz", headers=headers) for headers in ({"Authorization": operator}, {})
+    )
+    assert (told.status_code, told.json()["code"]) == (not_told.status_code, not_told.json()["code"])
+    assert (told.status_code, told.json()["code"]) == (503, "not-ready")
+    assert "db upgrade" in told.json()["detail"]
+    assert "db upgrade" not in not_told.text
 
 
 def test_metrics_count_requests_by_route_template(server: Server, owner: httpx.Client) -> None:

@@ -20,7 +20,7 @@ from bson.raw_bson import RawBSONDocument
 from numpy.typing import NDArray
 
 from marey_schemas.encoding.arrays import LEAF_KEYS, EncodedArray, array_from_leaf, json_data, with_blocks
-from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, little_endian, require_finite
+from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec, little_endian, require_finite
 
 JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
 MAX_BYTES = 1 << 28
@@ -32,10 +32,6 @@ FREE_LISTS = 1 << 17
 """Number of objects and lists that a document of any size may contain; larger documents may contain more."""
 BYTES_PER_LIST = 6
 """Least size in bytes of an object or a list, on average: one takes 70 bytes of memory, and `[0,0],` six in JSON."""
-FREE_ARRAY_BYTES = 1 << 24
-"""Bytes of arrays that a document of any size may unpack to."""
-UNPACKING = 2048
-"""Greatest ratio of the unpacked arrays of a larger document to its own bytes."""
 BSON_COPIES = 8
 """Greatest ratio of the bytes that reading BSON copies, once for each level, to those of the document."""
 
@@ -88,11 +84,6 @@ def _write_bson(plain: Any) -> bytes:
         raise CodecError("too-large", "", f"a BSON document is smaller than 2 GiB: {error}") from error
 
 
-def unpacked_limit(size_bytes: int) -> int:
-    """Return the number of bytes to which the arrays of a document from an untrusted sender may unpack."""
-    return max(FREE_ARRAY_BYTES, UNPACKING * size_bytes)
-
-
 def decode_tree(
     data: bytes,
     media_type: str,
@@ -101,12 +92,14 @@ def decode_tree(
     max_depth: int = MAX_DEPTH,
     max_array_bytes: int | None = None,
     keep_blocks: bool = False,
+    take_bytes: Callable[[int], None] | None = None,
 ) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
     With `keep_blocks`, arrays whose bytes are such as `encode_tree` writes become `EncodedArray` that are also decoded.
     `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without it, they
-    have the same limit as the input. The number of values is limited, too. Raises `CodecError`.
+    have the same limit as the input. `take_bytes` is called with the size of each array before it is decoded, and may
+    raise an error of its own. The number of values is limited, too. Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
@@ -115,6 +108,7 @@ def decode_tree(
         max_depth,
         array_bytes=max_bytes if max_array_bytes is None else min(max_bytes, max_array_bytes),
         keep_blocks=keep_blocks,
+        take_bytes=take_bytes,
         max_values=MAX_VALUES,
         max_copied=BSON_COPIES * max(len(data), MAX_LIST),
     )
@@ -274,6 +268,7 @@ class _Walk:
         on_array: Callable[[Any], dict[str, Any]] | None = None,
         array_bytes: int = 0,
         keep_blocks: bool = False,
+        take_bytes: Callable[[int], None] | None = None,
         max_values: int | None = None,
         max_copied: int = 0,
     ) -> None:
@@ -281,6 +276,7 @@ class _Walk:
         self._on_array = on_array
         self._array_bytes = array_bytes
         self._keep_blocks = keep_blocks
+        self._take_bytes = take_bytes
         self._values_left = math.inf if max_values is None else max_values
         self._copies_left = max_copied
         self._path: list[str | int] = []
@@ -352,6 +348,10 @@ class _Walk:
             raise self._error(error.code, error.detail) from error
 
     def _take_leaf(self, leaf: Mapping[str, Any]) -> NDArray[Any] | EncodedArray:
+        if self._take_bytes is not None:
+            spec = ArraySpec.parse(leaf["dtype"], leaf["shape"])
+            spec.require(self._array_bytes)
+            self._take_bytes(spec.nbytes)
         array = array_from_leaf(leaf, max_bytes=self._array_bytes)
         self._array_bytes -= array.nbytes
         return with_blocks(leaf, array) if self._keep_blocks else array

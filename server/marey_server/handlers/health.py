@@ -40,12 +40,20 @@ class Readyz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),), reserved=True)
     async def get(self) -> Reply:
-        """Answer whether the server is ready: database reachable, schema current, blobs writable, not draining."""
+        """Answer whether the server is ready: database reachable, schema current, space for blobs, not draining.
+
+        The log says what is missing, and so does the answer to an administrator.
+        """
         if self.services.draining.is_set():
             raise UnavailableProblem("The server is stopping.", code="draining", headers={"Retry-After": "5"})
         faults = await self.look_up(fsck.find_faults)
+        if disk_fault := self.services.disk.fault():
+            faults = [*faults, disk_fault]
+        self.services.note_faults(faults)
         if faults:
-            raise UnavailableProblem("; ".join(faults), code="not-ready", headers={"Retry-After": "5"})
+            shown = self.principal is not None and self.principal.administrator
+            detail = "; ".join(faults) if shown else "The server is not ready; its log says what is missing."
+            raise UnavailableProblem(detail, code="not-ready", headers={"Retry-After": "5"})
         return Reply(Health(status="ready"), headers={"Cache-Control": "no-store"})
 
 

@@ -113,6 +113,12 @@ class Operation:
         return STRICTEST if role is None else RequiredRole(role, self.scope or "read", guests=self.public)
 
     @property
+    def stores(self) -> bool:
+        """Whether the operation may need much space on the disk: it stores a body, and is not reserved."""
+        changes = self.access is Access.ATTEMPT or self.scope in ("write", "jobs")
+        return changes and self.body is not None and not self.reserved
+
+    @property
     def may_create(self) -> bool:
         """Whether the operation accepts `If-None-Match: *`."""
         return self.precondition in ("create", "optional")

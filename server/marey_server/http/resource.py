@@ -31,13 +31,13 @@ from urllib.parse import urlencode
 from pydantic import BaseModel
 from tornado.web import stream_request_body
 
-from marey_schemas.encoding.codecs import JSON, unpacked_limit
+from marey_schemas.encoding.codecs import JSON
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
 from marey_server.http import negotiation
 from marey_server.http.calls import BodyTarget, Call, Caller, admission_of, admit, require_access, run_call, run_plain
-from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation
+from marey_server.http.declarations import KIB, Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
@@ -54,6 +54,8 @@ T = TypeVar("T")
 INLINE_BYTES = 4 * 1024
 """Greatest size of JSON bodies that are decoded on the event loop; larger ones, and other forms, in a thread."""
 CLIENT_GONE = "The client closed the connection before this was computed."
+GUEST_BODY_BYTES = 64 * KIB
+"""Greatest size of a body that a caller without a token may send, such as a search in a public project."""
 ADMISSION_S = 5.0
 """Time in seconds for which a caller who was admitted may send further bodies without another look at the database."""
 _METHODS = ("get", "post", "put", "patch", "delete")
@@ -83,7 +85,7 @@ class Resource(Exchange):
     def initialize(self) -> None:
         """Set up the state of one request."""
         super().initialize()
-        self._received = bytearray()
+        self._received: bytearray | bytes = bytearray()
         self._in_children: set[ChildTask[Any]] = set()
 
     @property
@@ -96,11 +98,11 @@ class Resource(Exchange):
 
     async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
-        return await self._read(partial(run_plain, self.caller, partial(_apply, function, args, kwargs)))
+        return await self._read(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
 
     async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function(tx, ...)` on behalf of the caller, commit, and return its result."""
-        return await self._write(partial(run_plain, self.caller, partial(_apply, function, args, kwargs)))
+        return await self._write(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
 
     async def answer(
         self,
@@ -136,16 +138,12 @@ class Resource(Exchange):
         )
 
     async def _read(self, function: Callable[[Transaction], T]) -> T:
-        reserved = self.operation.reserved
-        return await asyncio.wrap_future(
-            self.services.database.queue_read(self.client, ANONYMOUS, function, reserved=reserved)
-        )
+        queue = self.services.database.queue_read
+        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
 
     async def _write(self, function: Callable[[Transaction], T]) -> T:
-        reserved = self.operation.reserved
-        return await asyncio.wrap_future(
-            self.services.database.queue_write(self.client, ANONYMOUS, function, reserved=reserved)
-        )
+        queue = self.services.database.queue_write
+        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
 
     @cached_property
     def holding(self) -> Holding:
@@ -262,6 +260,8 @@ class Resource(Exchange):
             body = self.operation.body
             if body is not None and (body.streamed or self.expects_body()):
                 await self._admit()
+                if self.operation.stores:
+                    self.services.disk.require()
             if body is not None and body.streamed:
                 self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 await self.begin(**self.path_variables)
@@ -326,12 +326,16 @@ class Resource(Exchange):
         negotiation.require_plain_encoding(self.request.headers.get("Content-Encoding"))
         if body is None or not self.expects_body():
             return
-        if self.declared_length() > body.max_bytes:
+        if self.declared_length() > self._most_bytes(body):
             raise TooLargeProblem(
-                f"The body has {self.declared_length()} bytes; at most {body.max_bytes} are accepted here."
+                f"The body has {self.declared_length()} bytes; at most {self._most_bytes(body)} are accepted here."
             )
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
+
+    def _most_bytes(self, body: RequestBody) -> int:
+        """Return the greatest size of the body; callers without a token may send short ones only."""
+        return body.max_bytes if self.caller.token is not None else min(body.max_bytes, GUEST_BODY_BYTES)
 
     @property
     def path_variables(self) -> dict[str, Any]:
@@ -347,7 +351,7 @@ class Resource(Exchange):
             return
         body = self.operation.body
         try:
-            limit = body.max_bytes if body is not None else 0
+            limit = self._most_bytes(body) if body is not None else 0
             if self.received_bytes > limit:
                 raise TooLargeProblem(f"The body is longer than the {limit} bytes that are accepted here.")
             if body is not None and body.streamed:
@@ -399,16 +403,22 @@ class Resource(Exchange):
     async def _read_body(self) -> Any:
         body = self.operation.body
         assert body is not None
-        data = bytes(self._received)
+        data = self._received = bytes(self._received)  # one copy of a long body is enough
         if body.content is Bytes:
             return data
         if not data:
             if body.required:
                 raise BadRequestProblem("A body is needed.", code="body-missing")
             return None
-        # Workers compute: their results may be still motion of any length, which takes next to no bytes.
-        max_array_bytes = body.max_bytes if body.results else min(body.max_bytes, unpacked_limit(len(data)))
-        read = partial(_decode, data, self.body_type, body.content, max_array_bytes, keep_blocks=body.results)
+        decode = partial(
+            decode_body,
+            data,
+            self.body_type,
+            max_array_bytes=body.max_bytes,
+            keep_blocks=body.results,
+            take_bytes=self.holding.grow,
+        )
+        read = partial(_read_tree, decode, body.content)
         inline = len(data) <= INLINE_BYTES and self.body_type == JSON  # a few bytes of blocks unpack to megabytes
         return read() if inline else await self.compute(read)
 
@@ -431,12 +441,8 @@ class Resource(Exchange):
         return f"sha256:{digest.hexdigest()}"
 
 
-def _apply(function: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any], tx: Transaction) -> T:
-    return function(tx, *args, **kwargs)
-
-
-def _decode(data: bytes, media_type: str, content: Any, max_array_bytes: int, *, keep_blocks: bool) -> Any:
-    tree = decode_body(data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks)
+def _read_tree(decode: Callable[[], Any], content: Any) -> Any:
+    tree = decode()
     return tree if content is Document else validate_body(content, tree)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -56,13 +56,22 @@ def _bad_query(faults: list[FieldError]) -> BadRequestProblem:
     return BadRequestProblem(f"Query parameters: {names}.", code="bad-query", errors=faults[:MAX_ERRORS])
 
 
-def decode_body(data: bytes, media_type: str, *, max_array_bytes: int, keep_blocks: bool = False) -> Any:
-    """Return the tree in a body, whose arrays may have `max_array_bytes`; `keep_blocks` as in `codecs.decode_tree`.
+def decode_body(
+    data: bytes,
+    media_type: str,
+    *,
+    max_array_bytes: int,
+    keep_blocks: bool = False,
+    take_bytes: Callable[[int], None] | None = None,
+) -> Any:
+    """Return the tree in a body; the other arguments are those of `codecs.decode_tree`.
 
     Raises `BadRequestProblem` if it cannot be decoded, and `InvalidProblem` if it contains values that are not allowed.
     """
     try:
-        return codecs.decode_tree(data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks)
+        return codecs.decode_tree(
+            data, media_type, max_array_bytes=max_array_bytes, keep_blocks=keep_blocks, take_bytes=take_bytes
+        )
     except codecs.CodecError as error:
         fault = FieldError(pointer=error.pointer, code=error.code, detail=error.detail)
         if error.code == "too-large":

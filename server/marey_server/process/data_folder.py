@@ -8,6 +8,7 @@ import stat
 from pathlib import Path
 
 from marey_server.process.administrators import TOKEN_FILE
+from marey_server.process.disk_space import RESERVE_FILE, make_reserve
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import sqlite_file
 
@@ -25,7 +26,8 @@ def prepare_data_folder(settings: Settings) -> None:
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder = settings.data.resolve()
-    own = {folder / name for name in (TOKEN_FILE, BLOB_FOLDER, WORKER_CACHE, "marey.toml")}
+    make_reserve(folder)
+    own = {folder / name for name in (TOKEN_FILE, BLOB_FOLDER, WORKER_CACHE, RESERVE_FILE, "marey.toml")}
     file = sqlite_file(settings.resolved_database_url)
     if file is not None and file.parent.is_dir():
         os.close(os.open(file, os.O_CREAT | os.O_RDWR, 0o600))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,7 @@ from marey_server.motions.searching import Searchable, SearchableKey
 from marey_server.motions.searching import size_bytes as searchable_bytes
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
+from marey_server.process.disk_space import DiskSpace
 from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
 from marey_server.process.password_lanes import PasswordLane, RefusedTries
@@ -29,6 +31,8 @@ from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
 from marey_server.store.upload_hashes import UploadHashes
+
+log = logging.getLogger(__name__)
 
 LARGEST_ANSWER_SHARE = 8
 """Largest part of the cache of answers that one body may take; larger bodies would displace all others."""
@@ -83,8 +87,10 @@ class Services:
         self.refused_tries = RefusedTries()
         self.compute_threads = ComputeThreads()
         self.children = children or Children(settings.child_limits)
+        self.disk = DiskSpace(settings.data, settings.min_free_bytes)
         self.memory = RequestMemory(settings.request_memory_bytes)
         self.upload_hashes = UploadHashes(database)
+        self._faults: list[str] = []
         self._tokens_noted: LruCache[str, float] = LruCache(max_entries=TOKENS_REMEMBERED)
         self._tokens_known: LruCache[str, bool] = LruCache(max_entries=TOKENS_REMEMBERED)
         self.queue_policy = QueuePolicy(settings.lease_ttl_s, settings.heartbeat_s, settings.cancel_grace_s)
@@ -100,6 +106,15 @@ class Services:
         self.metrics.in_flight.set_function(lambda: len(self.in_flight))
         self.metrics.request_memory.set_function(lambda: self.memory.held_bytes)
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
+
+    def note_faults(self, faults: Sequence[str]) -> None:
+        """Log why the server is not ready, once for the same reasons, and when it is ready again."""
+        if list(faults) != self._faults:
+            self._faults = list(faults)
+            if faults:
+                log.warning("not ready: %s", "; ".join(faults))
+            else:
+                log.info("ready again")
 
     def knows(self, token: str) -> bool:
         """Return whether a request with this token was accepted before, so that its caller has lines of its own."""

@@ -95,6 +95,11 @@ class Settings(BaseSettings):
         ge=MIB,
         description="Memory for bodies and long answers of all requests together, a quarter of it for strangers.",
     )
+    min_free_bytes: int = Field(
+        64 * MIB,
+        ge=0,
+        description="Free space of the data folder's disk below which nothing is stored; deleting stays possible.",
+    )
     max_header_bytes: int = Field(
         64 * 1024, ge=4096, description="Greatest size of the request line and the headers, in bytes."
     )

@@ -15,10 +15,9 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -48,7 +47,7 @@ WAL_PATIENCE_MS = 250
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
-RESERVED_THREADS = 4
+RESERVED_THREADS = 3
 """Number of threads, and of connections, for short transactions that must not wait behind others."""
 
 _POSTGRES_SETTINGS = {
@@ -209,7 +208,7 @@ class Database:
         **kwargs: P.kwargs,
     ) -> Future[T]:
         """Run `write` in a thread, for the server itself."""
-        return self.queue_write(SERVER, principal, partial(_apply, function, args, kwargs))
+        return self.queue_write(SERVER, principal, lambda tx: function(tx, *args, **kwargs))
 
     def queue_read(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
@@ -256,10 +255,6 @@ class Database:
         self._ordinary.close()
         self._read_engine.dispose()
         self.engine.dispose()
-
-
-def _apply(function: Callable[..., T], args: tuple[Any, ...], kwargs: Mapping[str, Any], tx: Transaction) -> T:
-    return function(tx, *args, **kwargs)
 
 
 # -- engines ----------------------------------------------------------------------------------------------------------

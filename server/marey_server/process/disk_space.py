@@ -1,0 +1,72 @@
+"""Free space of the disk with the data folder: a floor below which nothing is stored, and a reserve to start with.
+
+On a disk without any space, a server can neither start nor delete, because SQLite needs some for its log. So a file
+keeps space in reserve. It is removed when space runs out, and made again at the next start with enough space.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import time
+from pathlib import Path
+
+from marey_server.errors import StorageFullProblem
+from marey_server.process.settings import MIB
+
+RESERVE_FILE = "reserve"
+RESERVE_BYTES = 16 * MIB
+LOOK_AGAIN_S = 1.0
+
+log = logging.getLogger(__name__)
+
+
+class DiskSpace:
+    """Free space of the disk that holds a folder; `floor_bytes` of it are kept for deletions and heartbeats."""
+
+    def __init__(self, folder: Path, floor_bytes: int) -> None:
+        self._folder = folder
+        self._floor_bytes = floor_bytes
+        self._low = False
+        self._looked_s = -LOOK_AGAIN_S
+
+    def fault(self) -> str | None:
+        """Return why nothing can be stored, for an operator, or None."""
+        if not self._is_low():
+            return None
+        floor = self._floor_bytes // MIB
+        return f"the disk of {self._folder} has less than {floor} MiB free (min_free_bytes); purge or move data"
+
+    def require(self) -> None:
+        """Raise `StorageFullProblem` if nothing can be stored."""
+        if self._is_low():
+            raise StorageFullProblem("The server's disk has no room left; nothing was written. Deleting is possible.")
+
+    def _is_low(self) -> bool:
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= LOOK_AGAIN_S:
+            self._looked_s = now_s
+            self._low = self._folder.exists() and free_bytes(self._folder) < self._floor_bytes
+        return self._low
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of a folder's disk, after removing the reserve if hardly any is left."""
+    free, file = shutil.disk_usage(folder).free, folder / RESERVE_FILE
+    if free >= RESERVE_BYTES or not file.exists():
+        return free
+    log.warning("the disk of %s is full: the file %s, its reserve, is removed", folder, file.name)
+    file.unlink(missing_ok=True)
+    return shutil.disk_usage(folder).free
+
+
+def make_reserve(folder: Path) -> None:
+    """Write the reserve file if its disk has ample space; remove it if there is hardly any."""
+    file = folder / RESERVE_FILE
+    free = free_bytes(folder)
+    if file.exists() or free < 8 * RESERVE_BYTES:
+        return
+    with open(os.open(file, os.O_WRONLY | os.O_CREAT, 0o600), "wb") as reserve:
+        for _ in range(RESERVE_BYTES // MIB):
+            reserve.write(bytes(MIB))
