@@ -76,7 +76,10 @@ def main() -> None:
     keep_freed_memory()
     for name in sys.argv[3:]:
         _function(name)()
-    pipe.send_bytes(READY)
+    try:
+        pipe.send_bytes(READY)
+    except BrokenPipeError:  # the server ended while this loaded
+        return
     allow_memory(int(sys.argv[2]))
     while True:
         try:
@@ -84,15 +87,22 @@ def main() -> None:
         except EOFError:
             return
         allow_processor_time(order.processor_s)
-        pipe.send_bytes(run(order).pack())
+        pipe.send_bytes(run(order))
 
 
-def run(order: ChildOrder) -> ChildAnswer:
-    """Call the function of an order and return its end."""
+def run(order: ChildOrder) -> bytes:
+    """Call the function of an order and return the packed answer."""
+    try:
+        return _answer(order).pack()
+    except MemoryError:
+        return ChildAnswer(out_of_memory=True).pack()
+
+
+def _answer(order: ChildOrder) -> ChildAnswer:
     try:
         return ChildAnswer(payload=_function(order.function)(order.payload))
     except MemoryError:
-        return ChildAnswer(out_of_memory=True)
+        raise
     except ApiProblem as error:
         refusal = ChildRefusal(status=error.status, code=error.error_code, detail=error.detail, errors=error.errors)
         return ChildAnswer(refusal=refusal)

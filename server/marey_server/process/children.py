@@ -322,7 +322,7 @@ def _discard(child: ChildProcess | None) -> None:
 
 def _busy(which: str) -> UnavailableProblem:
     return UnavailableProblem(
-        f"{which} use the processes that read files and draw samples, or wait for one; try again in a few seconds.",
+        f"{which} use the processes that read files, or wait for one; try again in a few seconds.",
         code="children-busy",
         headers={"Retry-After": str(ASK_AGAIN_S)},
     )
