@@ -205,7 +205,9 @@ def open_database(settings: Settings) -> Database:
 def connect_database(settings: Settings) -> Database:
     """Connect to the database without upgrading its tables."""
     blobs = DirectoryBlobs(settings.data / BLOB_FOLDER) if settings.blobs == "directory" else None
-    return Database(settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs)
+    return Database(
+        settings.resolved_database_url, readers=settings.resolved_database_threads, blobs=blobs, quotas=settings.quotas
+    )
 
 
 async def serve(settings: Settings) -> None:

@@ -127,6 +127,12 @@ class LeaseLostProblem(ConflictProblem):
     code = "lease-lost"
 
 
+class QuotaExceededProblem(ConflictProblem):
+    """A quota leaves no room for this; nothing was changed."""
+
+    code = "quota-exceeded"
+
+
 class GoneProblem(ApiProblem):
     """It existed, and was deleted."""
 

@@ -25,12 +25,12 @@ from marey_server.process.memory import RequestMemory
 from marey_server.process.observe import Metrics
 from marey_server.process.password_lanes import PasswordLane, RefusedTries
 from marey_server.process.settings import Settings
+from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import events, tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.jobs.reaper import StartGrace
-from marey_server.store.upload_hashes import UploadHashes
 
 log = logging.getLogger(__name__)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
 from marey_server.process.children import ChildLimits
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.retention import Retention
+from marey_server.store.transaction import Quotas
 
 MIB = 1024 * 1024
 
@@ -152,6 +154,18 @@ class Settings(BaseSettings):
         le=3600,
         description="Seconds that a worker has to stop a job that was cancelled or whose time limit has passed.",
     )
+    user_uploads: int = Field(
+        Quotas.user_uploads, ge=0, description="Greatest number of uploads that a user has begun and not finished."
+    )
+    user_upload_bytes: int = Field(
+        Quotas.user_upload_bytes, ge=0, description="Greatest number of bytes that such uploads of a user announce."
+    )
+    user_tokens: int = Field(
+        Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, apart from sign-ins."
+    )
+    user_projects: int = Field(
+        Quotas.user_projects, ge=0, description="Number of owned projects from which on a user creates no more."
+    )
     events_days: int = Field(
         Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever, as for the next two."
     )
@@ -193,6 +207,11 @@ class Settings(BaseSettings):
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Return the sources in order of precedence: flags, variables, file."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
+
+    @property
+    def quotas(self) -> Quotas:
+        """Return the limits of what one user may hold."""
+        return Quotas(**{field.name: getattr(self, field.name) for field in fields(Quotas)})
 
     @property
     def retention(self) -> Retention:

@@ -31,6 +31,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
+from marey_server.store.quotas import require_room
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
@@ -198,6 +199,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
         raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
         raise ForbiddenProblem("This token may not create projects.", code="insufficient-scope")
+    require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,
         tx.now_us, tx.now_us, None, 1, Role.OWNER, False,

@@ -26,6 +26,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
+from marey_server.store.quotas import require_room
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
 
@@ -133,7 +134,10 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
         raise ForbiddenProblem(f"Your own credential lacks the scope {beyond[0]!r}.", code="insufficient-scope")
-    return _insert(tx, user_id, request, _end_of(tx, request), session=False)
+    ends_us = _end_of(tx, request)
+    if tx.principal.token_id is not None:  # the server itself may always make one, for its workers or after a loss
+        require_room(tx, "user_tokens")
+    return _insert(tx, user_id, request, ends_us, session=False)
 
 
 def create_session(tx: Transaction, expires_in_s: int) -> NewToken:

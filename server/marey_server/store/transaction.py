@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy
@@ -26,15 +27,33 @@ Event = tuple[str, str | None, str, dict[str, Any]]
 _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 
 
+@dataclass(frozen=True)
+class Quotas:
+    """Greatest numbers of things that one user may hold at a time; `quotas.require_room` checks them."""
+
+    user_uploads: int = 1000
+    user_upload_bytes: int = 128 * 2**30
+    user_tokens: int = 1000
+    user_projects: int = 1000
+
+
 class Transaction:
     """Transaction with the principal on whose behalf it runs."""
 
-    def __init__(self, connection: Connection, principal: Principal, clock: Clock, blobs: BlobBacking) -> None:
+    def __init__(
+        self,
+        connection: Connection,
+        principal: Principal,
+        clock: Clock,
+        blobs: BlobBacking,
+        quotas: Quotas = Quotas(),
+    ) -> None:
         self.connection = connection
         self.principal = principal
         self.required_role = STRICTEST
         """Role and scope that the request's operation declares; `projects.require` enforces them."""
         self.blobs = blobs
+        self.quotas = quotas
         self.shared_outputs = 0
         """Number of cached results that this transaction has published."""
         self._clock = clock
@@ -51,7 +70,7 @@ class Transaction:
 
     def beside(self, principal: Principal) -> Transaction:
         """Return a transaction on behalf of `principal` that is committed together with this one."""
-        return Transaction(self.connection, principal, self._clock, self.blobs)
+        return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
 
     @property
     def is_postgres(self) -> bool:

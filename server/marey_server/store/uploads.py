@@ -25,6 +25,7 @@ from marey_server.errors import (
 from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
 from marey_server.store.ids import new_id
+from marey_server.store.quotas import require_room
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
@@ -59,6 +60,8 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
     sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
         raise TooLargeProblem(f"An upload must have 1 to {MAX_UPLOAD_BYTES} bytes.")
+    require_room(tx, "user_uploads")
+    require_room(tx, "user_upload_bytes", length)
     upload_id = new_id("upload")
     row = {
         "id": upload_id, **sender, "length": length, "offset": 0, "digest": digest,

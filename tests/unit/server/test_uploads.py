@@ -18,13 +18,13 @@ from marey_server.errors import (
     TooLargeProblem,
     UnauthenticatedProblem,
 )
+from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import blobs, garbage, uploads
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.blobs import digest_of
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import upload as upload_table
 from marey_server.store.tables import upload_chunk
-from marey_server.store.upload_hashes import UploadHashes
 
 DATA = os.urandom(3_000_001)
 

@@ -32,7 +32,7 @@ from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
 from marey_server.store.database.lanes import SERVER, Client, Lane
 from marey_server.store.database.write_lane import WriteLane
-from marey_server.store.transaction import Transaction
+from marey_server.store.transaction import Quotas, Transaction
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -67,6 +67,7 @@ class Database:
         readers: int = 8,
         clock: Clock | None = None,
         blobs: BlobBacking | None = None,
+        quotas: Quotas | None = None,
         echo: bool = False,
     ) -> None:
         self.url = make_url(url)
@@ -86,6 +87,7 @@ class Database:
         self.clock: Clock = clock or DatabaseClock()
         self._high_water_us = 0
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
+        self.quotas = quotas or Quotas()
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
         self._wal_checked_s = 0.0
         self._ordinary = Lane("marey-database", readers)
@@ -157,7 +159,7 @@ class Database:
         raise AssertionError("unreachable")
 
     def _transaction(self, connection: Connection, principal: Principal) -> Transaction:
-        return Transaction(connection, principal, self.clock, self.blobs)
+        return Transaction(connection, principal, self.clock, self.blobs, self.quotas)
 
     def _run_and_commit(
         self,

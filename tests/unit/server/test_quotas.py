@@ -1,0 +1,81 @@
+"""Quotas of users: never exceeded, by however many requests at once, and free again when something ends."""
+
+import os
+import random
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+from tests.support.store_fixtures import Lab
+
+from marey_schemas.access import ProjectCreate, TokenCreate
+from marey_server.errors import QuotaExceededProblem
+from marey_server.process.settings import Settings
+from marey_server.store import projects, tokens, uploads
+from marey_server.store.blobs import digest_of
+from marey_server.store.transaction import Quotas, Transaction
+
+LIMIT = 3
+Make = Callable[[Transaction, int], Any]
+
+
+def make_token(tx: Transaction, number: int) -> None:
+    tx.principal = replace(tx.principal, token_id="token_of_request")
+    tokens.create_token(tx, TokenCreate(name=f"t{number}"))
+
+
+def make_project(tx: Transaction, number: int) -> None:
+    projects.create_project(tx, ProjectCreate(name=f"p{number}"))
+
+
+def make_upload(tx: Transaction, number: int) -> None:
+    uploads.create_upload(tx, 1)
+
+
+@pytest.mark.parametrize(
+    ("quota", "make"),
+    [
+        ("user_tokens", make_token),
+        ("user_projects", make_project),
+        ("user_uploads", make_upload),
+        ("user_upload_bytes", make_upload),
+    ],
+)
+def test_many_requests_at_once_never_exceed_a_quota(lab: Lab, quota: str, make: Make) -> None:
+    lab.database.quotas = Quotas(**{quota: LIMIT})
+    futures = [lab.database.submit_write(lab.stranger, make, number) for number in range(3 * LIMIT)]
+    errors = [error for future in futures if (error := future.exception(60)) is not None]
+    assert len(errors) == 2 * LIMIT
+    for error in errors:
+        assert isinstance(error, QuotaExceededProblem)
+        assert error.context == {"quota": quota, "used": LIMIT, "limit": LIMIT}
+    lab.write(make, 99, who=lab.contributor)  # the quota of somebody else
+
+
+def test_what_ends_makes_room_and_nothing_is_lost(lab: Lab) -> None:
+    draw = random.Random(13)
+    lab.database.quotas = Quotas(user_uploads=LIMIT, user_upload_bytes=10)
+    open_bytes: dict[str, int] = {}
+    for _ in range(60):
+        length = draw.randint(1, 6)
+        action = draw.choice(("begin", "begin", "abandon", "finish"))
+        if action == "begin":
+            if len(open_bytes) < LIMIT and sum(open_bytes.values()) + length <= 10:
+                open_bytes[lab.write(uploads.create_upload, length).id] = length
+            else:
+                with pytest.raises(QuotaExceededProblem, match="Finish or delete one of them, such as upload_"):
+                    lab.write(uploads.create_upload, length)
+        elif open_bytes:
+            ended = draw.choice(sorted(open_bytes))
+            data = os.urandom(open_bytes.pop(ended))
+            if action == "finish":
+                lab.write(uploads.append, ended, 0, data)
+                lab.write(uploads.finish, ended, digest_of(data), None)
+            else:
+                lab.write(uploads.abandon, ended)
+
+
+def test_every_quota_is_a_setting_with_the_same_default() -> None:
+    assert Settings().quotas == Quotas()
+    assert {field.name for field in fields(Quotas)} <= Settings.model_fields.keys()
