@@ -170,7 +170,8 @@ def test_finishing_takes_as_many_statements_for_many_bytes_as_for_few(backed: La
         assert content is not None
         statements.clear()
         backed.write(uploads.finish, upload_id, *content)
-        counts.append(len(statements))
+        # SQLite stores its clock about once a second.
+        counts.append(sum("server_state" not in statement for statement in statements))
         assert backed.read(blobs.read_blob, digest_of(data)) == data
     assert counts[0] == counts[1] < 20
 
