@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
@@ -70,6 +71,7 @@ class _FeedPosition:
         self._services = services
         self._last: int | None = None
         self._due_until_us = 0
+        self._look_for_due_at_s = 0.0
 
     async def announce_news(self) -> None:
         """Announce what the events since the last call concern, and kinds of which a retry has become due."""
@@ -81,6 +83,13 @@ class _FeedPosition:
             news = await self._read(events.read_news, self._last)
             wakeups.announce(news.topics)
             self._last, complete = news.last, news.complete
+        await self._announce_due()
+
+    async def _announce_due(self) -> None:
+        """Announce the kinds of which a retry has become due; not after each commit, as it reads the whole queue."""
+        if time.monotonic() < self._look_for_due_at_s:
+            return
+        self._look_for_due_at_s = time.monotonic() + LOOK_EVERY_S
         kinds, self._due_until_us = await self._read(events.kinds_due, self._due_until_us)
         wakeups.announce(map(work_topic, kinds))
 
@@ -102,4 +111,7 @@ async def _listen(services: Services) -> None:
         except ApiProblem as error:
             failures += 1
             log.warning("no notifications from the database: %s", error.detail)
+        except Exception:
+            failures += 1
+            log.exception("no notifications from the database")
         await asyncio.sleep(RECONNECT.delay_s(max(failures, 1)))

@@ -15,7 +15,7 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -232,7 +232,7 @@ class Database:
         lane = self._reserved if reserved else self._ordinary
         return lane.submit(client, self.write, principal, function)
 
-    async def notifications(self, channel: str) -> AsyncIterator[None]:
+    async def notifications(self, channel: str) -> AsyncGenerator[None]:
         """Yield after each notification of a channel of Postgres, and once before them, when it is listened to.
 
         Raises `UnavailableProblem` if the connection, which is outside of the pool, breaks.

