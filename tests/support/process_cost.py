@@ -10,7 +10,7 @@ from pathlib import Path
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 _QUIET_S = 0.0005
 """Processor time within two hundredths of a second below which a process is idle."""
-_LONGEST_WAIT_S = 20.0
+_LONGEST_WAIT_S = 1.0
 
 
 class ProcessCost:
