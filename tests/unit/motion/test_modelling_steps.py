@@ -176,7 +176,7 @@ def test_steps_of_different_skeletons_make_no_motion() -> None:
     primitive = sliding(2)
     other = Step(primitive, (), {})
     wrong = search_steps([other], [build_tree(primitive, 0, TreeOptions(samples=10, features="latent"))])
-    with pytest.raises(InvalidConstraint, match="different skeletons") as caught:
+    with pytest.raises(InvalidConstraint, match="another skeleton") as caught:
         found_motion([THREE[0], other], joined(sequel, wrong))
     assert caught.value.where == "steps[1]"
 
