@@ -258,7 +258,7 @@ class RunningAttempt:
         if isinstance(request, Stage):
             self._staging = [*filter(_not_stored, self._staging), carrying_out]
         # A child that runs the next job may take long to read this reply: `carrying_out` is done before it is sent.
-        carrying_out.add_done_callback(partial(_send_reply, child))
+        carrying_out.add_done_callback(partial(send_reply, child))
 
     def _reply_to(self, request: Request) -> ChildReply | None:
         """Carry out one request of the child; return the reply, or None if the lease was lost."""
@@ -371,6 +371,12 @@ def _not_stored(staging: Future[ChildReply | None]) -> bool:
     return reply is None or reply.refusal is not None
 
 
-def _send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> None:
-    if not carried_out.cancelled() and (reply := carried_out.result()) is not None:
-        child.send(pack(reply))
+def send_reply(child: ChildProcess, carried_out: Future[ChildReply | None]) -> None:
+    """Send the child the reply to a request that was carried out, or the reason why it cannot be sent."""
+    if carried_out.cancelled() or (reply := carried_out.result()) is None:
+        return
+    try:
+        data = pack(reply)
+    except (TypeError, ValueError, OverflowError) as error:  # the child waits for an answer, whatever happened
+        data = pack(ChildReply(reply.request, refusal=f"the answer cannot be passed on: {error}"))
+    child.send(data)

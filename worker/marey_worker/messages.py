@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +161,8 @@ def pack(message: Any) -> bytes:
 def _plain(value: Any) -> str:
     if isinstance(value, Path):
         return str(value)
+    if isinstance(value, datetime):  # of items, which the child validates
+        return value.isoformat()
     raise TypeError(f"a message cannot contain a value of the type {type(value).__name__}")
 
 

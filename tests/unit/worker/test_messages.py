@@ -1,17 +1,20 @@
 """Messages between supervisor and child: bytes that are validated, and never pickled."""
 
 import pickle
+from concurrent.futures import Future
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgpack
 import pytest
 
-from marey_schemas.items import PartPlace
+from marey_schemas.items import Item, PartPlace
 from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
-from marey_schemas.processes.child_process import BadMessage
+from marey_schemas.processes.child_process import BadMessage, ChildProcess
 from marey_schemas.worker_protocol import PinnedInput
+from marey_worker.attempt import send_reply
 from marey_worker.messages import ChildReply, Done, Made, PutFile, ReadParts, ReadResults, Run, pack, unpack
 
 PIN = PinnedInput(item="clip_1", revision=2, kind=Kind.CLIP, name="walk", collection="takes")
@@ -34,6 +37,33 @@ RUN = Run("job_1", "align", {"window": 3}, {"clips": (PIN,)}, 7, 1 << 29, Path("
 )
 def test_a_message_arrives_as_it_was_sent(message: Any) -> None:
     assert unpack(pack(message)) == message
+
+
+def test_items_arrive_with_their_times() -> None:
+    made = datetime(2026, 11, 23, 1, 19, 30, 402_000, tzinfo=UTC)
+    item = Item(
+        id="clip_1", kind=Kind.CLIP, name="walk", collection="takes", tags=("left",), revision=2, created_at=made,
+        updated_at=made, rev=3,
+    )  # fmt: skip
+    (found,) = unpack(pack(ChildReply(8, [item]))).value
+    assert Item.model_validate(found) == item
+
+
+class Child:
+    """A child that keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.received: list[Any] = []
+
+    def send(self, data: bytes) -> None:
+        self.received.append(unpack(data))
+
+
+def test_an_answer_that_cannot_be_passed_on_is_refused_so_that_the_child_goes_on() -> None:
+    child, carried_out = Child(), Future[ChildReply | None]()
+    carried_out.set_result(ChildReply(9, value=object()))
+    send_reply(cast(ChildProcess, child), carried_out)
+    assert [(one.request, one.refusal is not None) for one in child.received] == [(9, True)]
 
 
 class Hostile:
