@@ -13,6 +13,7 @@ from sqlalchemy import ColumnElement, and_, delete, exists, insert, or_, select,
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store import events
+from marey_server.store.database.clock import DAY_US
 from marey_server.store.database.connections import Database
 from marey_server.store.garbage import BATCH
 from marey_server.store.tables import (
@@ -27,7 +28,6 @@ from marey_server.store.tables import (
 )
 from marey_server.store.transaction import Transaction
 
-DAY_US = 86400 * 1_000_000
 DELETED_LOG = b"[This log was deleted because it was old.]\n"
 """Text of a log that was deleted. Logs that are not longer are kept."""
 

@@ -16,7 +16,7 @@ FAR_AHEAD_DAYS = 366
 """A clock that is further ahead of the stored mark is assumed to be wrong until somebody confirms it."""
 NOTABLY_AHEAD_S = 60
 """A database that is further ahead of its machine is named in the log."""
-_DAY_US = 86400 * 1_000_000
+DAY_US = 86400 * 1_000_000
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -58,7 +58,7 @@ class DatabaseClock:
         with self._lock:
             if self._start_us is None:
                 stored_us, wall_us = stored_high_water_us(connection), wall_clock_us()
-                if stored_us and wall_us - stored_us > FAR_AHEAD_DAYS * _DAY_US:
+                if stored_us and wall_us - stored_us > FAR_AHEAD_DAYS * DAY_US:
                     raise ClockFarAhead(
                         f"the clock of this machine says {datetime_of(wall_us):%Y-%m-%d}, but the database was last "
                         f"used on {datetime_of(stored_us):%Y-%m-%d}; mend the clock, or confirm it with "
