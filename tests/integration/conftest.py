@@ -1,5 +1,23 @@
 """Fixtures of the integration tests."""
 
+from typing import Any
+
+import pytest
 from tests.support.rest_server import owner, server
 
+from marey_server.http.validation import decode_body
+
 __all__ = ["owner", "server"]
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the bodies that the server decodes."""
+    sizes: list[int] = []
+
+    def note(data: bytes, media_type: str, **options: Any) -> Any:
+        sizes.append(len(data))
+        return decode_body(data, media_type, **options)
+
+    monkeypatch.setattr("marey_server.http.resource.decode_body", note)
+    return sizes

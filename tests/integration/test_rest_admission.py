@@ -15,7 +15,6 @@ from marey_schemas.access import Role
 from marey_schemas.encoding import blocks
 from marey_server.access.principal import SYSTEM
 from marey_server.http.resource import GUEST_BODY_BYTES
-from marey_server.http.validation import decode_body
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
 
@@ -34,19 +33,6 @@ def packed(array: np.ndarray[Any, Any]) -> bytes:
 def in_chunks(body: bytes) -> Iterator[bytes]:
     """Yield a body without its length, as a chunked request sends it."""
     yield body
-
-
-@pytest.fixture
-def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the bodies that the server decodes."""
-    sizes: list[int] = []
-
-    def note(data: bytes, media_type: str, **options: Any) -> Any:
-        sizes.append(len(data))
-        return decode_body(data, media_type, **options)
-
-    monkeypatch.setattr("marey_server.http.resource.decode_body", note)
-    return sizes
 
 
 @pytest.mark.parametrize("chunked", [False, True])

@@ -10,7 +10,6 @@ import pytest
 from tests.support.rest_server import ALL_SCOPES, Server
 
 from marey_server.access.principal import SYSTEM
-from marey_server.http.validation import decode_body
 from marey_server.store import tokens
 
 CHAIN = {"schema": "marey/skeleton@1", "joints": [{"name": "hips", "parent": -1, "offset": [0, 1, 0]}]}
@@ -229,19 +228,6 @@ def test_a_batch_of_completions_publishes_nothing_of_an_author_who_was_disabled(
 
 
 # -- what is decoded for it -------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def decoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the bodies that the server decodes."""
-    sizes: list[int] = []
-
-    def note(data: bytes, media_type: str, **options: Any) -> Any:
-        sizes.append(len(data))
-        return decode_body(data, media_type, **options)
-
-    monkeypatch.setattr("marey_server.http.resource.decode_body", note)
-    return sizes
 
 
 def in_chunks(body: bytes) -> Iterator[bytes]:

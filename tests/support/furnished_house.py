@@ -39,7 +39,7 @@ BODIES = {
     "TokenCreate": {"name": "t", "scopes": ["read"]},
     "UserCreate": {"name": "new-user"},
     "UserChange": {"display_name": "D"},
-    "ProjectCreate": {"name": "lab"},  # taken: 409 tells that the caller was let through
+    "ProjectCreate": {"name": "lab"},  # the name is taken: 409 means that the caller was admitted
     "ProjectChange": {"title": "T"},
     "MemberChange": {"role": "reader"},
     "CollectionCreate": {"path": CANARY},
