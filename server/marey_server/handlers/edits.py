@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from marey_schemas.editing.previews import EditPreviewRequest
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Document, reads
-from marey_server.http.reply import Rendered, Reply, render
+from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.motions import previewing
 
@@ -17,15 +19,15 @@ class EditPreviewResource(Resource):
     tag = "Items"
 
     @reads(access=Access.READER, body=EditPreviewRequest, answer=Document)
-    async def post(self, project: str, kind: str, item: str, body: EditPreviewRequest) -> Rendered:
+    async def post(self, project: str, kind: str, item: str, body: EditPreviewRequest) -> Reply:
         """Return some frames of the result of commands on a clip (kind `clips`); nothing is stored.
 
         The whole edit is computed, so that the frames equal those of a job. Edits that would take longer than some
         seconds are refused with 413.
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
-        form, answers = self.answer_form, self.services.answers
-        return await self.compute_long(lambda: render(Reply(previewing.make_preview(source, body)), form, answers))
+        order = partial(previewing.preview_order, source, body, self.media.encoding)
+        return Reply(await self.compute_apart(previewing.MAKE_PREVIEW, order), media_type=str(self.media))
 
 
 RESOURCES: tuple[type[Resource], ...] = (EditPreviewResource,)

@@ -6,14 +6,18 @@ documents that were loaded are rendered in another thread.
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
+
 from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import ForbiddenProblem, UnauthenticatedProblem
+from marey_server.errors import BadRequestProblem, ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
 from marey_server.store import idempotency, projects, tokens
@@ -22,6 +26,7 @@ from marey_server.store.transaction import Transaction
 
 T = TypeVar("T")
 
+_KEY = re.compile(r"[\x21-\x7e]{1,255}")
 CHALLENGE = {"WWW-Authenticate": 'Bearer realm="marey"'}
 
 
@@ -148,3 +153,22 @@ def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transact
     """Run a function on behalf of the caller and return its result."""
     caller.identify(tx)
     return function(tx)
+
+
+# -- idempotency -------------------------------------------------------------------------------------------------------
+
+
+def idempotency_key(headers: HTTPHeaders) -> str | None:
+    """Return the key by which a repeated request is recognised, if there is one. Raises `BadRequestProblem`."""
+    key = headers.get("Idempotency-Key")
+    if key is not None and not _KEY.fullmatch(key):
+        raise BadRequestProblem("An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key")
+    return key
+
+
+def fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
+    """Return a digest by which a request with a key is compared with an earlier one that had the same key."""
+    digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
+    digest.update(request.headers.get("Content-Type", "").encode() + b"\n")
+    digest.update(body)
+    return f"sha256:{digest.hexdigest()}"

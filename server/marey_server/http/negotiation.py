@@ -8,6 +8,7 @@ from typing import Literal
 
 from marey_schemas.encoding import codecs
 from marey_server.errors import NotAcceptableProblem, UnauthenticatedProblem, UnsupportedMediaTypeProblem
+from marey_server.motions.child import AnswerEncoding
 
 MAX_RANGES = 64
 
@@ -22,6 +23,11 @@ class MediaType:
 
     def __str__(self) -> str:
         return self.name if self.arrays == "plain" else f"{self.name}; arrays={self.arrays}"
+
+    @property
+    def encoding(self) -> AnswerEncoding:
+        """This media type in the form in which a child process is asked to answer in it."""
+        return AnswerEncoding(media_type=self.name, arrays=self.arrays)
 
 
 JSON = MediaType(codecs.JSON, "json")

@@ -19,7 +19,6 @@ function of the store with a transaction, in its own thread, and renders its res
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import re
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -36,7 +35,18 @@ from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
 from marey_server.http import negotiation
-from marey_server.http.calls import BodyTarget, Call, Caller, admission_of, admit, require_access, run_call, run_plain
+from marey_server.http.calls import (
+    BodyTarget,
+    Call,
+    Caller,
+    admission_of,
+    admit,
+    fingerprint_of,
+    idempotency_key,
+    require_access,
+    run_call,
+    run_plain,
+)
 from marey_server.http.declarations import KIB, Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
@@ -59,7 +69,6 @@ GUEST_BODY_BYTES = 64 * KIB
 ADMISSION_S = 5.0
 """Time in seconds for which a caller who was admitted may send further bodies without another look at the database."""
 _METHODS = ("get", "post", "put", "patch", "delete")
-_KEY = re.compile(r"[\x21-\x7e]{1,255}")
 
 
 @stream_request_body
@@ -121,8 +130,8 @@ class Resource(Exchange):
         **kwargs: P.kwargs,
     ) -> Rendered:
         """Run `function(tx, ...)` and `to_reply` on its result in one transaction; return the rendered answer."""
-        key = self._idempotency_key()
-        fingerprint = self._fingerprint() if key else ""
+        key = idempotency_key(self.request.headers) if self.operation.idempotency == "key" else None
+        fingerprint = fingerprint_of(self.request, self._received) if key else ""
         answers = self.services.answers
         project = self.path_kwargs.get("project")
         call = Call(self.caller, self.answer_form, answers, to_reply, function, args, kwargs, key, fingerprint, project)
@@ -170,7 +179,7 @@ class Resource(Exchange):
 
     @asynccontextmanager
     async def using_children(self) -> AsyncIterator[None]:
-        """Count this request as one that reads untrusted files. Raises `UnavailableProblem` if there are too many."""
+        """Count this request as one that uses children. Raises `UnavailableProblem` if there are too many."""
         if self.principal is None:  # children are shared among users, not among their tokens
             await self.look_up(_identify)
         with self.services.children.request(self._child_user):
@@ -183,7 +192,8 @@ class Resource(Exchange):
         """
         if self._gone:
             raise ClientGoneProblem(CLIENT_GONE)
-        task = self.services.children.submit(self._child_user, function, make, read)
+        count_stop = self.services.metrics.count_stopped_child
+        task = self.services.children.submit(self._child_user, function, make, read, count_stop)
         self._in_children.add(task)
         try:
             return await asyncio.wrap_future(task.future)
@@ -194,6 +204,16 @@ class Resource(Exchange):
             raise
         finally:
             self._in_children.discard(task)
+
+    async def compute_apart(self, function: str, make: Callable[[], bytes]) -> bytes:
+        """Call `function` (`module:name`) in a child process with `make()` as argument, and return its result.
+
+        Raises `UnavailableProblem` if too many requests use children.
+        """
+        async with self.using_children():
+            order = await self.compute(make)
+            self.holding.grow(len(order))
+            return await self.compute_in_child(function, lambda: order, bytes)
 
     @property
     def _child_user(self) -> str:
@@ -421,24 +441,6 @@ class Resource(Exchange):
         read = partial(_read_tree, decode, body.content)
         inline = len(data) <= INLINE_BYTES and self.body_type == JSON  # a few bytes of blocks unpack to megabytes
         return read() if inline else await self.compute(read)
-
-    # -- idempotency --------------------------------------------------------------------------------------------------
-
-    def _idempotency_key(self) -> str | None:
-        if self.operation.idempotency != "key":
-            return None
-        key = self.request.headers.get("Idempotency-Key")
-        if key is not None and not _KEY.fullmatch(key):
-            raise BadRequestProblem(
-                "An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key"
-            )
-        return key
-
-    def _fingerprint(self) -> str:
-        digest = hashlib.sha256(f"{self.request.method} {self.request.uri}\n".encode())
-        digest.update(self.request.headers.get("Content-Type", "").encode() + b"\n")
-        digest.update(self._received)
-        return f"sha256:{digest.hexdigest()}"
 
 
 def _read_tree(decode: Callable[[], Any], content: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Child process of the server that reads untrusted files: it runs one order after another, within limits.
+"""Child process of the server that reads untrusted files and computes: it runs one order after another, within limits.
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
@@ -17,6 +17,7 @@ from typing import Any, Self
 import msgpack
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, decode_tree, encode_tree
 from marey_schemas.problems import FieldError
 from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
 from marey_schemas.processes.limits import allow_memory, allow_processor_time
@@ -42,6 +43,27 @@ class Message(BaseModel):
             return cls.model_validate(fields)
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException, ValidationError) as error:
             raise BadMessage(f"a child process sent {len(data)} bytes that are no {cls.__name__}: {error}") from error
+
+
+class AnswerEncoding(Message):
+    """Media type of a document that a child computes for a client, and the form of its arrays."""
+
+    media_type: str
+    arrays: ArrayForm
+
+    def encode(self, tree: Any) -> bytes:
+        """Return the document as bytes."""
+        return encode_tree(tree, self.media_type, arrays=self.arrays)
+
+
+def pack_tree(tree: Any) -> bytes:
+    """Return a document as bytes for an order; arrays that are encoded already are copied as they are."""
+    return encode_tree(tree, MSGPACK, arrays="blocks")
+
+
+def unpack_tree(packed: bytes) -> Any:
+    """Return a document of an order, with decoded arrays."""
+    return decode_tree(packed, MSGPACK)
 
 
 class ChildOrder(Message):

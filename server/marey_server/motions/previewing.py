@@ -1,4 +1,4 @@
-"""Previews of edits: read in one transaction, computed in a thread, and not stored."""
+"""Previews of edits: read in one transaction, computed in a child process, and not stored."""
 
 from __future__ import annotations
 
@@ -17,15 +17,19 @@ from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
+from marey_server.motions.child import AnswerEncoding, Message, pack_tree, unpack_tree
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
-if TYPE_CHECKING:  # numeric modules take a second to load: only who looks at previews pays for them
+if TYPE_CHECKING:  # numeric modules are loaded by children alone: they take a second, and 100 MB of memory
     from marey_motion.clip import Clip
+    from marey_motion.editing.registry import EditedClip
     from marey_motion.editing.take import EditedBody
 
 Tree = dict[str, Any]
 
+MAKE_PREVIEW = "marey_server.motions.previewing:make_preview"
+"""Function that child processes run."""
 MOST_WORK = 5e9
 """Greatest cost of a preview, in nanoseconds of one thread (estimated). Jobs have no such limit."""
 MOST_NUMBERS = 50_000_000
@@ -46,6 +50,30 @@ class PreviewSource:
     sources: dict[str, Tree] = field(default_factory=dict)
     hierarchies: dict[tuple[str, int], Tree] = field(default_factory=dict)
     mappings: dict[str, Tree] = field(default_factory=dict)
+
+
+class PreviewOrder(Message):
+    """Order to compute a preview: the request, its inputs as bytes, and limits."""
+
+    request: EditPreviewRequest
+    edit: EditDocument
+    motion: bytes
+    sources: dict[str, bytes]
+    hierarchies: tuple[tuple[str, int, bytes], ...]
+    mappings: dict[str, bytes]
+    encoding: AnswerEncoding
+    most_work: float
+    most_shown: int
+
+    def source(self) -> PreviewSource:
+        """Return the inputs, decoded."""
+        return PreviewSource(
+            self.edit,
+            unpack_tree(self.motion),
+            {name: unpack_tree(motion) for name, motion in self.sources.items()},
+            {(item, revision): unpack_tree(hierarchy) for item, revision, hierarchy in self.hierarchies},
+            {name: unpack_tree(mapping) for name, mapping in self.mappings.items()},
+        )
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
@@ -70,53 +98,6 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
     return source
 
 
-def make_preview(source: PreviewSource, request: EditPreviewRequest) -> Tree:
-    """Return the document of the preview.
-
-    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames.
-    """
-    from marey_motion.documents import clip_to_document
-    from marey_motion.editing.registry import edit_clip
-    from marey_motion.errors import MotionError
-    from marey_motion.kinematics import global_positions
-
-    try:
-        clip, body = _clip_of(source, source.motion)
-        sources = {name: _clip_of(source, tree)[0] for name, tree in source.sources.items()}
-        made = edit_clip(
-            clip, source.edit.commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=MOST_WORK
-        )
-    except MotionError as error:
-        if error.code in ("edit-too-large", "edit-too-long"):
-            raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error
-        raise _invalid("/commands", error.code, str(error)) from error
-    if request.piece >= len(made):
-        raise _invalid("/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}, counted from 0.")
-    wanted = made[request.piece]
-    start, stop = request.frames
-    stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
-    if start >= stop:
-        held = counted(wanted.clip.frame_count, "frame")
-        raise _invalid("/frames", "no-frames", f"The range contains no frame of the result, which has {held}.")
-    shown = wanted.clip.sliced(start, stop)
-    if shown.poses.size > MOST_SHOWN:
-        raise TooLargeProblem(
-            f"{stop - start} frames are too many for one preview; request a shorter range.", code="preview-too-large"
-        )
-    skeleton = MotionDocument.model_validate(source.motion).skeleton
-    return EditPreview(
-        pieces=len(made),
-        frame_count=wanted.clip.frame_count,
-        frame_rate_hz=shown.frame_rate_hz,
-        frames=(start, stop),
-        motion=clip_to_document(shown, skeleton) if "motion" in request.fields else None,
-        positions=np.asarray(global_positions(shown)) if "positions" in request.fields else None,
-        findings=tuple({"command": one.command, **one.values} for one in wanted.findings)
-        if "findings" in request.fields
-        else (),
-    ).model_dump(by_alias=True, exclude_none=True)
-
-
 def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> EditDocument:
     assert request.edit is not None
     named = request.edit
@@ -132,6 +113,80 @@ def _read_edit(tx: Transaction, project: str, request: EditPreviewRequest) -> Ed
 def _size(motion: Tree) -> int:
     frames, width = motion["poses"].shape
     return int(frames * width)
+
+
+def preview_order(source: PreviewSource, request: EditPreviewRequest, encoding: AnswerEncoding) -> bytes:
+    """Return the order to compute a preview."""
+    return PreviewOrder(
+        request=request,
+        edit=source.edit,
+        motion=pack_tree(source.motion),
+        sources={name: pack_tree(motion) for name, motion in source.sources.items()},
+        hierarchies=tuple((*place, pack_tree(hierarchy)) for place, hierarchy in source.hierarchies.items()),
+        mappings={name: pack_tree(mapping) for name, mapping in source.mappings.items()},
+        encoding=encoding,
+        most_work=MOST_WORK,
+        most_shown=MOST_SHOWN,
+    ).pack()
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def make_preview(packed: bytes) -> bytes:
+    """Carry out a `PreviewOrder` and return the document of the preview.
+
+    Raises `InvalidProblem` if the commands cannot be applied or the result does not have the requested frames.
+    """
+    from marey_motion.documents import clip_to_document
+    from marey_motion.kinematics import global_positions
+
+    order = PreviewOrder.unpack(packed)
+    source, request = order.source(), order.request
+    made = _edited(source, order.most_work)
+    if request.piece >= len(made):
+        raise _invalid("/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}, counted from 0.")
+    wanted = made[request.piece]
+    start, stop = request.frames
+    stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
+    if start >= stop:
+        held = counted(wanted.clip.frame_count, "frame")
+        raise _invalid("/frames", "no-frames", f"The range contains no frame of the result, which has {held}.")
+    shown = wanted.clip.sliced(start, stop)
+    if shown.poses.size > order.most_shown:
+        raise TooLargeProblem(
+            f"{stop - start} frames are too many for one preview; request a shorter range.", code="preview-too-large"
+        )
+    skeleton = MotionDocument.model_validate(source.motion).skeleton
+    preview = EditPreview(
+        pieces=len(made),
+        frame_count=wanted.clip.frame_count,
+        frame_rate_hz=shown.frame_rate_hz,
+        frames=(start, stop),
+        motion=clip_to_document(shown, skeleton) if "motion" in request.fields else None,
+        positions=np.asarray(global_positions(shown)) if "positions" in request.fields else None,
+        findings=tuple({"command": one.command, **one.values} for one in wanted.findings)
+        if "findings" in request.fields
+        else (),
+    )
+    return order.encoding.encode(preview.model_dump(by_alias=True, exclude_none=True))
+
+
+def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
+    """Return the clips that the edit makes. Raises `TooLargeProblem` for work that needs a job, `InvalidProblem`."""
+    from marey_motion.editing.registry import edit_clip
+    from marey_motion.errors import MotionError
+
+    try:
+        clip, body = _clip_of(source, source.motion)
+        sources = {name: _clip_of(source, tree)[0] for name, tree in source.sources.items()}
+        return edit_clip(
+            clip, source.edit.commands, body=body, sources=sources, most_numbers=MOST_NUMBERS, most_work=most_work
+        )
+    except MotionError as error:
+        if error.code in ("edit-too-large", "edit-too-long"):
+            raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error
+        raise _invalid("/commands", error.code, str(error)) from error
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:

@@ -142,8 +142,8 @@ class MappingOrder(Message):
 
 
 def load() -> None:
-    """Load what reading needs; kernels are compiled where necessary, which takes far longer than reading a file."""
-    compile_kernels(["files"])
+    """Load what children need; kernels are compiled where necessary, which takes far longer than reading a file."""
+    compile_kernels(["files", "editing", "searches", "coverage"])
 
 
 def read_file(order: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Child processes in which the server reads untrusted files: a bounded number, shared fairly, within limits.
+"""Child processes in which the server reads untrusted files and computes: a bounded number, shared fairly, with limits.
 
 Each child has a thread, which starts it, sends it one order after another, and replaces it. Of the waiting orders, the
 next is one of the caller who uses the fewest children, and nobody uses all of them.
@@ -67,9 +67,11 @@ class ChildTask(Generic[T]):
     function: str
     make: Callable[[], bytes]
     read: Callable[[bytes], T]
+    count_stop: Callable[[str, str], None]
+    """Called with a reason and the function's name if the child ends before the task does."""
     future: Future[T] = field(default_factory=Future)
     stopped: str = ""
-    """Reason why the child was killed: `time`, `abandoned` or `closing`."""
+    """Reason why the child was killed: `time`, `client-gone` or `closing`."""
     _child: ChildProcess | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -88,7 +90,7 @@ class ChildTask(Generic[T]):
     def abandon(self) -> None:
         """Give the task up, because its client has gone away; a child that works on it is killed after a moment."""
         if self.future.cancel():
-            _after(ABANDONED_S, self.stop, "abandoned")
+            _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
         """Convert the result and end the task."""
@@ -99,6 +101,10 @@ class ChildTask(Generic[T]):
             return
         with suppress(InvalidStateError):
             self.future.set_result(result)
+
+    def count_end(self, reason: str) -> None:
+        """Count that a child ended while it ran this task."""
+        self.count_stop(reason, self.function.partition(":")[2])
 
     def fail(self, error: Exception) -> None:
         """End the task without a result."""
@@ -146,9 +152,16 @@ class Children:
                     del self._requests[caller]
                     self._turns.pop(caller, None)
 
-    def submit(self, caller: str, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> ChildTask[T]:
+    def submit(
+        self,
+        caller: str,
+        function: str,
+        make: Callable[[], bytes],
+        read: Callable[[bytes], T],
+        count_stop: Callable[[str, str], None],
+    ) -> ChildTask[T]:
         """Call `function` (`module:name`) in a child with what `make` returns; the task's future gets `read` of it."""
-        task = ChildTask(caller, function, make, read)
+        task = ChildTask(caller, function, make, read, count_stop)
         with self._changed:
             if self._closed:
                 raise _stopping()
@@ -204,7 +217,7 @@ class Children:
                 child, orders = self._started(), 0
             orders += 1
             if child is None:
-                task.fail(UnavailableProblem("The server cannot start a process that reads files; its log says why."))
+                task.fail(UnavailableProblem("The server cannot start a child process; its log says why."))
             elif not self._perform(task, child):
                 _discard(child)
                 child = None
@@ -267,7 +280,7 @@ class Children:
             return False
         except BadMessage as error:
             log.error("%s", error)
-            task.fail(ApiProblem("A process that reads files failed; the server's log says why."))
+            task.fail(ApiProblem("A child process of the server failed; the server's log says why."))
             return False
         finally:
             timer.cancel()
@@ -277,26 +290,29 @@ class Children:
 
     def _settle(self, task: ChildTask[Any], outcome: ChildAnswer) -> None:
         if outcome.out_of_memory:
+            task.count_end("memory")
             task.fail(self._too_much_memory())
         elif outcome.refusal is not None:
             task.fail(_as_error(outcome.refusal))
         elif outcome.traceback:
             log.error("%s failed in a child process:\n%s", task.function, outcome.traceback)
-            task.fail(ApiProblem("The server failed to read this; its log says why."))
+            task.fail(ApiProblem("The server failed to read or to compute this; its log says why."))
         else:
             task.succeed(outcome.payload)
 
     def _problem_of_end(self, task: ChildTask[Any], status: int) -> ApiProblem:
-        """Return the reason why a child ended while it ran a task."""
+        """Return the reason why a child ended while it ran a task, and count it."""
         if task.stopped == "closing":
             return _stopping()
+        out_of_time = status == -signal.SIGXCPU
+        task.count_end(task.stopped or ("time" if out_of_time else "died"))
         if task.stopped == "time":
             return _too_long(f"{self.limits.wall_s:g} s", "child_wall_s")
-        if status == -signal.SIGXCPU:
+        if out_of_time:
             return _too_long(f"{self.limits.processor_s:g} s of processor time", "child_processor_s")
         ended = f"was ended by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
         return InvalidProblem(
-            f"The process that read this {ended}; it may be damaged, or need more memory than there is.",
+            f"The process that worked on this {ended}; the data may be damaged, or need more memory than there is.",
             code="child-died",
         )
 
@@ -322,7 +338,7 @@ def _discard(child: ChildProcess | None) -> None:
 
 def _busy(which: str) -> UnavailableProblem:
     return UnavailableProblem(
-        f"{which} use the processes that read files, or wait for one; try again in a few seconds.",
+        f"{which} use the processes that read files and compute, or wait for one; try again in a few seconds.",
         code="children-busy",
         headers={"Retry-After": str(ASK_AGAIN_S)},
     )

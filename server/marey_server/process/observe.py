@@ -93,7 +93,13 @@ class Metrics:
         self.database_connections = Gauge(
             "marey_database_connections", "Connections to the database in use.", registry=self.registry
         )
-        self.children = Gauge("marey_children", "Child processes that read uploaded files.", registry=self.registry)
+        self.children = Gauge(
+            "marey_children", "Child processes that read uploaded files or compute.", registry=self.registry
+        )
+        self.children_stopped = Counter(
+            "marey_children_stopped", "Child processes that ended during their work, by reason (memory, time, "
+            "client-gone or died) and kind of work.", ("reason", "work"), registry=self.registry,
+        )  # fmt: skip
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
 
@@ -107,6 +113,10 @@ class Metrics:
         self.seconds.labels(method, route).observe(duration_s)
         if bytes_in:
             self.received.inc(bytes_in)
+
+    def count_stopped_child(self, reason: str, work: str) -> None:
+        """Count a child that ended before its work did; both labels are names in the server's code."""
+        self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:
         """Show how many calls wait in each lane."""

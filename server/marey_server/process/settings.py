@@ -124,8 +124,8 @@ class Settings(BaseSettings):
         None,
         ge=2,
         le=64,
-        description="Processes in which the server reads uploaded files; nobody uses all of them at once. Absent: "
-        "one more than there are processors, but 3 to 5.",
+        description="Processes in which the server reads uploaded files and computes on stored data; nobody uses all "
+        "of them at once. Absent: one more than there are processors, but 3 to 5.",
     )
     child_requests: int = Field(
         32,
@@ -133,9 +133,11 @@ class Settings(BaseSettings):
         description="Greatest number of requests that use these processes or wait for one; a user has half of them. "
         "Others are answered with 503.",
     )
-    child_memory_mb: int = Field(1024, ge=64, description="Memory in MiB that such a process may use to read a file.")
-    child_processor_s: float = Field(30.0, ge=1, description="Greatest processor time in seconds to read a file.")
-    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds to read a file.")
+    child_memory_mb: int = Field(1024, ge=64, description="Memory in MiB that such a process may use for its work.")
+    child_processor_s: float = Field(
+        30.0, ge=1, description="Greatest processor time in seconds for one piece of work."
+    )
+    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds for one piece of work.")
     lease_ttl_s: float = Field(
         QueuePolicy.lease_ttl_s,
         ge=1,

@@ -37,7 +37,7 @@ def run(pool: Children, function: str, payload: bytes = b"", *, caller: str = "r
 
 def start(pool: Children, function: str, payload: bytes = b"", *, caller: str = "rita") -> ChildTask[bytes]:
     """Start a function in a child."""
-    return pool.submit(caller, f"{FUNCTIONS}:{function}", lambda: payload, bytes)
+    return pool.submit(caller, f"{FUNCTIONS}:{function}", lambda: payload, bytes, lambda reason, work: None)
 
 
 def until(condition: Callable[[], Any]) -> None:

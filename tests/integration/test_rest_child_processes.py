@@ -1,0 +1,95 @@
+"""Computations on stored data in child processes: the answers when a child is killed, and the end of unwanted work."""
+
+import http.client
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+from tests.support.edited_takes import make_walk
+from tests.support.rest_server import PATIENCE_S, Server
+
+from marey_motion.documents import clip_to_document, skeleton_to_document
+from marey_schemas.documents.references import RevisionRef
+from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.motions import previewing
+
+pytestmark = pytest.mark.slow  # each test ends a child, and the next one takes seconds to start
+
+WAITING = "tests.support.child_functions:wait_for"
+TRIM = {"commands": [{"command": "trim", "stop": 20}]}
+
+
+def until(condition: Callable[[], Any]) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def made(owner: httpx.Client, kind: str, **parts: object) -> str:
+    """Create an item and return its id."""
+    body = encode_tree({"name": kind, "parts": parts}, MSGPACK)
+    headers = {"Content-Type": MSGPACK, "Accept": "application/json"}
+    answer = owner.post(f"/projects/lab/{kind}", content=body, headers=headers)
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["id"])
+
+
+@pytest.fixture
+def preview(owner: httpx.Client) -> str:
+    """The address of previews of a clip."""
+    walk = make_walk(seconds=1.0)
+    skeleton = made(owner, "skeletons", hierarchy=skeleton_to_document(walk.skeleton).model_dump(by_alias=True))
+    motion = clip_to_document(walk, RevisionRef(item=skeleton, revision=1)).model_dump(by_alias=True)
+    return f"/projects/lab/clips/{made(owner, 'clips', motion=motion)}/edit-preview"
+
+
+@pytest.fixture
+def noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file in which the child that computes a preview notes its process; it then waits."""
+    monkeypatch.setattr(previewing, "MAKE_PREVIEW", WAITING)
+    monkeypatch.setattr(previewing, "preview_order", lambda *_: str(tmp_path / "noted").encode())
+    return tmp_path / "noted"
+
+
+def test_a_request_whose_child_is_killed_is_refused_and_the_next_one_is_answered(
+    server: Server, owner: httpx.Client, preview: str, noted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(owner.post, preview, json=TRIM)
+        until(noted.exists)
+        os.kill(int(noted.read_text()), signal.SIGKILL)
+        refused = asked.result()
+    assert (refused.status_code, refused.json()["code"]) == (422, "child-died")
+    assert "SIGKILL" in refused.json()["detail"]
+    assert stopped(server, "died") == 1
+    monkeypatch.undo()
+    assert owner.post(preview, json=TRIM).json()["frame_count"] == 20
+
+
+def test_the_child_of_a_client_that_leaves_is_stopped(
+    server: Server, owner: httpx.Client, preview: str, noted: Path
+) -> None:
+    connection = http.client.HTTPConnection(server.address.removeprefix("http://"), timeout=PATIENCE_S)
+    headers = {"Authorization": owner.headers["Authorization"], "Content-Type": "application/json"}
+    connection.request("POST", f"/api/v1{preview}", json.dumps(TRIM), headers)
+    until(noted.exists)
+    connection.close()
+    until(lambda: not psutil.pid_exists(int(noted.read_text())))
+    until(lambda: stopped(server, "client-gone") == 1)
+    until(lambda: not server.app.services.in_flight)
+
+
+def stopped(server: Server, reason: str) -> float:
+    """Return how many children ended for a reason while they waited for a file."""
+    lines = dict(line.rsplit(" ", 1) for line in httpx.get(f"{server.address}/metrics").text.splitlines())
+    return float(lines.get(f'marey_children_stopped_total{{reason="{reason}",work="wait_for"}}', 0))
