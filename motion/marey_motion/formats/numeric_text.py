@@ -2,7 +2,8 @@
 
 A number whose digits form an integer of at most 2**53, scaled by a power of ten up to 10**22, needs one correctly
 rounded multiplication or division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI
-1990). All other numbers, which are rare in real files, are parsed by `float`.
+1990). All other numbers, which are rare in real files, are parsed by `float`. `plain_numbers` reads the usual ones
+faster, with the same results.
 """
 
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from marey_motion.formats.plain_numbers import read_plain_numbers
 from marey_motion.kernels import compiled
 
 # What `parse_number` found, besides a value.
@@ -127,6 +129,9 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
     long_count = 0
     malformed = 0
     while i < end:
+        i, now = read_plain_numbers(text, values, i, count)
+        in_line += now - count
+        count = now
         byte = text[i]
         if byte == 32 or byte == 9 or byte == 11 or byte == 12:
             i += _ONE
@@ -149,11 +154,8 @@ def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-d
                 malformed = 1
                 break
             if kind == LONG:
-                long_tokens[long_count, 0] = i
-                long_tokens[long_count, 1] = stop
-                long_tokens[long_count, 2] = line
-                long_tokens[long_count, 3] = count
-                long_tokens[long_count, 4] = in_line
+                token = long_tokens[long_count]
+                token[0], token[1], token[2], token[3], token[4] = i, stop, line, count, in_line
                 long_count += 1
             values[count] = value
             count += 1
@@ -203,8 +205,9 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     state[_LINE] = first_line
     while state[_POSITION] < text.size:
         malformed = _scan(text, width, values, long_tokens, state)
-        _read_long_tokens(text, long_tokens[: state[_LONG_TOKENS]], values)
-        state[_LONG_TOKENS] = 0
+        if state[_LONG_TOKENS]:
+            _read_long_tokens(text, long_tokens[: state[_LONG_TOKENS]], values)
+            state[_LONG_TOKENS] = 0
         if malformed:
             raise _bad_token_at(text, state)
     return NumberTable(
@@ -217,12 +220,13 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
 
 
 def _read_long_tokens(text: NDArray[np.uint8], tokens: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    for start, stop, line, index, in_line in tokens.tolist():
-        token = text[start:stop].tobytes()
-        value = float(token)
-        if value in (float("inf"), float("-inf")):
-            raise BadNumber(excerpt(token), line, index, in_line)
-        values[index] = value
+    characters = text.data
+    numbers = np.array([float(characters[start:stop]) for start, stop in tokens[:, :2].tolist()])
+    infinite = np.flatnonzero(np.isinf(numbers))
+    if infinite.size:
+        start, stop, line, index, in_line = tokens[infinite[0]].tolist()
+        raise BadNumber(excerpt(text[start:stop].tobytes()), line, index, in_line)
+    values[tokens[:, 3]] = numbers
 
 
 def _bad_token_at(text: NDArray[np.uint8], state: NDArray[np.int64]) -> BadNumber:

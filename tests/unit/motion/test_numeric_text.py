@@ -28,6 +28,13 @@ def test_any_decimal_numeral_is_read_as_python_reads_it(numerals: list[str]) -> 
     assert same_bits(scan("\t".join(numerals).encode()), [float(numeral) for numeral in numerals])
 
 
+@given(st.lists(st.from_regex(r"\A[+-]?(?:[0-9]{1,9}\.?[0-9]{0,9}|\.[0-9]{1,9})(?:[eE][+-]?[0-9]{1,2})?\Z")))
+def test_numerals_far_from_the_end_of_the_text_are_read_as_python_reads_them(numerals: list[str]) -> None:
+    # Eight bytes are read at a time wherever the text does not end soon.
+    text = " ".join(numerals) + 40 * " "
+    assert same_bits(scan(text.encode()), [float(numeral) for numeral in numerals])
+
+
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
 def test_lines_are_counted_whatever_ends_them(ending: str) -> None:
     with pytest.raises(BadNumber) as bad:
@@ -36,11 +43,15 @@ def test_lines_are_counted_whatever_ends_them(ending: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "token", ["nan", "inf", "1e999", "1,5", "1_0", "0x1p3", ".", "-", "1e", "--1", "1.2.3", "\x00"]
+    "token", ["nan", "inf", "1e999", "1,5", "1_0", "0x1p3", ".", "-", "1e", "--1", "1.2.3", "1e-", "1.5-2", "é", "\x00"]
 )
 def test_what_is_no_finite_decimal_number_is_refused(token: str) -> None:
-    with pytest.raises(BadNumber):
+    with pytest.raises(BadNumber) as bad:
         scan(f"1 {token} 2".encode())
+    with pytest.raises(BadNumber) as bad_far_from_the_end:
+        scan(f"1 {token} 2{40 * ' '}".encode())
+    assert vars(bad.value) == vars(bad_far_from_the_end.value)
+    assert bad.value.index == 1
 
 
 def test_the_first_line_of_another_width_is_reported() -> None:
