@@ -8,6 +8,7 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
 PINNED := $(PIP) install --require-hashes --only-binary :all: -r
 MAREY  := $(PIP) install --no-deps --no-build-isolation -e .
 ARGS   ?=
+EFFORT ?= 4
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
@@ -46,9 +47,9 @@ check: $(VENV)/.installed-dev lint ## In 4 minutes: lint, types, units, REST on 
 test: $(VENV)/.installed-dev lint ## In 15 minutes: everything a change can break, on SQLite and on Postgres
 	$(PYTEST) --tier test tests
 
-soak: $(VENV)/.installed-dev lint ## Every fault on both databases, hours of generated files, requests and state machines
-	$(PYTEST) --tier soak -o timeout=7200 tests
-	$(BIN)/python -m tests.support.motion_fuzz 3600
+soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases; EFFORT=20 for more examples, in hours
+	$(PYTEST) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
+	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
 
 lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms

@@ -15,7 +15,7 @@ from tests.support.hostile_client import fire_all, shots, some
 from tests.support.process_cost import ProcessCost
 from tests.support.rest_server import People
 from tests.support.server_process import ServerProcess
-from tests.support.tiers import examples
+from tests.support.tiers import is_soak
 from tests.support.who_may import PEOPLE
 
 from marey_server.store.database.connections import Database
@@ -24,6 +24,7 @@ from marey_server.store.tables import metadata
 pytestmark = pytest.mark.timeout(3600)
 
 SEED = 20261123
+SHOTS = 5_000 if is_soak() else 250
 OUTSIDERS = tuple(person.name for person in PEOPLE.values() if person.rank < 0 and person.standing != "attempt")
 MOST_MB = 1_200
 """Twice what the server and its children may take, because this bound must hold on a busy machine."""
@@ -69,7 +70,7 @@ def attacked(tmp_path: Path, database_url: str) -> Iterator[Attacked]:
 
 
 def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_well(attacked: Attacked) -> None:
-    every = some(shots(attacked.house), examples(250), SEED)
+    every = some(shots(attacked.house), SHOTS, SEED)
     refused = [shot for shot in every if shot.refusal]
     before = attacked.fingerprint()
     outcomes = asyncio.run(fire_all(attacked.process.url, refused, 8))
@@ -87,6 +88,6 @@ def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_we
 
 def test_two_hundred_hostile_connections_leave_no_fault(attacked: Attacked) -> None:
     outsiders = [shot for shot in shots(attacked.house, OUTSIDERS) if shot.refusal]
-    outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, examples(250), SEED), 200))
+    outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, SHOTS, SEED), 200))
     assert [outcome.fault for outcome in outcomes if outcome.fault] == []
     assert attacked.cost.peak_mb() < MOST_MB

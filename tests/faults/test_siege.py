@@ -25,7 +25,7 @@ import httpx
 import pytest
 from tests.support.queue_desk import Desk
 from tests.support.server_process import PATIENT, QUICK_LEASES, MareyProcess, ServerProcess, WorkerProcess
-from tests.support.tiers import examples
+from tests.support.tiers import is_soak
 
 from marey_client import Marey
 from marey_client.imports import find_files
@@ -41,7 +41,7 @@ from marey_server.store.database.connections import Database
 
 pytestmark = pytest.mark.timeout(7200)
 
-LONG = examples(1) > 1
+LONG = is_soak()
 WRITERS = 8
 WRITER_KILLS = 77 if LONG else 2
 JOBS, JOB_KILLS, WORKERS = (1_800, 206, 4) if LONG else (12, 2, 1)

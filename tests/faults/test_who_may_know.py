@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.rest_server import Server, running
-from tests.support.tiers import examples
+from tests.support.tiers import is_soak
 from tests.support.who_may_know import Program
 
 from marey_server.access import roles, scopes
@@ -18,8 +18,7 @@ from marey_server.store.database.connections import Database
 pytestmark = pytest.mark.timeout(7200)
 
 SEED = 20261123
-CALLS = 1_000
-"""Calls in the tier `test`; the tier `soak` makes twenty times as many."""
+CALLS = 20_000 if is_soak() else 1_000
 CALLS_TO_FIND_A_HOLE = 2_000
 
 
@@ -32,7 +31,7 @@ def server(database: Database, tmp_path: Path) -> Iterator[Server]:
 
 def test_every_caller_does_and_knows_what_the_model_says(server: Server) -> None:
     program = Program(server, SEED)
-    program.run(examples(CALLS))
+    program.run(CALLS)
     assert program.differences == []
 
 

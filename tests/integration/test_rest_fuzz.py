@@ -24,7 +24,7 @@ from schemathesis.specs.openapi.checks import (
 )
 from tests.support.furnished_house import CANARY, INVENTED, House, build_house
 from tests.support.rest_server import running
-from tests.support.tiers import examples
+from tests.support.tiers import examples, is_soak
 from tests.support.who_may import PEOPLE
 
 from marey_server.handlers.catalogue import RESOURCES
@@ -76,7 +76,7 @@ def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
         house = build_house(server)
         server.make_user("fred")
         house.variables["user"] = "fred"  # whom the administrator may change without taking somebody's token away
-        yield Fuzzed(house, tuple(PEOPLE) if examples(FEW) > FEW else ("anonymous", "reader", "owner"))
+        yield Fuzzed(house, tuple(PEOPLE) if is_soak() else ("anonymous", "reader", "owner"))
 
 
 def operations() -> list[APIOperation[Any, Any, Any, Any]]:

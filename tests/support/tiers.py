@@ -20,15 +20,21 @@ from tests.support.database_fixtures import BACKENDS
 MOCAP_VARIABLE = "MAREY_TEST_MOCAP"
 """Names the folder of real motion capture."""
 EXAMPLES, STEPS = 100, 50
-"""How many examples Hypothesis draws, and how many steps a state machine takes, in the tier `test`."""
+"""Number of examples that Hypothesis draws, and of steps that a state machine takes, in the tier `test`."""
+SOAK_EFFORT = 4
+"""Number of times as many examples that the tier `soak` draws, unless `--effort` gives another number."""
+
+
+LONGEST_STEPS = 2
+"""Greatest multiple of the steps of a state machine; more machines find more than longer ones."""
 
 
 @dataclass(frozen=True)
 class Tier:
     """A tier of tests: the tests it leaves out, with reasons, and the effort of generated tests."""
 
-    examples: int
-    steps: int
+    effort: float
+    """Number of examples of generated tests, as a multiple of those of the tier `test`."""
     leaves_out: dict[str, Callable[[pytest.Item], bool]]
 
 
@@ -75,8 +81,7 @@ def _fault_on_other_database(item: pytest.Item) -> bool:
 
 TIERS = {
     "check": Tier(
-        EXAMPLES // 5,
-        STEPS,
+        0.2,
         {
             "on Postgres": _on_postgres,
             "fault cases": _fault,
@@ -84,8 +89,8 @@ TIERS = {
             "slow": _slow,
         },
     ),
-    "test": Tier(EXAMPLES, STEPS, {"fault cases on the other database": _fault_on_other_database}),
-    "soak": Tier(20 * EXAMPLES, 5 * STEPS, {}),
+    "test": Tier(1, {"fault cases on the other database": _fault_on_other_database}),
+    "soak": Tier(SOAK_EFFORT, {}),
 }
 
 
@@ -103,17 +108,37 @@ def steps(count: int) -> int:
     return count * hypothesis.settings.default.stateful_step_count // STEPS
 
 
+def is_soak() -> bool:
+    """Return whether this is the tier `soak`, in which tests run their long forms."""
+    return hypothesis.settings.default.max_examples > EXAMPLES
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--tier", choices=list(TIERS), default="test", help="Tier of tests to run (default: test).")
+    parser.addoption(
+        "--effort",
+        type=int,
+        choices=range(2, 1001),
+        metavar="TIMES",
+        help=f"In the tier soak, how many times as many examples to draw as in the tier test (default: {SOAK_EFFORT}).",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LEFT_OUT] = Counter()
     name = config.getoption("tier")
     tier = TIERS[name]
+    effort = tier.effort
+    if given := config.getoption("effort"):
+        if name != "soak":
+            raise pytest.UsageError("--effort needs --tier soak")
+        effort = given
     # No deadline: how fast things are is for benchmarks to say, and machines do other things at the same time.
     hypothesis.settings.register_profile(
-        name, deadline=None, max_examples=tier.examples, stateful_step_count=tier.steps
+        name,
+        deadline=None,
+        max_examples=round(effort * EXAMPLES),
+        stateful_step_count=round(min(max(effort, 1), LONGEST_STEPS) * STEPS),
     )
     hypothesis.settings.load_profile(name)
 
