@@ -24,5 +24,5 @@ __all__ = ["Marey", "ProjectHandle"]
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        raise AttributeError(f"the module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -79,7 +79,10 @@ class Blobs:
         """Return the bytes of a blob. Raises `DigestMismatch` if other bytes arrived."""
         data: bytes = self.transport.send("GET", f"/blobs/{digest}", headers={"Accept": "*/*"}).content
         if digest_of(data) != digest:
-            raise DigestMismatch(f"asked for {digest}, but {digest_of(data)} arrived")
+            raise DigestMismatch(
+                f"the downloaded blob has the digest {digest_of(data)} instead of {digest}: it was "
+                "damaged on the way or on the server"
+            )
         return data
 
     def fetch_to(self, digest: str, target: Path) -> Path:
@@ -100,7 +103,10 @@ class Blobs:
             file.seek(0)
             arrived = f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
             if arrived != digest:
-                raise DigestMismatch(f"asked for {digest}, but {arrived} arrived")
+                raise DigestMismatch(
+                    f"the downloaded blob has the digest {arrived} instead of {digest}: it was damaged on "
+                    "the way or on the server"
+                )
         return target
 
 
@@ -110,10 +116,10 @@ def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
         while chunk := file.read(CHUNK_BYTES):
             left -= len(chunk)
             if left < 0:
-                raise FileChanged(f"{path} has become longer while it was being sent")
+                raise FileChanged(f"the file {path} grew while it was being uploaded; upload it again")
             yield chunk
     if left > 0:
-        raise FileChanged(f"{path} has become shorter while it was being sent")
+        raise FileChanged(f"the file {path} was shortened while it was being uploaded; upload it again")
 
 
 def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
@@ -143,7 +149,7 @@ def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
     file.seek(upload.offset)
     piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
     if not piece and upload.offset < upload.length:
-        raise FileChanged(f"{file.name} has become shorter while it was being sent")
+        raise FileChanged(f"the file {file.name} was shortened while it was being uploaded; upload it again")
     response = transport.send(
         "PATCH",
         f"/uploads/{upload.id}",

@@ -80,13 +80,17 @@ def read_secret(path: Path) -> str:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()
     except UnicodeDecodeError as error:
-        raise BadCredentialFile(f"{path} holds no token") from error
+        raise BadCredentialFile(
+            f"the file {path} contains no token: a token has only ASCII letters, digits and _"
+        ) from error
     except OSError as error:
         raise BadCredentialFile(f"{path} cannot be read: {error.strerror}") from error
     if os.name == "posix" and mode & 0o077:
-        raise BadCredentialFile(f"{path} can be read by others; run: chmod 600 {path}")
+        raise BadCredentialFile(
+            f"the token file {path} can be read by other users of this machine; run: chmod 600 {path}"
+        )
     if not text or any(character.isspace() for character in text):
-        raise BadCredentialFile(f"{path} must hold one token and nothing else")
+        raise BadCredentialFile(f"the token file {path} must contain one token and nothing else")
     return text
 
 
@@ -115,7 +119,7 @@ def read_logins(path: Path) -> Logins:
         content = json.loads(path.read_text(encoding="utf-8"))
         return Logins(content["default"], dict(content["tokens"]))
     except (ValueError, KeyError, TypeError) as error:
-        raise BadCredentialFile(f"{path} is damaged; remove it and log in again") from error
+        raise BadCredentialFile(f"the file of logins {path} is damaged; remove it and log in again") from error
 
 
 def store_login(path: Path, url: str, token: str) -> None:

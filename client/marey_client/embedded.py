@@ -93,5 +93,6 @@ def room(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"this needs a package that is not installed ({error.name}); pip install 'marey[{extra}]'"
+            f"a server in this process needs the package {error.name}, which is not installed; run: pip "
+            f"install 'marey[{extra}]'"
         ) from error

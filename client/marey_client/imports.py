@@ -99,8 +99,8 @@ def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
     known = files.setdefault(name, LocalFile(name, path, path.stat().st_size))
     if not known.path.samefile(path):
         raise SameName(
-            f"{known.path} and {path} would both be {name}; name the folder above them, "
-            "or upload them to two collections"
+            f"the files {known.path} and {path} would both get the name {name} on the server; import the "
+            "folder that contains both, or import them into different collections"
         )
 
 

@@ -246,8 +246,9 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
         return answer.model_validate_json(response.content)
     except ValidationError as error:
         raise UnexpectedAnswer(
-            f"{response.request.method} {response.request.url.path}: the answer is not a {answer.__name__} "
-            f"({error.error_count()} fields differ). Is the client older than the server?"
+            f"{response.request.method} {response.request.url.path}: the server's answer is not a valid "
+            f"{answer.__name__} ({error.error_count()} fields are wrong); the client may be older than the "
+            "server: update it"
         ) from error
 
 

@@ -94,7 +94,9 @@ class Clip:
         joints, where = self.translated_joints, "translated_joints"
         if self.translations is None:
             if joints:
-                raise ClipError("these joints need translations, but translations is None", where=where)
+                raise ClipError(
+                    "translated_joints names joints, so translations must be an array, not None", where=where
+                )
             return
         if self.translations.shape != (self.frame_count, len(joints), 3):
             needed = (self.frame_count, len(joints), 3)
@@ -145,7 +147,8 @@ class Clip:
         """
         if not 0 <= start < stop <= self.frame_count:
             raise ClipError(
-                f"frames {start}:{stop} are not a part of 0:{self.frame_count}; start must come before stop",
+                f"the range of frames {start}:{stop} must lie within 0:{self.frame_count}, and its start must "
+                "be before its stop",
                 where="slice",
             )
         translations = None if self.translations is None else self.translations[start:stop]
@@ -162,7 +165,9 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
     view = np.asarray(array, dtype=np.float32).view()
     if not np.isfinite(view).all():
         finite = np.isfinite(view).reshape(len(view), -1).all(axis=1)
-        raise ClipError(f"frame {int(np.argmin(finite))} contains a number that is not finite", where=field)
+        raise ClipError(
+            f"frame {int(np.argmin(finite))} contains a number that is not finite (infinite or NaN)", where=field
+        )
     view.setflags(write=False)
     return view
 

@@ -144,7 +144,10 @@ def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Cl
     """
     if set(document.joints) != set(skeleton.joint_names) or len(document.joints) != skeleton.joint_count:
         odd = sorted(set(document.joints) ^ set(skeleton.joint_names)) or ["a repeated name"]
-        raise ClipError(f"the joints of the motion and of the skeleton differ in: {', '.join(odd[:5])}", where="joints")
+        raise ClipError(
+            f"the motion and the skeleton do not have the same joints; only one of them has {', '.join(odd[:5])}",
+            where="joints",
+        )
     if document.joints[0] != skeleton.joint_names[0]:
         raise ClipError(f"the first joint must be the root, {skeleton.joint_names[0]}", where="joints")
     poses, translations = document.poses, document.translations
@@ -257,7 +260,9 @@ def mapping_from_document(
     """
     for standard, name in document.joints.items():
         if standard not in STANDARD_JOINTS:
-            raise MappingError(f"{standard!r} is not a standard joint", where=f"joints.{standard}")
+            raise MappingError(
+                f"the mapping names {standard!r}, which is not a standard joint", where=f"joints.{standard}"
+            )
         if name not in skeleton:
             raise MappingError(f"the skeleton has no joint {name!r}", where=f"joints.{standard}")
     for name in document.axes:

@@ -295,7 +295,8 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
     known = length >= SHORTEST_LATERAL_M
     if not known.any():
         raise MotionError(
-            "the left and right joints lie above each other in every frame, so the body has no forward direction",
+            "the forward direction of the body cannot be computed, because each left joint is exactly above "
+            "or below the right joint in every frame",
             code="heading-undefined",
         )
     last_known = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
@@ -321,7 +322,9 @@ def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[i
     MotionError    without a pair of joints
     """
     if not left or len(left) != len(right):
-        raise MotionError("a heading needs at least one pair of left and right joints", code="heading-undefined")
+        raise MotionError(
+            "computing a heading needs at least one pair of a left and a right joint", code="heading-undefined"
+        )
     lateral = np.sum(positions[:, list(left)].astype(np.float64) - positions[:, list(right)], axis=1)
     return np.stack((-lateral[:, 2], lateral[:, 0]), axis=1)
 

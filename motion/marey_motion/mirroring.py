@@ -107,7 +107,10 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
     partners = np.array(pairing)
     count = skeleton.joint_count
     if partners.shape != (count,) or not np.array_equal(np.sort(partners), np.arange(count)):
-        raise MotionError(f"each of the {count} joints needs one partner that no other joint has", where="partners")
+        raise MotionError(
+            f"each of the {count} joints needs one partner, and no two joints may have the same partner",
+            where="partners",
+        )
     if partners[0] != 0 or not np.array_equal(partners[partners], np.arange(count)):
         raise MotionError("partners must be mutual, and the root must be its own partner", where="partners")
     sources = partners.astype(np.int64)

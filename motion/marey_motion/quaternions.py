@@ -300,7 +300,7 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
     """
     axes = _euler_axes(order)
     if len(axes) != 3:
-        raise RotationError(f"{order!r} names {len(axes)} axes, three are needed", where="order")
+        raise RotationError(f"the order {order!r} contains {len(axes)} axes, but three are needed", where="order")
     (q,), dtype = _widened((q, 4))
     first, middle, last = axes if intrinsic else axes[::-1]
     proper = first == last
@@ -581,7 +581,7 @@ def _check_orthonormal(m: Floats) -> None:
     if np.any(wrong):
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         kind = "mirrors" if error[index] <= 1e-3 else "scales or shears"
-        raise RotationError(f"the matrix at {index} {kind}, so it is not a rotation", where="matrix")
+        raise RotationError(f"the matrix at index {index} is not a rotation: it {kind}", where="matrix")
 
 
 def _euler_axes(order: str) -> tuple[int, ...]:

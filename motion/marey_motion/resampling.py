@@ -65,7 +65,7 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
     ClipError    when the rate is not a positive number
     """
     if not (np.isfinite(to_hz) and to_hz > 0):
-        raise ClipError(f"the frame rate is {to_hz}, a positive number is needed", where="frame_rate_hz")
+        raise ClipError(f"the frame rate must be a positive number, not {to_hz}", where="frame_rate_hz")
     if _are_same(to_hz, from_hz):
         return motion
     frames = motion.frame_count

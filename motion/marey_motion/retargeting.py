@@ -149,7 +149,7 @@ def plan_retarget(
     if scale is None:
         scale = _hip_height_ratio(pairs, source, source_axes, target, target_axes)
     if not (np.isfinite(scale) and scale > 0):
-        raise MappingError(f"a scale of {scale} must be a positive number", code="scale-invalid", where="scale")
+        raise MappingError(f"the scale must be a positive number, not {scale}", code="scale-invalid", where="scale")
     followed = {pair.target for pair in pairs}
     others = tuple(name for name in target.joint_names if name not in followed)
     same_rig = _are_same_rig(source, target)
@@ -202,7 +202,9 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
     from marey_motion import retargeting_kernels as kernels
 
     if not same_hierarchy(clip.skeleton, plan.source, tolerance_m=SAME_SKELETON_M):
-        raise ClipError("the clip is of another skeleton than the plan was made for", where="skeleton")
+        raise ClipError(
+            "the clip has a different skeleton from the source skeleton of the retargeting plan", where="skeleton"
+        )
     target = plan.target
     ways = np.where(plan.sources >= 0, kernels.MAPPED, kernels.AT_REST).astype(np.int8)
     sources = plan.sources.copy()
@@ -275,8 +277,8 @@ def _check_enough(pairs: tuple[JointPair, ...], source_mapping: JointMapping, ta
         if missing:
             lacks.append(f"the {which} skeleton's mapping has no {', '.join(missing)}")
     raise MappingError(
-        f"too few joints to retarget: {'; '.join(lacks)}. Set them in the mapping as standard name: joint name; "
-        f"the pelvis and at least {FEWEST_ESSENTIAL - 1} others of the essential joints are needed on both sides",
+        f"too few joints are mapped to retarget: {'; '.join(lacks)}. Add them to the joint mappings; both "
+        f"skeletons must map the pelvis and at least {FEWEST_ESSENTIAL - 1} of the other essential joints",
         code="mapping-too-small",
         where="mapping",
     )
@@ -290,8 +292,8 @@ def _axes_of(axes: Mapping[str, JointAxes], joint: str, which: str) -> NDArray[n
     cross = np.cross(twist, swing)
     if not np.linalg.norm(cross) > 1e-6 * np.linalg.norm(twist) * np.linalg.norm(swing):
         raise MappingError(
-            f"the twist axis {axes[joint].twist} and the swing axis {axes[joint].swing} of the {which} skeleton's "
-            "joint must have a length and point in different directions",
+            f"the twist axis {axes[joint].twist} and the swing axis {axes[joint].swing} of the {which} "
+            "skeleton's joint must be longer than zero and not parallel",
             where=joint,
         )
     columns = (twist, np.cross(cross, twist), cross)
@@ -318,7 +320,10 @@ def _hip_height_ratio(
     known = np.isfinite(parts[0]) & np.isfinite(parts[1])
     heights = [float(np.sum(part[known])) for part in parts]
     if min(heights) <= 0.0:
-        raise MappingError("legs without length give no scale; set it with --scale (scale)", where="left_hip")
+        raise MappingError(
+            "the scale cannot be computed from legs of length zero; set the scale with --scale (scale)",
+            where="left_hip",
+        )
     return heights[1] / heights[0]
 
 
@@ -332,8 +337,8 @@ def _heights(
     missing = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints]
     if missing:
         raise MappingError(
-            f"the hip height needs both legs, but {', '.join(missing)} is not mapped on both sides; "
-            "map it or set the scale with --scale (scale)",
+            f"the scale is computed from both legs, but {', '.join(missing)} is not mapped on both sides; add "
+            "the mapping, or set the scale with --scale (scale)",
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]

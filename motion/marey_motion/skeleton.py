@@ -99,7 +99,10 @@ class Skeleton:
         set_field(self, "rest_rotations", _frozen(self.rest_rotations, np.float64, (count, 4), "rest_rotations"))
         set_field(self, "end_sites", tuple(self.end_sites))
         if len(self.display_names) != count:
-            raise SkeletonError(f"{len(self.display_names)} names for {count} joints", where="display_names")
+            raise SkeletonError(
+                f"there are {len(self.display_names)} display names for {count} joints; each joint needs one",
+                where="display_names",
+            )
         self._check_tree()
         self._check_rest_rotations()
 
@@ -116,7 +119,8 @@ class Skeleton:
         for site in self.end_sites:
             if not 0 <= site.joint < self.joint_count:
                 raise SkeletonError(
-                    f"an end site is on joint {site.joint}, the skeleton has {self.joint_count}", where="end_sites"
+                    f"an end site belongs to joint {site.joint}, but the skeleton has only {self.joint_count} joints",
+                    where="end_sites",
                 )
 
     def _check_rest_rotations(self) -> None:
@@ -125,7 +129,7 @@ class Skeleton:
         if wrong.size:
             joint = int(wrong[0])
             raise SkeletonError(
-                f"rest rotation has length {norms[joint]:.6g}, a unit quaternion (w, x, y, z) is needed",
+                f"the rest rotation must be a unit quaternion (w, x, y, z), but has the length {norms[joint]:.6g}",
                 where=self.joint_names[joint],
             )
 
@@ -279,10 +283,12 @@ def _checked_names(names: Sequence[str]) -> tuple[str, ...]:
         raise SkeletonError("a skeleton needs at least one joint", where="joint_names")
     for joint, name in enumerate(names):
         if not isinstance(name, str) or not name:
-            raise SkeletonError(f"the name of joint {joint} is {name!r}, text is needed", where="joint_names")
+            raise SkeletonError(f"the name of joint {joint} must be text, not {name!r}", where="joint_names")
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
-        raise SkeletonError(f"joint names must be unique, {repeated[0]!r} repeats", where="joint_names")
+        raise SkeletonError(
+            f"joint names must be unique, but two joints are called {repeated[0]!r}", where="joint_names"
+        )
     return names
 
 
@@ -290,9 +296,9 @@ def _frozen(values: ArrayLike, dtype: DTypeLike, shape: tuple[int, ...], field: 
     """Make a read-only view of `values` as `dtype`; the caller's own array keeps its flags."""
     array = np.asarray(values)
     if array.shape != shape:
-        raise SkeletonError(f"shape {array.shape}; {shape} is needed", where=field)
+        raise SkeletonError(f"the array has the shape {array.shape}, but must have {shape}", where=field)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise SkeletonError(f"numbers are needed, not {array.dtype}", where=field)
+        raise SkeletonError(f"the array must contain numbers, not values of the type {array.dtype}", where=field)
     if not np.all(np.isfinite(array)):
         raise SkeletonError("all numbers must be finite", where=field)
     view: NDArray[np.generic] = np.asarray(array, dtype=dtype).view()

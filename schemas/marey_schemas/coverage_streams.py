@@ -85,15 +85,19 @@ class CoverageStreamCreate(Request):
     def _check_grid(self) -> Self:
         for name in ("speeds_m_s", "turn_rates_deg_s", "least_s"):
             if self.evaluation is not None and getattr(self, name) is not None:
-                raise ValueError(f"{name}: the evaluation contains it already; give only one of the two")
+                raise ValueError(
+                    f"{name}: this value comes from the evaluation; give either the evaluation or {name}, not both"
+                )
         for name in ("speeds_m_s", "turn_rates_deg_s"):
             values = getattr(self, name) or ()
             if len(set(values)) != len(values):
-                raise ValueError(f"{name}: a value is repeated")
+                raise ValueError(f"{name}: the list contains a value twice; remove one")
         if self.speeds_m_s and self.turn_rates_deg_s:
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
-                raise ValueError(f"these speeds and turn rates make {cells} cells; at most {MOST_CELLS} are possible")
+                raise ValueError(
+                    f"these speeds and turn rates make a grid of {cells} cells; at most {MOST_CELLS} are possible"
+                )
         return self
 
 
@@ -127,11 +131,11 @@ class CoverageFrames(Request):
         for name in ("poses", "translations", "roots"):
             frames = getattr(self, name)
             if frames is not None and not np.issubdtype(frames.dtype, np.floating):
-                raise ValueError(f"{name}: dtype {frames.dtype.str}; it must be <f4 or <f8")
+                raise ValueError(f"{name}: the dtype is {frames.dtype.str}, but must be <f4 or <f8")
         if self.frame_count > MOST_FRAMES:
-            raise ValueError(f"{self.frame_count} frames; a request may have at most {MOST_FRAMES}")
+            raise ValueError(f"the request has {self.frame_count} frames; at most {MOST_FRAMES} are possible")
         if self.frame_count == 0 and not self.ends_take:
-            raise ValueError("send frames, or set ends_take")
+            raise ValueError("the request is empty; send frames, or set ends_take")
         return self
 
     @property
@@ -237,7 +241,7 @@ class MeasuredCells(Answer):
     @model_validator(mode="after")
     def _check_seconds(self) -> Self:
         if not np.all((self.seconds >= 0.0) & (self.seconds <= MOST_SECONDS)):
-            raise ValueError(f"seconds: a cell must have 0 to {MOST_SECONDS:g} s")
+            raise ValueError(f"seconds: the value of each cell must be 0 to {MOST_SECONDS:g} s")
         return self
 
 

@@ -74,22 +74,27 @@ class KindDeclaration:
 
     def __post_init__(self) -> None:
         if self.fan_out is not None and not (self.fan_out in self.inputs and self.inputs[self.fan_out].many):
-            raise ValueError(f"{self.name}: fan_out {self.fan_out!r} must be an input that takes many items")
+            raise ValueError(
+                f"job kind {self.name}: fan_out names {self.fan_out!r}, which must be an input that takes many items"
+            )
         for name in (*self.never_cached_without, *filter(None, [self.named_after])):
             if name not in self.inputs:
-                raise ValueError(f"{self.name}: it has no input {name!r}")
+                raise ValueError(f"job kind {self.name}: the declaration has no input {name!r}")
         for name in (*self.newest_of, *filter(None, [self.in_place])):
             if name not in self.params.model_fields:
-                raise ValueError(f"{self.name}: it has no parameter {name!r}")
+                raise ValueError(f"job kind {self.name}: the declaration has no parameter {name!r}")
         for name, spec in self.inputs.items():
             if unknown := set(spec.parts) - PARTS[spec.kind].keys():
-                raise ValueError(f"{self.name}: input {name!r}: a {spec.kind} has no part {sorted(unknown)[0]!r}")
+                raise ValueError(
+                    f"job kind {self.name}: input {name!r}: an item of the kind {spec.kind} has no part "
+                    f"{sorted(unknown)[0]!r}"
+                )
         if self.batch_size < 1:
-            raise ValueError(f"{self.name}: batch_size must be at least 1, not {self.batch_size}")
+            raise ValueError(f"job kind {self.name}: batch_size must be at least 1, not {self.batch_size}")
         if (self.task_count is None) != (self.gathering is None):
-            raise ValueError(f"{self.name}: declare task_count and gathering together")
+            raise ValueError(f"job kind {self.name}: declare either both of task_count and gathering, or neither")
         if self.task_count is not None and self.fan_out is not None:
-            raise ValueError(f"{self.name}: tasks come from fan_out or from task_count, not from both")
+            raise ValueError(f"job kind {self.name}: declare fan_out or task_count, not both")
 
     @property
     def code_version(self) -> str:
@@ -403,9 +408,12 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
         kind = entry.load()
         if not isinstance(kind, KindDeclaration):
-            raise TypeError(f"entry point {entry.value} of {ENTRY_POINT_GROUP} must be a KindDeclaration")
+            raise TypeError(f"the entry point {entry.value} in the group {ENTRY_POINT_GROUP} must be a KindDeclaration")
         if kind.name in kinds:
-            raise ValueError(f"entry point {entry.value} declares the job kind {kind.name!r}, which exists already")
+            raise ValueError(
+                f"the entry point {entry.value} declares the job kind {kind.name!r}, but another one "
+                "has this name already"
+            )
         kinds[kind.name] = kind
     return MappingProxyType(kinds)
 
@@ -415,4 +423,4 @@ def find_kind(name: str) -> KindDeclaration:
     try:
         return job_kinds()[name]
     except KeyError:
-        raise UnknownKindError(f"there is no kind of job called {name!r}; known: {', '.join(job_kinds())}") from None
+        raise UnknownKindError(f"there is no job kind {name!r}; the job kinds are {', '.join(job_kinds())}") from None

@@ -99,9 +99,15 @@ class CutParams(TaggedResults):
     def _check_name(cls, name: str) -> str:
         fields = {found.group(1) for found in _NAME_FIELD.finditer(name)}
         if fields != {"clip", "label", "number"}:
-            raise ValueError("must contain {clip}, {label} and {number}, so that every piece has a name of its own")
+            raise ValueError(
+                "the pattern of names must contain {clip}, {label} and {number}, so that every "
+                "piece has a name of its own"
+            )
         if set("{}/") & set(_NAME_FIELD.sub("", name)):
-            raise ValueError("only {clip}, {label} and {number} (or {number:3} for three digits) may be in braces")
+            raise ValueError(
+                "the pattern of names may contain only {clip}, {label} and {number} (or "
+                "{number:3} for three digits) in braces"
+            )
         return name
 
     @model_validator(mode="after")
@@ -155,16 +161,18 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
     def _check_size(self) -> Self:
         if self.trial_count > MOST_TRIALS:
             raise ValueError(
-                f"the speeds, turn rates and families make {self.trial_count} trials, more than {MOST_TRIALS}"
+                f"the speeds, turn rates and families make {self.trial_count} trials; at most {MOST_TRIALS} "
+                "are possible"
             )
         simulated_s = self.trial_count * (self.approach_s + self.duration_s)
         if simulated_s > MOST_SIMULATED_S:
             raise ValueError(
-                f"{self.trial_count} trials of this length are {simulated_s:,.0f} s, over {MOST_SIMULATED_S:,.0f}"
+                f"{self.trial_count} trials of this length simulate {simulated_s:,.0f} s together; at most "
+                f"{MOST_SIMULATED_S:,.0f} s are possible"
             )
         for item, (start, stop) in self.trims.items():
             if stop <= start:
-                raise ValueError(f"trims.{item}: the end {stop} must lie after the start {start}")
+                raise ValueError(f"trims.{item}: the end, frame {stop}, must be after the start, frame {start}")
         return self
 
 
@@ -239,7 +247,9 @@ class EditParams(SuffixedResults):
     @model_validator(mode="after")
     def _check_place(self) -> Self:
         if self.in_place and self.suffix:
-            raise ValueError("suffix: must be empty with in_place, which keeps the names of the clips")
+            raise ValueError(
+                "suffix: must be empty when in_place is set, because in_place keeps the names of the clips"
+            )
         return self
 
     def unclear_place(self, into: str) -> str | None:

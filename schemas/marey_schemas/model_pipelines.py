@@ -53,11 +53,16 @@ class ModelPlan(Request):
         if (self.files is None) == (not self.clips):
             raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
-            raise ValueError("annotations: give them only for existing clips, and only if none are proposed")
+            raise ValueError(
+                "annotations: annotations can be given only for existing clips, not for files to "
+                "import, and not if annotations are proposed"
+            )
         if self.cut is not None and not self.annotations and self.annotate is None:
-            raise ValueError("cut: needs annotations; give some, or let them be proposed")
+            raise ValueError("cut: cutting needs annotations; give some, or let them be proposed")
         if self.annotations and self.skeleton is not None and self.cut is None:
-            raise ValueError("annotations: cannot be used after retargeting; cut the clips first")
+            raise ValueError(
+                "annotations: the annotations of the takes cannot be used after retargeting; cut the clips first"
+            )
         return self
 
 

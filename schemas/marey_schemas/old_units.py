@@ -25,7 +25,7 @@ def read_old_unit(model: Request, name: str, old: str) -> None:
     if centimetres is None:
         return
     if name in model.model_fields_set:
-        raise ValueError(f"{old}: replaced by {name}; give only {name}")
+        raise ValueError(f"{old}: this old name was given together with the current name {name}; give only {name}")
     object.__setattr__(model, name, centimetres * 0.01)
     object.__setattr__(model, old, None)
     model.model_fields_set.discard(old)

@@ -87,13 +87,17 @@ class SearchRequest(RefineOptions):
     @model_validator(mode="after")
     def _check_steps(self) -> Self:
         if self.steps and self.constraints:
-            raise ValueError("constraints: for several motions, give them in steps")
+            raise ValueError(
+                "constraints: in a search for several motions, give the constraints of each motion in its step"
+            )
         total = sum(len(step.constraints) for step in self.asked_steps)
         if total > MOST_CONSTRAINTS:
-            raise ValueError(f"steps: {total} constraints in all; at most {MOST_CONSTRAINTS} are possible")
+            raise ValueError(
+                f"steps: the steps have {total} constraints together; at most {MOST_CONSTRAINTS} are possible"
+            )
         if total * self.candidates > MOST_CANDIDATE_CONSTRAINTS:
             most = MOST_CANDIDATE_CONSTRAINTS // total
-            raise ValueError(f"candidates: at most {most} are possible with {total} constraints")
+            raise ValueError(f"candidates: with {total} constraints, at most {most} candidates are possible")
         return self
 
     @property

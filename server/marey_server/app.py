@@ -137,7 +137,9 @@ async def listening(app: Application) -> AsyncIterator[Running]:
     try:
         sockets = bind_sockets(settings.port, settings.host)
     except OSError as error:
-        raise CannotListen(f"cannot listen on {settings.host}, port {settings.port}: {error.strerror}") from error
+        raise CannotListen(
+            f"the server cannot listen on {settings.host}, port {settings.port}: {error.strerror}"
+        ) from error
     server = HTTPServer(
         app,
         idle_connection_timeout=settings.header_timeout_s,

@@ -44,7 +44,9 @@ def serve(**settings: Any) -> None:
     except DatabaseUnusable as error:
         raise CommandFailed(str(error)) from error
     except CannotListen as error:
-        raise CommandFailed(f"{error}; choose others with --host and --port, 0 for any free port") from error
+        raise CommandFailed(
+            f"{error}; choose another address with --host, or another port with --port (0: any free port)"
+        ) from error
     leave()
 
 
@@ -87,7 +89,7 @@ def backup(*, target: Path, **settings: Any) -> None:
     """Copy an SQLite database in a consistent state, even while a server is writing to it."""
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
-        raise CommandFailed(f"{target} exists; choose a file that does not exist")
+        raise CommandFailed(f"the file {target} exists already; choose a file that does not exist")
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
     _copy_database(source, partial)
@@ -102,9 +104,11 @@ def restore(*, source: Path, **settings: Any) -> None:
     # A log that stays behind would be played into the backup.
     for left in (target, target.with_name(f"{target.name}-wal"), target.with_name(f"{target.name}-shm")):
         if left.exists():
-            raise CommandFailed(f"{left} exists; stop the server and move the file away first, so that nothing is lost")
+            raise CommandFailed(
+                f"the file {left} exists already and would be replaced; stop the server and move the file away first"
+            )
     if not source.is_file():
-        raise CommandFailed(f"{source} is not a file")
+        raise CommandFailed(f"there is no file {source}; name a file that `marey db backup` wrote")
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
@@ -176,7 +180,7 @@ def _shrink(file: Path) -> None:
     try:
         vacuum(file)
     except DatabaseUnusable as error:
-        raise CommandFailed(f"the database was not made smaller: {error}") from None
+        raise CommandFailed(f"the database could not be compacted: {error}") from None
     _say(f"the database takes {file.stat().st_size:,} bytes; it took {before:,}")
 
 
@@ -218,9 +222,9 @@ def _sqlite_file(settings: Settings, *, must_exist: bool) -> Path:
 
     file = sqlite_file(settings.resolved_database_url)
     if file is None:
-        raise CommandFailed("this works on SQLite files; use pg_dump and pg_restore for Postgres")
+        raise CommandFailed("this command works only with SQLite; for Postgres, use pg_dump and pg_restore")
     if must_exist and not file.is_file():
-        raise CommandFailed(f"there is no database {file}; say where with --data")
+        raise CommandFailed(f"there is no database {file}; name its folder with --data")
     return file
 
 
@@ -235,10 +239,10 @@ def _copy_database(source: Path, target: Path) -> None:
             (state,) = writing.execute("PRAGMA quick_check").fetchone()
     except sqlite3.DatabaseError as error:
         target.unlink()
-        raise CommandFailed(f"{source} is not an intact database: {error}") from None
+        raise CommandFailed(f"the backup {source} cannot be read as a database: {error}") from None
     if state != "ok":
         target.unlink()
-        raise CommandFailed(f"{source} is damaged: {state}")
+        raise CommandFailed(f"the backup {source} is damaged: {state}")
     with open(target, "rb") as file:
         os.fsync(file.fileno())
 

@@ -23,7 +23,7 @@ class _Fault:
         self._nth = int(nth) if nth else None
         self._passes: Iterator[int] = itertools.count(1)
         if self.action not in ("kill", "stop", "error"):
-            raise ValueError(f"{FAULT_VARIABLE}={text}: the action must be kill, stop or error")
+            raise ValueError(f"the variable {FAULT_VARIABLE} is {text}: its action must be kill, stop or error")
 
     def act(self) -> None:
         count = next(self._passes)

@@ -180,15 +180,15 @@ def test_it_goes_on_from_what_an_evaluation_found(owner: httpx.Client) -> None:
     assert progress["changed"][0]["seconds"] == pytest.approx(1.5 + 91 / 60)
     assert (progress["index"], progress["targets"]) == (1.0, [])
     both = owner.post(STREAMS, json={"frame_rate_hz": 60, "evaluation": made.json()["id"], "least_s": 1})
-    assert "give only one of the two" in problem(both, 422)["detail"]
+    assert "give either the evaluation or" in problem(both, 422)["detail"]
 
 
 @pytest.mark.parametrize(
     ("seconds", "least_s", "said"),
     [
         ([[5.0]], 1.0, "1 cells"),
-        ([[5.0], [-1.0]], 1.0, "coverage: seconds: a cell must have"),
-        ([[5.0], [1e300]], 1.0, "coverage: seconds: a cell must have"),
+        ([[5.0], [-1.0]], 1.0, "coverage: seconds: the value of each cell"),
+        ([[5.0], [1e300]], 1.0, "coverage: seconds: the value of each cell"),
         ([[5.0], [1.0]], 0.0, "options: coverage_least_s"),
         (None, 1.0, "coverage: Field required"),
     ],
@@ -222,7 +222,7 @@ def test_a_skeleton_that_tells_no_direction_is_refused(owner: httpx.Client) -> N
     [
         ({"frame_rate_hz": 5}, "greater than or equal to 10"),
         ({"frame_rate_hz": 1000}, "less than or equal to 240"),
-        ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "is repeated"),
+        ({"frame_rate_hz": 60, "speeds_m_s": [1, 1]}, "contains a value twice"),
         ({"frame_rate_hz": 60, "speeds_m_s": list(range(1, 21)), "turn_rates_deg_s": list(range(150))}, "3000 cells"),
         ({"frame_rate_hz": 60, "target_count": 17}, "less than or equal to 16"),
         ({}, "required"),
@@ -264,7 +264,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(
         (stream, {"roots": np.zeros((2, 4))}, "3 columns"),
         (stream, {"roots": np.zeros((0, 3))}, "send frames, or set ends_take"),
         (stream, {}, "send frames, or set ends_take"),
-        (rootless, {"poses": poses}, "without a skeleton"),
+        (rootless, {"poses": poses}, "without one"),
     ]  # fmt: skip
     for to, frames, said in wrong:
         assert said in problem(send(owner, to, offset=0, **frames), 422)["detail"], frames

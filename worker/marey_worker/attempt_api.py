@@ -143,7 +143,9 @@ def _split_documents(data: bytes) -> list[bytes | None]:
     unpacker = msgpack.Unpacker(max_buffer_size=len(data))
     unpacker.feed(data)
     if unpacker.read_map_header() != 1 or unpacker.unpack() != "documents":
-        raise ValueError("the answer to a request for several documents must have the only member `documents`")
+        raise ValueError(
+            "the server's answer to a request for several documents must be an object with the single key `documents`"
+        )
     documents: list[bytes | None] = []
     for _ in range(unpacker.read_array_header()):
         start = unpacker.tell()

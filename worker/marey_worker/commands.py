@@ -43,7 +43,9 @@ def work(
     standard input closes, because the process that started this worker has ended.
     """
     if credential.token is None:
-        raise NoCredential(f"a worker needs a token with the scope `work` for {credential.url}; see --token-file")
+        raise NoCredential(
+            f"a worker needs a token with the scope `work` for the server {credential.url}; give it with --token-file"
+        )
     log_to_standard_error(log_form or _form_named(os.environ.get("MAREY_LOG_FORM")), _level_of(os.environ))
     logging.getLogger("httpx").setLevel(logging.WARNING)
     given: dict[str, Any] = {} if name is None else {"name": name}
@@ -111,7 +113,7 @@ def _parsed_labels(texts: tuple[str, ...]) -> dict[str, str]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
-            raise MareyError(f"label {text!r}: write name=value")
+            raise MareyError(f"the label {text!r} is not a name with a value; write name=value")
         labels[name] = value
     return labels
 

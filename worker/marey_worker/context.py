@@ -92,7 +92,7 @@ class Context:
         """Return a part of a revision, with arrays as numpy arrays. Raises `NoSuchThing` if it does not exist."""
         ((_, document),) = self._read_ahead([(None, PartPlace(kind=kind, item=item, revision=revision, part=part))])
         if document is None:
-            raise NoSuchThing(f"There is no part {part!r} of {kind} {item!r} at revision {revision}.", f"no-{kind}")
+            raise NoSuchThing(f"The {kind} {item!r} has no part {part!r} at revision {revision}.", f"no-{kind}")
         return document
 
     def documents(

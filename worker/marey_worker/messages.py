@@ -172,4 +172,4 @@ def unpack(data: bytes) -> Any:
         name, fields = msgpack.unpackb(data, strict_map_key=True)
         return _FORMS[name].validate_python(fields)
     except (ValueError, TypeError, KeyError, msgpack.UnpackException, RecursionError, ValidationError) as error:
-        raise BadMessage(f"a child process sent {len(data)} bytes that are no message: {error}") from error
+        raise BadMessage(f"a child process sent {len(data)} bytes that cannot be read as a message: {error}") from error

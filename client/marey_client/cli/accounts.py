@@ -265,7 +265,9 @@ def change_password(
         me = marey.me().user
         who = name or (me.name if me else None)
         if who is None:
-            raise WrongUsage("the token belongs to no user; give the name of the user")
+            raise WrongUsage(
+                "the token in use does not belong to a user; give the name of the user whose tokens you mean"
+            )
         change: dict[str, Any] = {"password": _ask_secret("New password", twice=True)}
         if end_tokens:
             change["end_tokens"] = EndTokens.ALL
@@ -305,7 +307,7 @@ def change_user(
     given = {"display_name": display_name, "administrator": administrator}
     change = UserChange.model_validate({key: value for key, value in given.items() if value is not None})
     if not change.model_fields_set:
-        raise WrongUsage("give --display-name or --administrator")
+        raise WrongUsage("nothing to change; give --display-name, --administrator or both")
     with connect(context) as marey:
         changed = marey.users.change(name, change)
     if as_json:
@@ -315,7 +317,10 @@ def change_user(
 
 def _ask_name() -> str:
     if not sys.stdin.isatty():
-        raise WrongUsage("there is no terminal to ask at: name the user with --name, or use --with-token")
+        raise WrongUsage(
+            "the user name cannot be asked for, because standard input is not a terminal; give "
+            "--name, or use --with-token"
+        )
     return str(typer.prompt("User name", err=True))
 
 
@@ -326,7 +331,8 @@ def _ask_secret(what: str, *, twice: bool = False) -> str:
     if secret := sys.stdin.readline().rstrip("\r\n"):
         return secret
     raise WrongUsage(
-        f"{what}: there is neither a terminal to ask at nor a line on standard input; run the command in a terminal"
+        f"the command needs {what}, but standard input is neither a terminal nor has a line of text; run the "
+        "command in a terminal"
     )
 
 

@@ -82,14 +82,16 @@ def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
     """Return the error for an address without a wanted item, with the command that lists the folder there or above."""
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; marey ls {address} lists it")
-    return WrongUsage(f"there is {what} at {address}; marey ls {address.project} shows what there is")
+    return WrongUsage(f"there is {what} at {address}; `marey ls {address.project}` lists the project")
 
 
 def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
     """Parse several addresses. Raises `WrongUsage` if they are not all in one project."""
     addresses = [Address.parse(place) for place in places]
     if len({address.project for address in addresses}) > 1:
-        raise WrongUsage(f"{', '.join(places)}: all of these must be in one project")
+        raise WrongUsage(
+            f"these places are in different projects, but the command works in one project only: {', '.join(places)}"
+        )
     return addresses
 
 
@@ -230,12 +232,12 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
     if len(kinds) > 1:
-        raise WrongUsage(f"{address} is the name of a {' and of a '.join(kinds)}; choose one with --kind")
+        raise WrongUsage(f"several items are called {address}: a {{' and a '.join(kinds)}}; choose one with --kind")
     if not found:
         if not deleted:
-            raise _missing(marey, address, "nothing")
+            raise _missing(marey, address, "no item or folder")
         raise WrongUsage(
-            f"there is nothing deleted at {address}; marey ls --deleted {address.project} shows what there is"
+            f"there is no deleted item at {address}; `marey ls --deleted {address.project}` lists the deleted items"
         )
     return found[0]
 
@@ -245,9 +247,11 @@ def require_apart(things: Sequence[Thing]) -> None:
     for place, one in enumerate(things):
         for other in (*things[:place], *things[place + 1 :]):
             if other.id == one.id:
-                raise WrongUsage(f"{one.place} is given twice")
+                raise WrongUsage(f"{one.place} is named twice in the command; name it once")
             if other.kind == FOLDER and one.place.startswith(f"{other.place}/"):
-                raise WrongUsage(f"{one.place} is in {other.place}, which is given, too")
+                raise WrongUsage(
+                    f"{one.place} is inside {other.place}, and the command names both; name only one of them"
+                )
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:

@@ -139,7 +139,7 @@ def move(
     """Move the start or the end of a segment; a neighbouring segment at that edge is adapted."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
     if len(edges) != 1:
-        raise WrongUsage("give either --start or --end")
+        raise WrongUsage("give exactly one of --start and --end")
     _apply(context, place, command="move_boundary", at=at, edge=edges[0][0], to=edges[0][1])
 
 
@@ -166,7 +166,7 @@ def mark(
 ) -> None:
     """Add, move or remove a keyframe."""
     if move_to is not None and remove_it:
-        raise WrongUsage("give --move or --remove, not both")
+        raise WrongUsage("give exactly one of --move and --remove")
     if move_to is not None:
         _apply(context, place, command="move_keyframe", label=label, frame=frame, to=move_to)
     else:

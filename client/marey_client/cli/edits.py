@@ -65,7 +65,8 @@ def apply_edit(
     addresses = addresses_in_one_project(sources)
     if not (into or params.get("suffix") or params.get("in_place")):
         raise WrongUsage(
-            "choose a place for the results: --into for a folder, --suffix for names beside the clips, or --in-place"
+            "choose where the results go: --into FOLDER, --suffix TEXT (next to the clips, with this text "
+            "added to their names), or --in-place (new revisions of the clips)"
         )
     with connect(context) as marey:
         commands = _commands(marey, addresses[0].project, do, file, saved)
@@ -183,7 +184,7 @@ def _commands(
     if saved is None:
         return _given(marey, project, do, file)
     if do or file:
-        raise WrongUsage("give either an edit by --with or commands by --do or --file, not both")
+        raise WrongUsage("give either a saved edit with --with, or commands with --do or --file, not both")
     if Address.parse(saved).project != project:
         raise WrongUsage("the edit and the clips must be in one project")
     return _edit_at(marey, saved)
@@ -193,7 +194,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
     from marey_client.handles.edits import as_edit
 
     if (file is None) == (not do):
-        raise WrongUsage("give commands either by --do or by --file, not both")
+        raise WrongUsage("give commands either with --do or with --file, not both")
     tree: Any = [parse_command(text) for text in do or ()] if file is None else read_json(file)
     given = tree if isinstance(tree, dict) else {"commands": tree}
     commands, title = given.get("commands"), given.get("title", "")
@@ -211,7 +212,10 @@ def _with_ids(marey: Marey, project: str, command: Any) -> Any:
         return command
     place = Address.parse(source)
     if place.project != project:
-        raise WrongUsage(f"{command.get('command', 'a command')}: the source {place} must be in the project {project}")
+        raise WrongUsage(
+            f"{command.get('command', 'a command')}: the source clip {place} must be in the "
+            f"project {project}, like the clips to edit"
+        )
     return {**command, "source": require_item(marey, place, [Kind.CLIP]).id}
 
 
@@ -239,7 +243,9 @@ def parse_command(text: str) -> dict[str, Any]:
     try:
         name, *assigned = shlex.split(text) or [""]
     except ValueError as error:
-        raise WrongUsage(f"{text!r}: {error}; write a command and its parameters, as in 'trim start=10'") from None
+        raise WrongUsage(
+            f"{text!r} cannot be read as a command ({error}); write a command and its parameters, as in 'trim start=10'"
+        ) from None
     if name not in COMMAND_MODELS:
         raise WrongUsage(f"there is no command {name!r}; the commands are {', '.join(COMMAND_MODELS)}")
     parameters = _parameters(COMMAND_MODELS[name])
@@ -247,7 +253,7 @@ def parse_command(text: str) -> dict[str, Any]:
     for assignment in assigned:
         key, equals, value = assignment.partition("=")
         if not equals:
-            raise WrongUsage(f"{name}: {assignment!r}: write parameter=value")
+            raise WrongUsage(f"{name}: {assignment!r} is not a parameter with a value; write parameter=value")
         if key not in parameters:
             raise WrongUsage(f"{name} has no parameter {key!r}; it has {', '.join(parameters) or 'none'}")
         command[key] = read_value(value, parameters[key])

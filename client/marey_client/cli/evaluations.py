@@ -68,7 +68,9 @@ def evaluate(
 
     addresses = addresses_in_one_project(sources)
     if out is not None and not wait:
-        raise WrongUsage("--out needs the result; remove --no-wait")
+        raise WrongUsage(
+            "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
+        )
     folder, _, last = addresses[0].path.rpartition("/")
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")
@@ -119,7 +121,7 @@ def report(
     if walk_graph is not None and walk_graph.suffix.lower() not in (".graphml", ".json"):
         raise WrongUsage(f"--walk-graph: {walk_graph} must end in .graphml or .json")
     if trial is not None and walk_graph is None:
-        raise WrongUsage("--trial selects the walks for --walk-graph; give --walk-graph as well")
+        raise WrongUsage("--trial has an effect only together with --walk-graph; give both")
     kinds = [Kind.EVALUATION, Kind.MODEL] if walk_graph is None else [Kind.EVALUATION]
     with connect(context) as marey:
         found = require_item(marey, Address.parse(place), kinds)
@@ -156,7 +158,10 @@ def _trim(marey: Marey, text: str) -> tuple[str, tuple[int, int]]:
     place, _, frames = text.rpartition("=")
     first, colon, stop = frames.partition(":")
     if not (place and colon and is_frame(first) and is_frame(stop)):
-        raise WrongUsage(f"{text!r}: write project/folder/clip=first:stop, as in lab/walks/take=120:900")
+        raise WrongUsage(
+            f"{text!r} is not a clip with a range of frames; write "
+            "project/folder/clip=first:stop, as in lab/walks/take=120:900"
+        )
     return require_item(marey, Address.parse(place), [Kind.CLIP]).id, (int(first), int(stop))
 
 

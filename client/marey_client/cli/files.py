@@ -160,7 +160,7 @@ def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:
 
     item = find_item(marey, address, list(Kind))
     if item is None and address.path:
-        raise WrongUsage(f"there is nothing at {address}; marey ls {address.project} shows what there is")
+        raise WrongUsage(f"there is no item or folder at {address}; `marey ls {address.project}` lists the project")
     return [] if item is None else [item]
 
 
@@ -307,7 +307,7 @@ def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
     if single is not None:
         return [single], single.item.collection
     if not below:
-        raise WrongUsage(f"there is no clip at {address}; marey ls {address.project} shows what there is")
+        raise WrongUsage(f"there is no clip at {address}; `marey ls {address.project}` lists the project")
     return below, address.path
 
 

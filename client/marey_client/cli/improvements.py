@@ -72,7 +72,9 @@ def compare(
 ) -> None:
     """Show what changed between two evaluations, trial by trial."""
     if out is not None and not wait:
-        raise WrongUsage("--out needs the result; remove --no-wait")
+        raise WrongUsage(
+            "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
+        )
     with connect(context) as marey:
         first, second = evaluation_at(marey, before), evaluation_at(marey, after)
         if first.project != second.project:
@@ -105,7 +107,10 @@ def suggest(
 ) -> None:
     """Find clips of an evaluated set that can be removed, and other clips that would fill its gaps."""
     if remove_out is not None and not wait:
-        raise WrongUsage("--remove-out needs the result; remove --no-wait")
+        raise WrongUsage(
+            "--remove-out writes a part of the result, but --no-wait does not wait for the "
+            "result; leave out one of them"
+        )
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.suggest_request(_places(marey, handle, candidates), **params)

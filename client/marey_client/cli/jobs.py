@@ -93,7 +93,9 @@ def submit_job(
         places: dict[str, list[Any]] = {}
         for role, place in map(assignment, inputs or ()):
             if role not in roles:
-                raise WrongUsage(f"{kind} has no input {role!r}; it has {', '.join(roles) or 'none'}")
+                raise WrongUsage(
+                    f"jobs of the kind {kind} have no input {role!r}; their inputs are {', '.join(roles) or 'none'}"
+                )
             places.setdefault(role, []).append(_input_at(marey, Address(project, place.strip("/")), roles[role]))
         wanted = JobCreate(
             kind=kind,
@@ -114,7 +116,7 @@ def submit_job(
 def _kind_of_job(marey: Marey, name: str) -> JobKind:
     kinds = {kind.name: kind for kind in marey.jobs.kinds()}
     if name not in kinds:
-        raise WrongUsage(f"{name!r} is not a kind of job of this server; the kinds are {', '.join(kinds)}")
+        raise WrongUsage(f"this server has no job kind {name!r}; its job kinds are {', '.join(kinds)}")
     return kinds[name]
 
 

@@ -83,7 +83,7 @@ def sample(
     if format not in SAMPLE_FORMATS:
         raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(SAMPLE_FORMATS)}")
     if into is not None and out is not None:
-        raise WrongUsage("--out writes files, --into creates clips; give only one of them")
+        raise WrongUsage("--out writes files and --into creates clips; give only one of the two")
     with connect(context) as marey:
         found = model_at(marey, place)
         if into is not None:

@@ -125,7 +125,7 @@ def tag(
 
     added, removed = tuple(add or ()), frozenset(remove or ())
     if not added and not removed:
-        raise WrongUsage("give tags with --add NAME or --remove NAME")
+        raise WrongUsage("no tags to change; give them with --add NAME or --remove NAME")
     ItemChange(tags=added)  # a tag that is none is told before anything changes
     with connect(context) as marey:
         things = [the_thing(marey, place, kind) for place in places]
@@ -167,7 +167,9 @@ def _named(things: Sequence[Thing]) -> str:
 def _ask(question: str) -> None:
     """Ask for confirmation. Raises `Refused` unless the answer is yes, and `WrongUsage` without a terminal."""
     if not sys.stdin.isatty():
-        raise WrongUsage(f"{question} there is no terminal to ask at: confirm with --yes")
+        raise WrongUsage(
+            f"{question} This needs a confirmation, but standard input is not a terminal; confirm with --yes"
+        )
     if not typer.confirm(question, err=True):
         print_message("nothing is removed")
         raise Refused

@@ -124,7 +124,10 @@ def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
         path, equals, value = text.partition("=")
         step, *names = path.split(".")
         if not equals or step not in STEPS or not all(names) or not names:
-            raise WrongUsage(f"{text!r}: write step.parameter=value, the step one of {', '.join(STEPS)}")
+            raise WrongUsage(
+                f"{text!r} does not set a parameter of a step; write step.parameter=value, where step "
+                f"is one of {', '.join(STEPS)}"
+            )
         _choose(chosen, (step, *names), json_or_text(value), f"--set {text}")
     return chosen
 
@@ -135,7 +138,7 @@ def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) 
     for depth, name in enumerate(path[:-1], start=1):
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
-            raise WrongUsage(f"{told} conflicts with --set {'.'.join(path[:depth])}={place}; give one of them")
+            raise WrongUsage(f"{told} conflicts with --set {'.'.join(path[:depth])}={place}; give only one of them")
     place[path[-1]] = value
 
 
@@ -146,7 +149,10 @@ def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[st
         if len({address.project for address in addresses}) > 1:
             raise WrongUsage("the takes must be in one project")
         if options:
-            raise WrongUsage("parameters of import apply to local files; name the project for them with --project")
+            raise WrongUsage(
+                "parameters of the import step apply only to local files; give --project, the "
+                "project that receives these files"
+            )
         return addresses[0].project, {"takes": [clips_at(marey, address) for address in addresses]}
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions

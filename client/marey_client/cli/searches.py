@@ -106,7 +106,10 @@ def search(
     if constraints:
         asked["constraints"] = constraints
     if not (asked.get("constraints") or asked.get("steps")):
-        raise WrongUsage("there are no constraints; give --at WHEN:JOINT=x,y,z or another constraint")
+        raise WrongUsage(
+            "a search needs at least one constraint; give --at WHEN:JOINT=x,y,z or another "
+            "option that adds a constraint"
+        )
     asked |= params
     if start is not None:
         asked["start"] = _start(start)
@@ -130,7 +133,7 @@ def _read_request(path: Path | None) -> dict[str, Any]:
         return {}
     read = read_json(path)
     if not isinstance(read, dict):
-        raise WrongUsage(f"{path}: a request must be a JSON object")
+        raise WrongUsage(f"the file {path} must contain the search request as a JSON object")
     return read
 
 
@@ -142,7 +145,7 @@ def _joint_constraints(
         place, _, values = text.partition("=")
         moment, colon, joint = place.rpartition(":")
         if not (colon and moment and joint and values):
-            raise WrongUsage(f"{text!r}: write WHEN:JOINT={','.join('wxyz'[-count:])}")
+            raise WrongUsage(f"{text!r} is not a constraint on a joint; write WHEN:JOINT={','.join('wxyz'[-count:])}")
         made.append({"joint": joint, **_constraint(kind, moment, field, _numbers(values, count, text), tolerance)})
     return made
 
@@ -154,7 +157,7 @@ def _body_constraints(
     for text in texts or ():
         moment, _, values = text.rpartition("=")
         if not (moment and values):
-            raise WrongUsage(f"{text!r}: write WHEN={'x,z' if count == 2 else 'number'}")
+            raise WrongUsage(f"{text!r} is not a time with its value; write WHEN={('x,z' if count == 2 else 'number')}")
         numbers = _numbers(values, count, text)
         made.append(_constraint(kind, moment, field, numbers if count > 1 else numbers[0], tolerance))
     return made
@@ -180,9 +183,9 @@ def _numbers(text: str, count: int, whole: str) -> list[float | None]:
     try:
         numbers = [None if part.strip() == "_" else float(part) for part in parts]
     except ValueError:
-        raise WrongUsage(f"{whole!r}: {text!r} is not {count} numbers") from None
+        raise WrongUsage(f"{whole!r}: {text!r} must be {count} numbers, separated by commas") from None
     if len(numbers) != count:
-        raise WrongUsage(f"{whole!r}: {len(numbers)} numbers instead of {count}")
+        raise WrongUsage(f"{whole!r} has {len(numbers)} numbers where {count} are needed")
     return numbers
 
 

@@ -74,7 +74,9 @@ def joint_axes(
         mapping = found.mapping()
         if twist or swing:
             if joint not in mapping.axes:
-                raise WrongUsage(f"{joint!r} has no axes; marey skeleton axes {place} shows the joints with axes")
+                raise WrongUsage(
+                    f"the joint {joint!r} has no axes; `marey skeleton axes {place}` lists the joints with axes"
+                )
             old = mapping.axes[joint]
             new = JointAxesDocument(twist=_vector(twist) or old.twist, swing=_vector(swing) or old.swing)
             mapping = mapping.model_copy(update={"axes": {**mapping.axes, joint: new}, "method": "manual"})
@@ -92,7 +94,7 @@ def _assigned(assignments: list[str], known: set[str]) -> dict[str, str]:
     for assignment in assignments:
         standard, equals, joint = assignment.partition("=")
         if not equals or not standard:
-            raise WrongUsage(f"{assignment!r}: write standard_joint=JointName")
+            raise WrongUsage(f"{assignment!r} does not map a joint; write standard_joint=JointName")
         if joint and joint not in known:
             raise WrongUsage(
                 f"{joint!r} is not a joint of this skeleton; its joints are {', '.join(sorted(known)[:8])}, ..."

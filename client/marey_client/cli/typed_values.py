@@ -138,7 +138,7 @@ def assignment(text: str) -> tuple[str, str]:
     """Return name and value of `name=value`. Raises `WrongUsage`."""
     name, equals, value = text.partition("=")
     if not equals or not name:
-        raise WrongUsage(f"{text!r}: write name=value")
+        raise WrongUsage(f"{text!r} is not a name with a value; write name=value")
     return name, value
 
 
@@ -179,7 +179,7 @@ def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str
     name, equals, value = text.rpartition("=")
     if not (name and equals) or (names is not None and name not in names):
         known = "" if names is None else f" with one of {', '.join(names)}"
-        raise WrongUsage(f"{text!r}: write name=number{known}")
+        raise WrongUsage(f"{text!r} is not a name with a number; write name=number{known}")
     return name, read_number(value, repr(text))
 
 
@@ -188,7 +188,10 @@ def read_numbers(text: str, most: int | None = None) -> list[float]:
     try:
         numbers = [float(part) for part in text.replace(",", ":").split(":")]
     except ValueError:
-        raise WrongUsage(f"{text!r}: write first:last:step, as in 1:3:0.25, or values, as in 1,1.5,2") from None
+        raise WrongUsage(
+            f"{text!r} is not a list of numbers; write a range first:last:step, as in 1:3:0.25, "
+            "or values, as in 1,1.5,2"
+        ) from None
     if not all(map(isfinite, numbers)):
         raise WrongUsage(f"{text!r}: all values must be finite")
     if ":" not in text:
@@ -224,7 +227,7 @@ def _read(file: str) -> bytes:
         if file != STANDARD_INPUT:
             return Path(file).read_bytes()
         if sys.stdin is None:
-            raise WrongUsage("standard input is closed")
+            raise WrongUsage("the command should read standard input, but standard input is closed")
         return sys.stdin.buffer.read()
     except OSError as error:
         raise WrongUsage(f"{_named(file)} cannot be read: {error.strerror or error}") from None

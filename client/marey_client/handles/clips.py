@@ -109,8 +109,13 @@ def frames_text(frames: slice | None) -> str | None:
     if frames is None:
         return None
     if frames.step not in (None, 1):
-        raise ValueError(f"frames: a step of {frames.step} is not possible; slice the arrays instead")
+        raise ValueError(
+            f"frames: only ranges with a step of 1 can be requested, not {frames.step}; request "
+            "the range, then take every n-th frame of the arrays"
+        )
     bounds: tuple[Any, Any] = (frames.start, frames.stop)
     if any(bound is not None and bound < 0 for bound in bounds):
-        raise ValueError("frames are counted from the start; negative bounds are not possible")
+        raise ValueError(
+            "frames: negative bounds are not possible, because frames are counted from the start of the clip"
+        )
     return ":".join("" if bound is None else str(bound) for bound in bounds)

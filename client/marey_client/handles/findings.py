@@ -39,5 +39,5 @@ class Findings:
     def _blob(self, name: str) -> str:
         result = self.job.result or {}
         if name not in result:
-            raise LookupError(f"job {self.job.id} made no {name}")
+            raise LookupError(f"the result of the job {self.job.id} has no {name}")
         return str(result[name]["blob"])

@@ -109,14 +109,18 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
         repeated; the error names the example
     """
     if not examples:
-        raise MotionError("there are no aligned clips", code="too-few-clips")
+        raise MotionError("a set of aligned clips needs at least one clip", code="too-few-clips")
     clips = sorted((_example(one) for one in examples), key=lambda clip: (clip.name, clip.uid))
     first = examples[0]
     for one in examples[1:]:
         _require_same_set(first, one)
     for before, after in pairwise(clips):
         if before.uid == after.uid:
-            raise MotionError("the set contains this clip twice; remove one", code="sets-differ", where=after.name)
+            raise MotionError(
+                "the set of clips contains this clip twice; leave one of the two out",
+                code="sets-differ",
+                where=after.name,
+            )
     reference = first.info.get("reference")
     return AlignedSet(
         skeleton=first.clip.skeleton,
@@ -181,7 +185,7 @@ def _require_same_set(first: StoredExample, one: StoredExample) -> None:
     name = str(one.info.get("name") or one.uid)
     if one.clip.skeleton.joint_names != first.clip.skeleton.joint_names:
         raise MotionError(
-            "the clip has another skeleton than the other clips; retarget it first",
+            "the clip has a different skeleton from the other clips; retarget it first",
             code="skeleton-mismatch",
             where=name,
         )

@@ -180,7 +180,7 @@ class _Aligning:
     def _require_options(self, clips: Sequence[SourceExample]) -> None:
         repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]
         if repeated:
-            raise MotionError("two examples have this uid; uids must be unique", where=repeated[0])
+            raise MotionError("two examples have this uid; give each example a uid of its own", where=repeated[0])
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
             raise MotionError("the reference is not one of the clips to align", code="unknown-reference", where=wanted)
@@ -191,8 +191,8 @@ class _Aligning:
         if size > MOST_JOINT_FRAMES:
             raise MotionError(
                 f"{len(clips)} clips with {frames:,.0f} frames of {self._body.skeleton.joint_count} joints at "
-                f"{rate_hz:g} Hz are too much to align at once: {size / MOST_JOINT_FRAMES:.1f} times the limit; "
-                "use fewer clips or a lower rate",
+                f"{rate_hz:g} Hz are {size / MOST_JOINT_FRAMES:.1f} times as much data as can be aligned at "
+                "once; use fewer clips or a lower frame rate",
                 code="too-much",
             )
 
@@ -226,20 +226,20 @@ class _Aligning:
             return rates[self._options.reference]
         counts = Counter(rates.values())
         if not counts:
-            raise MotionError("there are no clips to align", code="too-few-clips")
+            raise MotionError("alignment needs clips, but none were given", code="too-few-clips")
         return min(counts, key=lambda rate: (-counts[rate], rate))
 
     def _prepare(self, example: SourceExample, rate_hz: float) -> _Prepared:
         clip, skeleton = example.clip, self._body.skeleton
         if not same_hierarchy(clip.skeleton, skeleton, tolerance_m=SAME_OFFSET_M):
             raise MotionError(
-                "the clip has another skeleton than the other clips; retarget it first", code="skeleton-mismatch"
+                "the clip has a different skeleton from the other clips; retarget it first", code="skeleton-mismatch"
             )
         for cut in example.cuts:
             if not 0 <= cut.frame < clip.frame_count:
                 shown = ", ".join(cut.labels)
                 raise MotionError(
-                    f"the frame is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
+                    f"the cut is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
                     code="outside-clip",
                     where=f"{shown}, frame {cut.frame}",
                 )
@@ -247,7 +247,8 @@ class _Aligning:
         frames = motion.frame_count
         if not LEAST_FRAMES <= frames <= MOST_FRAMES:
             raise MotionError(
-                f"the clip has {frames} frames at {rate_hz:g} Hz; {LEAST_FRAMES} to {MOST_FRAMES} can be aligned",
+                f"the clip has {frames} frames at {rate_hz:g} Hz; a clip to align must have {LEAST_FRAMES} to "
+                f"{MOST_FRAMES} frames",
                 code="too-short" if frames < LEAST_FRAMES else "too-long",
             )
         sections = sections_of(example.cuts, frames, rate_ratio=rate_hz / clip.frame_rate_hz)

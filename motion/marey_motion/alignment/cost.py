@@ -64,7 +64,8 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     options = options or CostOptions()
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"both motions need shape (frames, points, 3) with equally many points, not {a.shape} and {b.shape}"
+            "both motions must have the shape (frames, points, 3) with the same number of points; their "
+            f"shapes are {a.shape} and {b.shape}"
         )
     return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 
@@ -88,7 +89,9 @@ def cost_points(points: Floats, options: CostOptions, weights: ArrayLike | None 
     """
     columns = np.array(points.transpose(1, 2, 0), dtype=np.float64, order="C")
     if not np.isfinite(columns).all():
-        raise MotionError("positions must be finite", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}")
+        raise MotionError(
+            "a position is infinite or not a number", where=f"frame {int(np.argwhere(~np.isfinite(points))[0, 0])}"
+        )
     shares = _shares(weights, points.shape[1])
     window = options.window
     if window > 1:
@@ -135,9 +138,12 @@ def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
 def _shares(weights: ArrayLike | None, count: int) -> Floats:
     given = np.ones(count) if weights is None else np.asarray(weights, dtype=np.float64)
     if given.shape != (count,):
-        raise MotionError(f"weights of shape {given.shape}; {count} points need one weight each", where="weights")
+        raise MotionError(
+            f"the weights have the shape {given.shape}, but one weight for each of {count} points is needed",
+            where="weights",
+        )
     if not (np.isfinite(given).all() and (given >= 0).all() and given.sum() > 0):
-        raise MotionError("weights are finite, not negative, and not all zero", where="weights")
+        raise MotionError("weights must be finite and at least 0, and one must be above 0", where="weights")
     return np.asarray(given / given.sum())
 
 

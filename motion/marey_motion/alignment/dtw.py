@@ -62,8 +62,8 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
         total, length = kernels.align_limited(matrix, max_run, longest)
     if not np.isfinite(total):
         raise MotionError(
-            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames if at most {max_run} consecutive "
-            "steps may advance only one motion; allow more",
+            f"{len(matrix)} frames cannot be aligned with {matrix.shape[1]} frames when at most {max_run} "
+            "consecutive steps may advance only one of the motions; allow more such steps",
             code="alignment-impossible",
             where="max_run",
         )
@@ -91,12 +91,19 @@ def least_total(costs: Floats, *, max_run: int | None = None) -> float:
 def _checked(costs: ArrayLike, max_run: int | None) -> Floats:
     matrix = np.ascontiguousarray(costs, dtype=np.float64)
     if matrix.ndim != 2 or not matrix.size:
-        raise MotionError(f"costs must be a matrix with at least one row and column, not of shape {matrix.shape}")
+        raise MotionError(
+            f"the costs must be a matrix with at least one row and one column, but have the shape {matrix.shape}"
+        )
     # Least and greatest are found without a matrix of answers, which would take longer than the alignment.
     if not (np.isfinite(matrix.min()) and np.isfinite(matrix.max())):
-        raise MotionError("costs must be finite", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}")
+        raise MotionError(
+            "a cost is infinite or not a number", where=f"cell {np.argwhere(~np.isfinite(matrix))[0].tolist()}"
+        )
     if max_run is not None and not 0 <= max_run <= 60:
-        raise MotionError(f"the number of consecutive steps must be 0 to 60, not {max_run}", where="max_run")
+        raise MotionError(
+            f"the number of consecutive steps that advance only one motion must be 0 to 60, not {max_run}",
+            where="max_run",
+        )
     return matrix
 
 
@@ -223,6 +230,7 @@ def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, F
     """Lay out the points of two motions with frames as the first axis of one and the last axis of the other."""
     if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
         raise MotionError(
-            f"both motions need shape (frames, points, 3) with equally many points, not {a.shape} and {b.shape}"
+            "both motions must have the shape (frames, points, 3) with the same number of points; their "
+            f"shapes are {a.shape} and {b.shape}"
         )
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

@@ -75,7 +75,8 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "numbering repeated labels gives two labels this name; rename one of them",
+            "a repeated label gets a number, and another label already has the resulting name; rename one of "
+            "the two labels",
             code="label-repeats",
             where=repeated[0],
         )
@@ -105,7 +106,8 @@ def sections_of(cuts: Sequence[Cut], frame_count: int, *, rate_ratio: float = 1.
         frame = min(round(cut.frame * rate_ratio), last)
         if bounds.get(frame):
             raise AnnotationError(
-                f"the cut is on the same frame as {', '.join(bounds[frame])}; a section needs two frames",
+                f"the cut is on the same frame as {', '.join(bounds[frame])}, but the section between two "
+                "cuts needs at least two frames; move one cut",
                 code="section-too-short",
                 where=", ".join(cut.labels),
             )
@@ -143,8 +145,8 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
     """
     if own != common:
         raise AnnotationError(
-            f"the clip has the cuts {_shown(own)}, the others have {_shown(common)}: all clips need the same labels "
-            "in the same order",
+            f"the annotation cuts the clip at {_shown(own)}, but the other clips at {_shown(common)}; all "
+            "annotations need the same labels in the same order",
             code="labels-differ",
         )
 

@@ -67,8 +67,8 @@ def _with_least_slope(times: Floats) -> Floats:
     spare = times[-1] - times[0] - least * len(steps)
     if spare < 0:
         raise MotionError(
-            f"{len(times)} frames cannot be aligned with {times[-1] - times[0]:g} frames of the source: the time "
-            f"function would be flatter than {LEAST_SLOPE:g}; use a longer source",
+            f"{len(times)} frames cannot be aligned with {times[-1] - times[0]:g} frames of the source clip: "
+            f"the slope of the time function would be below {LEAST_SLOPE:g}; use a longer source clip",
             code="alignment-impossible",
         )
     # Projection onto the simplex of steps above the least one (Held, Wolfe and Crowder 1974).

@@ -46,6 +46,6 @@ class ComputeBudget:
         self.left -= work
         if self.left < 0.0:
             raise EditError(
-                "the edit takes more computing time than allowed; use fewer frames or constraints",
+                "the edit needs more computing time than one edit may use; use fewer frames or fewer constraints",
                 code="edit-too-long",
             )

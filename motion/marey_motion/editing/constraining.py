@@ -148,8 +148,8 @@ def _check_range(constraint: Constraint, number: int, frames: int) -> None:
         )
     if len(constraint.target.values) not in (1, stop - start):
         raise EditError(
-            f"the target has {len(constraint.target.values)} values for {stop - start} frames; one value, or one per "
-            "frame, is needed",
+            f"the target has {len(constraint.target.values)} values for {stop - start} frames; give one "
+            "value, or one per frame",
             where=f"constraints[{number}]",
         )
 

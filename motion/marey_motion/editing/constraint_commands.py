@@ -138,7 +138,9 @@ class _Rig:
         """Return the axes of a joint. Raises `MappingError` if the joint is not mapped."""
         name = self.take.skeleton.joint_names[joint]
         if name not in self.axes:
-            raise MappingError("the mapping does not name this joint, so its axes are unknown", where=name)
+            raise MappingError(
+                "the axes of this joint are unknown, because the joint mapping does not contain it", where=name
+            )
         return self.axes[name]
 
     def axes_if_known(self) -> dict[str, JointAxes] | None:

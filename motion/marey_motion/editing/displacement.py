@@ -118,7 +118,7 @@ def _check_windows(frames: AnyInts, windows: Sequence[Window]) -> None:
             raise EditError(f"the window {window.start}:{window.stop} contains no changed frame", where="windows")
         inside |= held
     if not inside.all():
-        raise EditError(f"the changed frame {int(frames[~inside][0])} is not inside any window", where="windows")
+        raise EditError(f"the changed frame {int(frames[~inside][0])} is in none of the windows", where="windows")
 
 
 def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Floats:

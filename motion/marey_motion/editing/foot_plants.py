@@ -111,8 +111,8 @@ def plant_feet(
     for one in contacts:
         if len(one.toe) != motion.frame_count or len(one.heel) != motion.frame_count:
             raise EditError(
-                f"the contacts have {len(one.toe)} and {len(one.heel)} flags (toe, heel), but the motion has "
-                f"{motion.frame_count} frames",
+                f"the contacts have {len(one.toe)} flags for the toe and {len(one.heel)} for the heel; both "
+                f"must have one flag for each of the motion's {motion.frame_count} frames",
                 where="contacts",
             )
     blend = max(1, round(options.blend_s * frame_rate_hz))

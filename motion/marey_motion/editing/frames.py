@@ -61,8 +61,8 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
     for before, after in pairwise(bounds):
         if after <= before:
             raise EditError(
-                f"cuts at {', '.join(map(str, command.at))} leave a piece without frames; cuts increase, from 1 to "
-                f"{take.frame_count - 1}",
+                f"cuts at {', '.join(map(str, command.at))} would leave a piece without frames; cuts must be "
+                f"in increasing order, from 1 to {take.frame_count - 1}",
                 code="frames-missing",
                 where="at",
             )
@@ -111,7 +111,9 @@ def _same_rate(take: Take, source: str) -> Take:
     clip = take.source(source)
     if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
         raise EditError(
-            f"the clip {source} has another skeleton; retarget it first", code="other-skeleton", where="source"
+            f"the source clip {source} has a different skeleton from the edited clip; retarget it first",
+            code="other-skeleton",
+            where="source",
         )
     count = count_samples(clip.frame_count, clip.frame_rate_hz, take.frame_rate_hz)
     take.require_room(take.frame_count + count)

@@ -66,7 +66,8 @@ def _same_joints(target: Skeleton, source: Skeleton, joints: Sequence[int]) -> l
     odd = np.flatnonzero(apart > SAME_AXES_RAD)
     if odd.size:
         raise EditError(
-            "the joint's orientation in the rest pose differs between the two skeletons; retarget the source first",
+            "the joint has different orientations in the rest poses of the two skeletons; retarget the "
+            "source clip first",
             code="other-axes",
             where=f"joint {target.joint_names[joints[int(odd[0])]]}",
         )

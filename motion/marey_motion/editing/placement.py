@@ -300,7 +300,7 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
     start, stop = take.frames(command.frames)
     if stop - start < 2:
         raise EditError(
-            f"the range must have at least 2 frames to spread the drift over, but {start}:{stop} has one",
+            f"the drift is spread over a range of at least 2 frames, but the range {start}:{stop} has only one",
             code="frames-missing",
             where="frames",
         )

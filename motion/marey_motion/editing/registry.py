@@ -148,7 +148,10 @@ def apply_edit(clip: Clip, commands: Sequence[AnyCommand], **given: Any) -> Clip
     """
     edited = edit_clip(clip, commands, **given)
     if len(edited) > 1:
-        raise EditError(f"the commands return {len(edited)} clips instead of one; use edit_clip", code="several-clips")
+        raise EditError(
+            f"the commands split the clip into {len(edited)} clips, but a single clip was requested; use edit_clip",
+            code="several-clips",
+        )
     return edited[0].clip
 
 

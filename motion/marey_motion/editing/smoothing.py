@@ -103,7 +103,8 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
     if lengths.size and lengths.min() < LEAST_LENGTH:
         frame, joint = np.unravel_index(int(np.argmin(lengths)), lengths.shape)
         raise EditError(
-            f"around frame {frame} the joint turns a full circle within the window; choose a shorter window",
+            f"the joint turns by a full circle within one smoothing window, around frame {frame}; choose a "
+            "shorter window",
             code="window-too-long",
             where=f"joint {take.skeleton.joint_names[joints[int(joint)]]}",
         )

@@ -168,7 +168,11 @@ class Take:
         """
         if name not in self.sources:
             known = ", ".join(sorted(self.sources)) or "none"
-            raise EditError(f"no source is called {name!r}; known are: {known}", code="source-missing", where="source")
+            raise EditError(
+                f"no source clip is called {name!r}; the source clips are: {known}",
+                code="source-missing",
+                where="source",
+            )
         return self.sources[name]
 
     def frames(self, bounds: tuple[int, int | None] | None) -> tuple[int, int]:
@@ -240,7 +244,7 @@ class Take:
         most = self.most_numbers // width
         if frames > most:
             raise EditError(
-                f"the result would have {frames:,} frames; the limit for this skeleton is {most:,}",
+                f"the edited clip would have {frames:,} frames; with this skeleton a clip may have at most {most:,}",
                 code="edit-too-large",
             )
         self.budget.spend(PER_NUMBER * width * frames)
@@ -311,4 +315,7 @@ def require_finite(numbers: Floats) -> None:
     """
     if not np.isfinite(numbers).all():
         frame = int(np.argmin(np.isfinite(numbers.reshape(len(numbers), -1)).all(axis=1)))
-        raise EditError(f"the result contains a number in frame {frame} that is not finite", code="edit-not-finite")
+        raise EditError(
+            f"frame {frame} of the edited motion contains a number that is not finite (infinite or NaN)",
+            code="edit-not-finite",
+        )

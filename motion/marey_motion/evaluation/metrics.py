@@ -81,8 +81,8 @@ def trial_series(trial: Trial, reference: Reference, record: TrialRecord) -> Tri
     ticks, rate = len(record.rows), record.rate_hz
     if ticks != reference.tick_count or rate != reference.rate_hz:
         raise MotionError(
-            f"the record has {ticks} ticks at {rate:g} Hz, but its reference has {reference.tick_count} ticks at "
-            f"{reference.rate_hz:g} Hz",
+            f"the record of the trial has {ticks} ticks at {rate:g} Hz, but the reference trajectory has "
+            f"{reference.tick_count} ticks at {reference.rate_hz:g} Hz",
             where=trial.name,
         )
     steps = np.diff(record.positions, axis=0)

@@ -97,7 +97,10 @@ class OnlineCoverage:
             )
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:
-            raise MotionError(f"the shape must be {shape} as in the grid, not {self._before.shape}", where="seconds")
+            raise MotionError(
+                f"the seconds per cell must have the shape {shape} of the grid, not {self._before.shape}",
+                where="seconds",
+            )
         self._live = LiveWindows(rate_hz)
         self.counts = np.zeros(shape, dtype=np.int64)
         self.frame_count = 0
@@ -144,7 +147,9 @@ class OnlineCoverage:
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(
-                f"{len(headings)} headings do not match positions of shape {positions.shape}", where="roots"
+                f"each position needs one heading, but there are {len(headings)} headings and positions of "
+                f"shape {positions.shape}",
+                where="roots",
             )
         _require_near(positions)
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
@@ -273,7 +278,7 @@ class OnlineCoverage:
 
 def _require_near(positions: Floats) -> None:
     if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
-        raise MotionError(f"a frame is more than {FARTHEST_M:g} m from the origin", where="positions")
+        raise MotionError(f"the position in a frame is more than {FARTHEST_M:g} m from the origin", where="positions")
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:

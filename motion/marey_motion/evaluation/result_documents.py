@@ -160,8 +160,8 @@ def records_to_tree(trials: Sequence[Trial], records: Sequence[TrialRecord]) -> 
     rates = {record.rate_hz for record in records}
     if len(trials) != len(records) or len(rates) != 1:
         raise MotionError(
-            f"one record per trial at one rate is needed, but there are {len(records)} records at the rates "
-            f"{sorted(rates)} for {len(trials)} trials"
+            f"each trial needs one record, and all records need the same rate; there are {len(records)} "
+            f"records at the rates {sorted(rates)} for {len(trials)} trials"
         )
     return {
         "schema": RECORDS_SCHEMA,

@@ -134,7 +134,7 @@ def require_names(trials: Iterable[Trial]) -> None:
     for trial in trials:
         if trial.name in seen:
             raise MotionError(
-                f"two trials are called {trial.name}; each needs a name of its own, since records are found by it",
+                f"two trials are called {trial.name}; give each trial a name of its own",
                 where="grid",
             )
         seen.add(trial.name)
@@ -160,8 +160,8 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
     if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
         raise MotionError(
-            f"a trial with an approach of {trial.approach_s:g} s and a duration of {trial.duration_s:g} s has no ticks "
-            f"at {rate_hz:g} Hz",
+            f"a trial with an approach of {trial.approach_s:g} s and a duration of {trial.duration_s:g} s is "
+            f"too short: it has no ticks at {rate_hz:g} Hz",
             where=trial.name,
         )
     if trial.family == "switching" and not trial.switch_every_s > 0.0:

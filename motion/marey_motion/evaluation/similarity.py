@@ -101,7 +101,7 @@ def measure_similarity(
     filled = np.unique(cells[cells >= 0])
     for done, cell in enumerate(filled.tolist()):
         if cancelled is not None and cancelled():
-            raise EvaluationCancelled(f"stopped with {done} of {len(filled)} cells compared")
+            raise EvaluationCancelled(f"the comparison of grid cells was stopped after {done} of {len(filled)} cells")
         own, place = rows[cells == cell], divmod(cell, shape[1])
         chosen = every_kth(own, most_frames)
         found = nearest_poses(database.pose_points[chosen], groups[chosen], database.pose_points[own], groups[own])

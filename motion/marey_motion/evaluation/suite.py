@@ -146,7 +146,9 @@ def _run_ahead(
                 trial = waiting.pop()
                 running[pool.submit(run, trial)] = trial
             if stopping and not running:
-                raise EvaluationCancelled(f"stopped with {len(waiting)} of {len(trials)} trials not begun")
+                raise EvaluationCancelled(
+                    f"the evaluation was stopped before {len(waiting)} of {len(trials)} trials had begun"
+                )
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in sorted(ended, key=lambda one: running[one].name):
                 keep(running.pop(future), future.result())
@@ -330,7 +332,11 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
     """
     clips, notes = baseline_clips(options)
     if not clips:
-        raise MotionError("no clip can be generated for any speed and turn rate of the grid", where="grid")
+        raise MotionError(
+            "the generator cannot walk at any speed and turn rate of the grid; choose slower "
+            "speeds or lower turn rates",
+            where="grid",
+        )
     skeleton = clips[0].clip.skeleton
     body = MatchingBody.from_mapping(skeleton, map_joints(skeleton))
     return build_database(clips, body, options.database.replace(mirroring="none")), notes

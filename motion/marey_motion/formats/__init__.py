@@ -146,7 +146,9 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
     [b'HIERARCHY', b'ROOT Hips']
     """
     if file_format not in MOTION_FORMATS:
-        raise UnknownFormat(f"there is no writer for {file_format!r}; choose one of {', '.join(MOTION_FORMATS)}")
+        raise UnknownFormat(
+            f"files of the format {file_format!r} cannot be written; choose one of {', '.join(MOTION_FORMATS)}"
+        )
     written: bytes = _function("write", file_format)(clip, **options)
     return written
 

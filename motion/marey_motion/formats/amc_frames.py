@@ -253,7 +253,7 @@ def _fail(
     missing = skeleton.bones[int(np.argmax(moving & (seen < state[_FRAME])))]
     at_end = not lines.data[state[_POSITION] :].strip()
     raise lines.error(
-        f"frame {state[_NUMBER]} lacks this bone" + ("; the file is cut off" if at_end else ""),
+        f"frame {state[_NUMBER]} has no line for this bone" + ("; the file is cut off" if at_end else ""),
         code="file-truncated" if at_end else "frame-width",
         joint=missing.name,
     )

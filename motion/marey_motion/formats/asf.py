@@ -209,7 +209,7 @@ class _AsfReader:
         elif words[0].lower() == b"angle":
             degrees = _IN_DEGREES.get(b" ".join(words[1:]).lower())
             if degrees is None:
-                raise self.lines.error("angle must be deg or rad")
+                raise self.lines.error("the unit `angle` must be deg or rad")
             self.degrees = degrees
 
     def _root(self, words: list[bytes]) -> None:
@@ -228,7 +228,7 @@ class _AsfReader:
         if keyword == b"begin":
             self.bone = Bone("", self.lines.number)
         elif bone is None:
-            raise self.lines.error(f"{excerpt(words[0])!r} must be between begin and end")
+            raise self.lines.error(f"the word {excerpt(words[0])!r} must come between begin and end")
         elif keyword == b"end":
             self._end_bone(bone)
         elif keyword == b"name":
@@ -256,7 +256,11 @@ class _AsfReader:
         if bone.direction is None:
             raise self.lines.error("the bone has no direction; add a line 'direction x y z'", joint=bone.name)
         if len(self.bones) + 1 == MAX_JOINTS:
-            raise FormatLimit(f"more than {MAX_JOINTS} bones", file=self.lines.file, line=self.lines.number)
+            raise FormatLimit(
+                f"the file has more than {MAX_JOINTS} bones, the most that are accepted",
+                file=self.lines.file,
+                line=self.lines.number,
+            )
         self.bones[bone.name] = bone
         self.bone = None
 
@@ -266,7 +270,9 @@ class _AsfReader:
         parent, *children = map(decode_name, words)
         for name in (parent, *children):
             if name != ROOT and name not in self.bones:
-                raise self.lines.error("the hierarchy names a bone that :bonedata does not have", joint=name)
+                raise self.lines.error(
+                    "the section :hierarchy names this bone, but :bonedata does not define it", joint=name
+                )
         self.children.setdefault(parent, []).extend(children)
 
     def _channels(self, words: list[bytes], joint: str) -> tuple[str, ...]:
@@ -275,7 +281,8 @@ class _AsfReader:
             words
         ):
             raise self.lines.error(
-                f"{excerpt(b' '.join(words))!r} must be distinct names from TX TY TZ RX RY RZ", joint=joint
+                f"the channels {excerpt(b' '.join(words))!r} must be different names out of TX TY TZ RX RY RZ",
+                joint=joint,
             )
         return channels
 
@@ -303,14 +310,14 @@ class _AsfReader:
         while waiting:
             name, parent = waiting.pop()
             if name in placed:
-                raise self.lines.error("the hierarchy gives the bone two parents", joint=name)
+                raise self.lines.error("the section :hierarchy gives this bone two parents", joint=name)
             placed.add(name)
             waiting.extend((child, len(bones)) for child in reversed(self.children.get(name, ())))
             bones.append(self.root if name == ROOT else self.bones[name])
             parents.append(parent)
         loose = next((name for name in self.bones if name not in placed), None)
         if loose is not None:
-            raise self.lines.error("the hierarchy does not connect the bone to the root", joint=loose)
+            raise self.lines.error("the section :hierarchy does not connect this bone to the root", joint=loose)
         return AsfSkeleton(
             bones, np.array(parents, np.int32), self.length_unit, self.degrees, np.array(self.root_position)
         )

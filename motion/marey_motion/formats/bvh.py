@@ -133,7 +133,7 @@ def _read_frames(
         lines.number = table.ragged_line
         cut = table.ragged_line == table.last_line and table.ragged_count < width
         raise lines.error(
-            f"the line has {counted(table.ragged_count, 'value')}, but the channels need {width}"
+            f"the line has {counted(table.ragged_count, 'value')}, but the file declares {width} channels"
             + ("; the file is cut off in its last line" if cut else ""),
             code="file-truncated" if cut else "frame-width",
         )

@@ -213,7 +213,7 @@ class _HierarchyReader:
     def _checked(self) -> BvhHeader:
         for name, offset in zip(self.header.names, self.header.offsets, strict=True):
             if offset is None:
-                raise self.lines.error("the joint has no OFFSET", joint=name)
+                raise self.lines.error("the joint has no OFFSET; add a line with its three numbers", joint=name)
         return self.header
 
 

@@ -62,7 +62,10 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
         if len(turns) == 3:
             rotation_order = "".join(turns)
     if sorted(rotation_order.lower()) != ["x", "y", "z"]:
-        raise FormatError(f"the rotation order {rotation_order!r} is not an order of x, y and z", code="rotation-order")
+        raise FormatError(
+            f"the rotation order {rotation_order!r} must contain x, y and z once each, such as 'zxy'",
+            code="rotation-order",
+        )
     return ["xyz".index(axis) for axis in rotation_order.lower()]
 
 
@@ -141,7 +144,7 @@ def format_table(values: NDArray[np.float64]) -> bytes:
     """
     largest = float(np.abs(values).max(initial=0.0))
     if not largest < _LARGEST:
-        raise FormatError(f"a value of {largest:.3g} does not fit a BVH file", code="value-range")
+        raise FormatError(f"the value {largest:.3g} is too large to be written to a BVH file", code="value-range")
     widest = len(str(int(largest))) + _DECIMALS + 3
     text = np.empty(values.size * widest, np.uint8)
     return text[: _format(values, text)].tobytes()

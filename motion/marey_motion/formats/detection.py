@@ -58,14 +58,14 @@ def detect_format(data: bytes, name: str) -> FileFormat:
     foreign = next((kind for mark, kind in _FOREIGN.items() if data.startswith(mark)), None)
     if foreign:
         raise UnknownFormat(
-            f"{foreign}, for which there is no reader; export the motion as BVH", code="reader-absent", file=name
+            f"{foreign}, a format that cannot be imported; convert the motion to BVH", code="reader-absent", file=name
         )
     found = next((one for one in FORMATS if one.begins is not None and one.begins.search(start)), named)
     if found is None:
         endings = sorted({ending for one in IMPORTED for ending in one.endings + one.other_endings})
         raise UnknownFormat(
-            f"no reader knows this file, which begins with {excerpt(data[:16])!r}; "
-            f"known endings are {', '.join(endings)}",
+            f"the format of this file, which begins with {excerpt(data[:16])!r}, is not known; files with "
+            f"these endings can be imported: {', '.join(endings)}",
             file=name,
         )
     return found

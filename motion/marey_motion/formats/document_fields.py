@@ -83,7 +83,9 @@ def number_list(document: Any, name: str, count: int, file: str, joint: str | No
     numbers = number_array(values, file, name, joint)
     if numbers.shape != (count,):
         raise FormatError(
-            f"field {name!r} has shape {numbers.shape}, {count} numbers are needed", file=file, joint=joint
+            f"field {name!r} has the shape {numbers.shape}, but must be a list of {count} numbers",
+            file=file,
+            joint=joint,
         )
     return numbers
 
@@ -109,13 +111,13 @@ def number_array(values: Any, file: str, name: str, joint: str | None = None) ->
     try:
         array = np.array(values)
         if array.dtype.kind not in "iuf":
-            raise ValueError(f"{array.dtype} is not a type of number")
+            raise ValueError(f"the values are of the type {array.dtype}, not numbers")
         numbers = array.astype(np.float64)
     except (ValueError, TypeError, OverflowError) as error:
         message = f"field {name!r} must hold numbers in rows of equal length"
         raise FormatError(message, code="bad-number", file=file, joint=joint) from error
     if not np.isfinite(numbers).all():
         raise FormatError(
-            f"field {name!r} holds numbers that are not finite", code="bad-number", file=file, joint=joint
+            f"field {name!r} contains numbers that are not finite", code="bad-number", file=file, joint=joint
         )
     return numbers

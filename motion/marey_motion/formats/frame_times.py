@@ -42,7 +42,10 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     FormatError    if the frame time gives no valid rate; the error names the option that sets the rate
     """
     if frame_time_s is None:
-        raise _no_rate("the file has no Frame Time", file)
+        raise _no_rate(
+            "the file declares no Frame Time",
+            file,
+        )
     if LONGEST_FRAME_TIME_S < frame_time_s < float("inf"):
         reason = f"a Frame Time of {frame_time_s:g} s is too long; it looks like a frame rate, or like milliseconds"
         raise _no_rate(reason, file)

@@ -173,12 +173,12 @@ def _array(arrays: dict[str, NDArray[Any]], name: str, kind: str, shape: tuple[i
     array = arrays[name]
     if array.dtype.kind != kind or array.shape != shape:
         raise FormatError(
-            f"member {name!r} is {array.dtype} of shape {array.shape}; "
-            f"{'integers' if kind == 'i' else 'floating point numbers'} of shape {shape} are needed",
+            f"member {name!r} has the type {array.dtype} and the shape {array.shape}, but must have "
+            f"{('integers' if kind == 'i' else 'floating point numbers')} in the shape {shape}",
             file=file,
         )
     if kind == "f" and not np.isfinite(array).all():
-        raise FormatError(f"member {name!r} holds numbers that are not finite", code="bad-number", file=file)
+        raise FormatError(f"member {name!r} contains numbers that are not finite", code="bad-number", file=file)
     return array
 
 

@@ -41,7 +41,8 @@ def as_rotations(
     if wrong.any():
         frame, joint = (int(index) for index in np.argwhere(wrong)[0])
         raise FormatError(
-            f"frame {frame} has {values[frame, joint].tolist()}, which is not a rotation",
+            f"frame {frame} contains {values[frame, joint].tolist()}, which is not a rotation; "
+            "a quaternion must be finite and not zero",
             code="bad-number",
             file=file,
             joint=joint_names[joint],

@@ -187,7 +187,8 @@ def _pelvis_heights(
         if squared.min() <= 0.0:
             moment = moments.times_s[np.argmin(squared)]
             raise MotionError(
-                f"at {moment:.2f} s a step is longer than the leg of {leg:.2f} m; go slower or turn less",
+                f"at {moment:.2f} s, a step would be longer than the leg of {leg:.2f} m; use a slower speed "
+                "or a lower turn rate",
                 code="gait-out-of-reach",
                 where="speed_m_s",
             )

@@ -41,10 +41,14 @@ class PathSegment:
             if not np.isfinite(value):
                 raise MotionError(f"{value} is not a finite number", code="gait-invalid", where=field)
         if self.duration_s <= 0:
-            raise MotionError(f"{self.duration_s} s must be positive", code="gait-invalid", where="duration_s")
+            raise MotionError(
+                f"the duration of a segment must be positive, not {self.duration_s} s",
+                code="gait-invalid",
+                where="duration_s",
+            )
         if min(self.speed_m_s, self.final_speed_m_s) < 0:
             raise MotionError(
-                "a speed cannot be negative; set travel_angle_rad to π to go backward",
+                "a speed cannot be negative; to walk backward, set travel_angle_rad to π",
                 code="gait-invalid",
                 where="speed_m_s",
             )
@@ -101,7 +105,7 @@ class RootPath:
     def __post_init__(self) -> None:
         object.__setattr__(self, "segments", tuple(self.segments))
         if not self.segments:
-            raise MotionError("a path needs at least one segment", code="gait-invalid", where="segments")
+            raise MotionError("a path to walk needs at least one segment", code="gait-invalid", where="segments")
 
     @property
     def duration_s(self) -> float:

@@ -114,7 +114,7 @@ def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
     (26, 'Hips')
     """
     if not (np.isfinite(stature_m) and stature_m > 0):
-        raise SkeletonError(f"a stature of {stature_m} m must be positive", where="stature_m")
+        raise SkeletonError(f"the stature must be positive, not {stature_m} m", where="stature_m")
     bones, tips = _both_sides(_STUDIO, _STUDIO_TIPS, ("Left", "Right"))
     scale = stature_m / STUDIO_STATURE_M
     return _assembled(

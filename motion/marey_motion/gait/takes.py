@@ -227,11 +227,14 @@ def _slalom(speed_m_s: float, turn_rate_rad_s: float, bend_s: float, bends: int)
 
 def _frame_count(path: RootPath, frame_rate_hz: float) -> int:
     if not (np.isfinite(frame_rate_hz) and frame_rate_hz > 0):
-        raise MotionError(f"{frame_rate_hz} must be a positive number", code="gait-invalid", where="frame_rate_hz")
+        raise MotionError(
+            f"the frame rate must be a positive number, not {frame_rate_hz}", code="gait-invalid", where="frame_rate_hz"
+        )
     frames = round(path.duration_s * frame_rate_hz)
     if not 1 <= frames <= MAX_FRAMES:
         raise MotionError(
-            f"{path.duration_s:g} s at {frame_rate_hz:g} Hz are {frames} frames; 1 to {MAX_FRAMES} are possible",
+            f"a walk of {path.duration_s:g} s at {frame_rate_hz:g} Hz has {frames} frames; 1 to {MAX_FRAMES} "
+            "are possible",
             code="gait-invalid",
             where="duration_s",
         )

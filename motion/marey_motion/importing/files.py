@@ -68,7 +68,8 @@ def import_file(file: FileToImport) -> ImportedFile:
     try:
         if len(file.collection) > _LONGEST_COLLECTION:
             raise FormatError(
-                f"the path of its collection is longer than {_LONGEST_COLLECTION} characters; choose a shorter one",
+                f"the path of the file's collection is longer than {_LONGEST_COLLECTION} characters; choose a "
+                "shorter one",
                 code="name-invalid",
             )
         return _imported(file)
@@ -171,7 +172,8 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])
         raise FormatError(
-            f"its joints differ from those of the given skeleton ({odd}); import without a skeleton, then retarget",
+            f"the joints of the file differ from those of the chosen skeleton ({odd}); import without "
+            "choosing a skeleton, then retarget",
             code="skeleton-mismatch",
             file=file,
         )
@@ -181,8 +183,8 @@ def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
     apart = np.abs(own.offsets[order] - skeleton.offsets)[1:].max(initial=0.0)
     if parents != wanted or apart > SAME_OFFSET_M:
         raise FormatError(
-            f"its bones are not those of the chosen skeleton (offsets differ by up to {apart:.4f} m); "
-            "leave the skeleton out and retarget instead",
+            f"the bones of the file differ from those of the chosen skeleton (offsets by up to {apart:.4f} "
+            "m); import without choosing a skeleton, then retarget",
             code="skeleton-mismatch",
             file=file,
         )

@@ -80,4 +80,4 @@ def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
     places = ", ".join(one.path for one in models)
     there = f"{count} models are called {name!r} ({places})" if count else f"no model is called {name!r}"
     advice = "import the models of a graph first, beside it"
-    raise FormatError(f"The graph has a node {name!r}, but {there}; {advice}.", code="no-model")
+    raise FormatError(f"The graph has a node for the model {name!r}, but {there}; {advice}.", code="no-model")

@@ -58,7 +58,8 @@ def unit_in_metres(unit: str | float) -> float:
     metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
     if metres is None or not (np.isfinite(metres) and metres > 0):
         raise MotionError(
-            f"the unit {unit!r} is not one of {', '.join(UNITS_M)}, nor a size in metres", code="unit-unknown"
+            f"the unit {unit!r} is neither one of {', '.join(UNITS_M)} nor its length in metres, a positive number",
+            code="unit-unknown",
         )
     return metres
 
@@ -194,8 +195,8 @@ def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tupl
             )
             return grounded[0]
     raise AmbiguousUnits(
-        f"which axis points up is not clear: {standing}; {resting}; name it with --up-axis (up_axis), one of "
-        f"{_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
+        f"the file does not show clearly which axis points up ({standing}; {resting}); name the axis with "
+        f"--up-axis (up_axis), one of {_likely_axes((axis, cosine), (rest_axis, rest_cosine))}",
         code="up-axis-ambiguous",
         file=body.file,
     )
@@ -304,8 +305,8 @@ def _choose_unit(source: SourceMotion, body: _Measurements, options: ImportOptio
         return source.unit_scale_m
     if body.leg is None:
         raise AmbiguousUnits(
-            "the unit of length is not clear: no two legs were found to measure; "
-            "name it with --unit (unit_scale_m), such as cm",
+            "the unit of length is not clear, because no two legs were found whose length could be measured; "
+            "name the unit with --unit (unit_scale_m), such as cm",
             file=body.file,
         )
     return _unit_of_leg(body, hip_height, up_axis)

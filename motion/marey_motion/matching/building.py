@@ -122,7 +122,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
     MotionError    when they match different joints or horizons, or with different weights
     """
     if not databases:
-        raise MotionError("there are no databases to fit a normaliser to", code="no-features")
+        raise MotionError("a normaliser is fitted to databases, but none were given", code="no-features")
     ordered = sorted(databases, key=database_digest)
     layout = ordered[0].layout
     for other in ordered[1:]:
@@ -173,7 +173,7 @@ def _digest_of(arrays: Sequence[NDArray[Any]], text: str = "") -> str:
 
 def _ordered(clips: Sequence[SourceClip]) -> list[SourceClip]:
     if not clips:
-        raise MotionError("there are no clips to build a database of", code="no-clips")
+        raise MotionError("a database is built from clips, but none were given", code="no-clips")
     ordered = sorted(clips, key=lambda clip: clip.uid)
     for clip, following in pairwise(ordered):
         if clip.uid == following.uid:

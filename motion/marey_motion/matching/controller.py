@@ -123,15 +123,20 @@ def run_trial(
     rows = database_arrays(database)
     if guide.rate_hz != database.options.rate_hz:
         raise MotionError(
-            f"the trajectory has {guide.rate_hz:g} ticks per second, the database {database.options.rate_hz:g}"
+            f"the trajectory has {guide.rate_hz:g} ticks per second, but the database has "
+            f"{database.options.rate_hz:g}; both need the same rate"
         )
     if len(index.rows) != database.row_count:
-        raise MotionError(f"the index has {len(index.rows)} rows, the database {database.row_count}")
+        raise MotionError(
+            f"the search index has {len(index.rows)} rows, but the database has "
+            f"{database.row_count}; build the index from this database"
+        )
     last = database.starts[1:] - 1
     ends = last[database.selectable[last] & (rows.successors[last] < 0)]
     if len(ends):
         raise MotionError(
-            f"row {ends[0]} is the last of its clip, so playback cannot go on from it; make it not selectable",
+            f"row {ends[0]} is the last of its clip, so playback cannot continue from it; mark the row as not "
+            "selectable",
             where="selectable",
         )
     ticks = guide.tick_count
@@ -200,7 +205,10 @@ def trajectory_arrays(guide: Trajectory) -> TrajectoryArrays:
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)
     if not 1 <= guide.tick_count <= min(map(len, arrays)):
-        raise MotionError(f"the trajectory has {guide.tick_count} ticks, but arrays of {min(map(len, arrays))} samples")
+        raise MotionError(
+            f"the trajectory has {guide.tick_count} ticks, but its shortest array has only "
+            f"{min(map(len, arrays))} samples"
+        )
     return TrajectoryArrays(positions, headings, speeds, turn_rates, 1.0 / guide.rate_hz)
 
 

@@ -106,12 +106,18 @@ def explain_choice(
     MotionError    for ticks and rows that do not exist
     """
     if record.rows.max(initial=0) >= database.row_count:
-        raise MotionError("the record is of another database: it shows rows that this one does not have")
+        raise MotionError(
+            "the record of the trial belongs to another database: it contains rows that this database does not have"
+        )
     if not 0 <= tick < len(record.rows):
-        raise MotionError(f"the trial has {len(record.rows)} ticks and no tick {tick}", where="tick")
+        raise MotionError(
+            f"the trial has no tick {tick}; it has {len(record.rows)} ticks, counted from 0", where="tick"
+        )
     for row in others:
         if not 0 <= row < database.row_count:
-            raise MotionError(f"the database has {database.row_count} rows and no row {row}", where="others")
+            raise MotionError(
+                f"the database has no row {row}; it has {database.row_count} rows, counted from 0", where="others"
+            )
     wish, rules, playback = (
         trajectory_arrays(guide),
         controller_constants(options, guide.rate_hz),

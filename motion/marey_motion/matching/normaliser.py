@@ -75,16 +75,16 @@ class Normaliser:
         """
         if len(self.offset) != layout.dimension_count:
             raise MotionError(
-                f"the normaliser has {len(self.offset)} dimensions, the features have {layout.dimension_count}; "
-                "use one that was fitted with the same joints and horizons",
+                f"the normaliser has {len(self.offset)} dimensions, but the features have "
+                f"{layout.dimension_count}; use a normaliser that was fitted with the same joints and horizons",
                 code="normaliser-mismatch",
                 where="normaliser",
             )
         different = [pair for pair in zip(self.names, layout.names, strict=False) if pair[0] != pair[1]]
         if different:
             raise MotionError(
-                f"the normaliser was fitted to {different[0][0]} where the features have {different[0][1]}; "
-                "use one that was fitted with the same joints and horizons",
+                f"the normaliser has the feature {different[0][0]} where the database has {different[0][1]}; "
+                "use a normaliser that was fitted with the same joints and horizons",
                 code="normaliser-mismatch",
                 where="normaliser",
             )
@@ -127,11 +127,12 @@ class Normaliser:
             fitted_on, digest = str(tree["fitted_on"]), str(tree["digest"])
         except (KeyError, TypeError, ValueError) as error:
             raise MotionError(
-                f"this is not a normaliser: {error}", code="normaliser-invalid", where="normaliser"
+                f"the document is not a valid normaliser: {error}", code="normaliser-invalid", where="normaliser"
             ) from error
         if offset.ndim != 1 or scale.shape != offset.shape or len(names) not in (0, len(offset)):
             raise MotionError(
-                f"{len(names)} names, offsets of shape {offset.shape} and scales of shape {scale.shape} do not match",
+                f"{len(names)} names, offsets of the shape {offset.shape} and scales of the shape "
+                f"{scale.shape} do not match; each name needs one offset and one scale",
                 code="normaliser-invalid",
                 where="normaliser",
             )
@@ -142,7 +143,7 @@ class Normaliser:
         result = cls(offset, scale, fitted_on, names, floored)
         if result.digest != digest:
             raise MotionError(
-                f"its digest is {result.digest}, not {digest}: it was changed",
+                f"the numbers of the normaliser were changed: their digest is {result.digest}, not {digest}",
                 code="normaliser-invalid",
                 where="normaliser",
             )
@@ -169,7 +170,7 @@ def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> N
     MotionError    without rows
     """
     if not len(features):
-        raise MotionError("there are no features to fit a normaliser to", code="no-features")
+        raise MotionError("a normaliser is fitted to features, but none were given", code="no-features")
     offset = features.mean(axis=0)
     deviations = np.array([features[:, d].std() for d in range(layout.dimension_count)])
     scale = np.empty(layout.dimension_count)

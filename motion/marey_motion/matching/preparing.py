@@ -118,7 +118,7 @@ def _wanted_frames(
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(
-            "the clip moves another skeleton than the database's; retarget it first", code="skeleton-mismatch"
+            "the clip has a different skeleton from the database; retarget it first", code="skeleton-mismatch"
         )
     if source.frames is not None:
         clip, first = clip.sliced(*source.frames), source.frames[0]

@@ -115,13 +115,15 @@ def build_index(
 def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDArray[np.bool_]) -> None:
     if rows.ndim != 2 or rows.shape[1] == 0 or selectable.shape != rows.shape[:1]:
         raise MotionError(
-            f"features must be (rows, dimensions) with one mark per row, not {rows.shape} with {selectable.shape}"
+            "the features must have the shape (rows, dimensions), and `selectable` one value per row; their "
+            f"shapes are {rows.shape} and {selectable.shape}"
         )
     if len(starts) < 2 or starts[0] != 0 or starts[-1] != len(rows) or (np.diff(starts) < 0).any():
         raise MotionError(f"the first rows of the clips must ascend from 0 to the number of rows, {len(rows)}")
     if not selectable.any():
         raise MotionError(
-            "no row can be chosen: every clip is shorter than the look-ahead of its rows; add longer clips",
+            "no row of the database can be selected, because every clip is shorter than the look-ahead that "
+            "a row needs; add longer clips",
             code="nothing-selectable",
         )
     if not (rows.max() <= LARGEST and rows.min() >= -LARGEST):
@@ -253,9 +255,11 @@ def find_best(
 def _as_queries(index: SearchIndex, queries: NDArray[np.float64]) -> NDArray[np.float64]:
     queries = np.ascontiguousarray(queries, dtype=np.float64)
     if queries.ndim != 2 or queries.shape[1] != index.rows.shape[1]:
-        raise MotionError(f"queries must have {index.rows.shape[1]} dimensions, not the shape {queries.shape}")
+        raise MotionError(
+            f"each query must have {index.rows.shape[1]} dimensions, but the queries have the shape {queries.shape}"
+        )
     if not (np.abs(queries) <= LARGEST).all():
-        raise MotionError(f"queries must be finite and at most {LARGEST:g}")
+        raise MotionError(f"the numbers of a query must be finite and at most {LARGEST:g}")
     return queries
 
 

@@ -89,7 +89,8 @@ def find_components(
     examples = len(coefficients)
     if coefficients.shape[1] != basis.count or weights.shape != coefficients.shape[2:]:
         raise MotionError(
-            f"coefficients {coefficients.shape} do not fit {basis.count} splines, {weights.shape} weights"
+            f"the shapes do not match: coefficients {coefficients.shape}, {basis.count} splines, weights "
+            f"{weights.shape}"
         )
     mean = coefficients.mean(axis=0)
     deviations = coefficients - mean

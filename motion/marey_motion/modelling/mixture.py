@@ -30,9 +30,9 @@ class LatentMixture:
         count, dimensions = self.means.shape
         if not count or self.weights.shape != (count,) or self.covariances.shape != (count, dimensions, dimensions):
             shapes = f"{self.weights.shape}, {self.means.shape}, {self.covariances.shape}"
-            raise MotionError(f"weights, means and covariances of shapes {shapes} do not belong together")
+            raise MotionError(f"the shapes of the weights, means and covariances, {shapes}, do not match")
         if not ((self.weights > 0).all() and abs(self.weights.sum() - 1.0) < 1e-6):
-            raise MotionError("the weights of a mixture are positive and add up to 1")
+            raise MotionError("the weights of a mixture must be positive and add up to 1")
 
     @property
     def dimensions(self) -> int:

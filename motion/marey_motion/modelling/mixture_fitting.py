@@ -114,7 +114,7 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
     # In units of the mean deviation, everything below is independent of the scale of the data.
     unit = float(np.sqrt(latents.var(axis=0).mean()))
     if not unit > 0.0:
-        raise ModelError("the latent vectors do not vary, so no mixture can be fitted", where="latents")
+        raise ModelError("all latent vectors are equal, so no mixture can be fitted to them", where="latents")
     with one_thread():
         mixture, candidates, held_out = _Fitting(latents / unit, wanted, seed).choose()
     shift = dimensions * float(np.log(unit))
@@ -177,7 +177,7 @@ class _Fitting:
             if single is None or held_out is None or held_out.mean() > single.mean():
                 return count, held_out
             candidates[count] = replace(candidate, refusal="held-out")
-        raise ModelError("one component is always possible")
+        raise ModelError("the list of possible numbers of components must contain 1")
 
     def _held_out(self, count: int) -> Floats | None:
         """Compute ln p of each example under a mixture of `count` components fitted without the example's fold."""

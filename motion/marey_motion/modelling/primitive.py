@@ -51,9 +51,15 @@ class FunctionalComponents:
     def __post_init__(self) -> None:
         shape = (self.basis.count, self.mean.shape[1] if self.mean.ndim == 2 else -1)
         if self.mean.shape != shape or self.directions.shape[1:] != shape:
-            raise MotionError(f"mean {self.mean.shape} and directions {self.directions.shape} do not fit {shape}")
+            raise MotionError(
+                f"the mean has the shape {self.mean.shape} and the directions have "
+                f"{self.directions.shape}; the spline basis needs {shape}"
+            )
         if self.projections.shape != self.directions.shape:
-            raise MotionError(f"projections {self.projections.shape} do not fit directions {self.directions.shape}")
+            raise MotionError(
+                f"the shapes of the projections, {self.projections.shape}, and of the directions, "
+                f"{self.directions.shape}, do not match"
+            )
 
     @property
     def count(self) -> int:
@@ -124,13 +130,21 @@ class MotionPrimitive:
 
     def __post_init__(self) -> None:
         if self.spatial.mean.shape[1] != 3 + 4 * self.skeleton.joint_count:
-            raise MotionError(f"{self.spatial.mean.shape[1]} channels do not fit {self.skeleton.joint_count} joints")
+            raise MotionError(
+                f"{self.spatial.mean.shape[1]} channels do not match a skeleton of {self.skeleton.joint_count} joints"
+            )
         if self.temporal.basis.frame_count != self.frame_count - 1:
-            raise MotionError(f"{self.frame_count} canonical frames have {self.frame_count - 1} steps between them")
+            raise MotionError(
+                f"the time model must have {self.frame_count - 1} steps, one between every two of the "
+                f"{self.frame_count} canonical frames"
+            )
         if self.mixture.dimensions != self.dimensions:
-            raise MotionError(f"the mixture has {self.mixture.dimensions} dimensions, the components {self.dimensions}")
+            raise MotionError(
+                f"the mixture has {self.mixture.dimensions} dimensions, but the model has "
+                f"{self.dimensions} components; the two numbers must be equal"
+            )
         if not (np.isfinite(self.temporal_weight) and self.temporal_weight > 0):
-            raise MotionError("the temporal weight is a positive number", where="temporal_weight")
+            raise MotionError("the temporal weight must be a positive number", where="temporal_weight")
         least, most = self.log_slope_bounds
         if not -MOST_LOG_SLOPE <= least <= most <= MOST_LOG_SLOPE:
             message = f"{least:g} to {most:g} is not a range within {-MOST_LOG_SLOPE:g} to {MOST_LOG_SLOPE:g}"
@@ -259,7 +273,8 @@ class MotionPrimitive:
             passed = self.time_functions(latent[None])[0]
             if passed[-1] > MOST_FRAMES:
                 raise MotionError(
-                    f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far beyond those of the model",
+                    f"the motion would last {passed[-1] / self.frame_rate_hz:.3g} s, far longer than the "
+                    "motions that the model was trained on",
                     code="motion-too-long",
                 )
             steps = max(1, round(float(passed[-1])))

@@ -103,7 +103,7 @@ class SplineBasis:
         start, stop = self.span
         places = np.asarray(times, dtype=np.float64)
         if places.size and not (start <= places.min() and places.max() <= stop):
-            raise MotionError(f"canonical times lie between {start:g} and {stop:g}", where="times")
+            raise MotionError(f"canonical times must be from {start:g} to {stop:g}", where="times")
         if derivative == 0:
             return np.asarray(BSpline.design_matrix(places, self.knots, self.degree).toarray(), dtype=np.float64)
         splines = BSpline(self.knots, np.eye(self.count), self.degree)
@@ -122,7 +122,10 @@ class SplineBasis:
         """
         frames = values.shape[-2]
         if frames != self.frame_count:
-            raise MotionError(f"{frames} samples for knots that span {self.frame_count} canonical frames")
+            raise MotionError(
+                f"there are {frames} samples, but the knots of the spline span {self.frame_count} "
+                "canonical frames; one sample per frame is needed"
+            )
         return np.asarray(self._fitting @ values, dtype=np.float64)
 
     @property

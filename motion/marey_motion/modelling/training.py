@@ -116,25 +116,33 @@ def check_examples(aligned: AlignedSet) -> None:
     ModelError    naming the example that is wrong
     """
     if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
-        raise ModelError(f"{len(aligned.clips)} examples; a model needs 1 to {MOST_EXAMPLES:,}", code="example-count")
+        raise ModelError(
+            f"there are {len(aligned.clips)} examples; a model needs 1 to {MOST_EXAMPLES:,}", code="example-count"
+        )
     frames = aligned.frame_count
     if frames < LEAST_FRAMES:
-        raise ModelError(f"{frames} canonical frames; at least {LEAST_FRAMES} are needed", code="too-few-frames")
+        raise ModelError(
+            f"the examples have {frames} canonical frames; at least {LEAST_FRAMES} are needed", code="too-few-frames"
+        )
     shape = (frames, aligned.skeleton.joint_count, 4)
     for clip in aligned.clips:
         motion = clip.motion
         if motion.rotations.shape != shape or clip.time_function.shape != (frames,):
-            raise ModelError(f"{motion.rotations.shape[0]} frames where the others have {frames}", where=clip.name)
+            raise ModelError(
+                f"the example has {motion.rotations.shape[0]} frames, but the others have {frames}; "
+                "align all examples together",
+                where=clip.name,
+            )
         if motion.translated_joints:
             joint = aligned.skeleton.joint_names[motion.translated_joints[0]]
             raise ModelError(
-                f"the joint {joint} moves against its parent, which a model of rotations cannot hold; "
-                "retarget the clips to a skeleton whose bones keep their length",
+                f"the joint {joint} moves relative to its parent, but a model contains only rotations of "
+                "joints; retarget the clips to a skeleton whose bones have a fixed length",
                 code="translated-joints",
                 where=clip.name,
             )
         if not (np.isfinite(motion.poses).all() and np.isfinite(clip.time_function).all()):
-            raise ModelError("numbers that are not finite", where=clip.name)
+            raise ModelError("the example contains numbers that are not finite (infinite or NaN)", where=clip.name)
         if not (np.diff(clip.time_function) > 0.0).all():
             raise ModelError("the time function is not strictly increasing", where=clip.name)
 

@@ -72,7 +72,9 @@ class JointMapping:
         names = tuple(standard_names)
         missing = [name for name in names if name not in self.joints]
         if missing:
-            raise MappingError(f"the mapping names no joint for {', '.join(missing)}; add them to it", where=missing[0])
+            raise MappingError(
+                f"the joint mapping contains no joint for {', '.join(missing)}; add one for each", where=missing[0]
+            )
         return tuple(skeleton.index_of(self.joints[name]) for name in names)
 
 

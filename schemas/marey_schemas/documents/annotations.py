@@ -22,7 +22,9 @@ class SegmentDocument(Request):
     @model_validator(mode="after")
     def _check_range(self) -> Self:
         if self.end <= self.start:
-            raise ValueError(f"segment {self.label!r}: end {self.end} must lie after start {self.start}")
+            raise ValueError(
+                f"segment {self.label!r}: the end, frame {self.end}, must be after the start, frame {self.start}"
+            )
         return self
 
 

@@ -45,12 +45,15 @@ class MotionDocument(Request):
         if frames < 1:
             raise ValueError("poses: a motion needs at least one frame")
         if width != 3 + 4 * len(self.joints):
-            raise ValueError(f"poses: {width} columns, but {len(self.joints)} joints need {3 + 4 * len(self.joints)}")
+            raise ValueError(
+                f"poses: the array has {width} columns, but {len(self.joints)} joints need {3 + 4 * len(self.joints)}"
+            )
         if (self.translations is None) != (not self.translated_joints):
             raise ValueError("give translations and translated_joints together")
         if self.translations is not None and self.translations.shape != (frames, len(self.translated_joints), 3):
             raise ValueError(
-                f"translations: shape {self.translations.shape}, expected {(frames, len(self.translated_joints), 3)}"
+                f"translations: the array has the shape {self.translations.shape}, but must have "
+                f"{(frames, len(self.translated_joints), 3)}"
             )
         if unknown := set(self.translated_joints) - set(self.joints):
             raise ValueError(f"translated_joints: {sorted(unknown)} are not joints of the motion")

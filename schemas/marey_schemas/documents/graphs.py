@@ -63,7 +63,7 @@ class ModelGraph(Request):
             for name, node in group.primitives.items()
         }
         if len(nodes) > MOST_PRIMITIVES:
-            raise ValueError(f"actions: {len(nodes)} primitives; at most {MOST_PRIMITIVES} are accepted")
+            raise ValueError(f"actions: the graph has {len(nodes)} primitives; at most {MOST_PRIMITIVES} are accepted")
         _require_known(nodes, "start", [self.start])
         for place, node in nodes.items():
             _require_known(nodes, f"{place}: transitions", node.transitions)
@@ -71,7 +71,10 @@ class ModelGraph(Request):
                 raise ValueError(f"{place}: an idle primitive must have a transition to itself")
         follows = {place: set(node.transitions) for place, node in nodes.items()}
         if lost := nodes.keys() - _reached([self.start], follows):
-            raise ValueError(f"{_first(lost)}: it cannot be reached from the start, {self.start}")
+            raise ValueError(
+                f"{_first(lost)}: this primitive cannot be reached from the start, {self.start}; add "
+                "a transition to it, or remove it"
+            )
         ends = [place for place, node in nodes.items() if node.type in TYPES_TO_END_IN]
         if not ends:
             raise ValueError(
@@ -82,7 +85,9 @@ class ModelGraph(Request):
             for other in following:
                 precedes[other].add(place)
         if stuck := nodes.keys() - _reached(ends, precedes):
-            raise ValueError(f"{_first(stuck)}: no primitive that ends a sequence can be reached from it")
+            raise ValueError(
+                f"{_first(stuck)}: no primitive that ends a sequence can be reached from this one; add a transition"
+            )
         return self
 
 

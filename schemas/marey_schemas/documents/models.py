@@ -44,19 +44,27 @@ class FunctionalComponentsDocument(Request):
     def _check_shapes(self) -> Self:
         n, channels = self.mean.shape
         if len(self.knots) != n + self.degree + 1:
-            raise ValueError(f"knots: {len(self.knots)}, but {n} coefficients need {n + self.degree + 1}")
+            raise ValueError(
+                f"knots: there are {len(self.knots)}, but {n} spline coefficients need {n + self.degree + 1}"
+            )
         count = len(self.directions)
         for name in ("directions", "projections"):
             if getattr(self, name).shape != (count, n, channels):
-                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {(count, n, channels)}")
+                raise ValueError(
+                    f"{name}: the array has the shape {getattr(self, name).shape}, but must have {(count, n, channels)}"
+                )
         for name in ("variances", "energy"):
             if getattr(self, name).shape != (count,):
-                raise ValueError(f"{name}: {len(getattr(self, name))} values for {count} components")
+                raise ValueError(
+                    f"{name}: there are {len(getattr(self, name))} values for {count} components; each "
+                    "component needs one"
+                )
         frames = float(self.knots[-self.degree - 1] - self.knots[self.degree]) + 1.0
         if not (frames <= MOST_CANONICAL_FRAMES and frames * n <= MOST_BASIS_NUMBERS):
             raise ValueError(
-                f"knots: {frames:g} canonical frames with {n} coefficients; at most {MOST_CANONICAL_FRAMES} frames are "
-                f"accepted, and {MOST_BASIS_NUMBERS:,} as the product of the two"
+                f"knots: the spline has {frames:g} canonical frames and {n} coefficients; at most "
+                f"{MOST_CANONICAL_FRAMES} frames are accepted, and frames times coefficients may be at most "
+                f"{MOST_BASIS_NUMBERS:,}"
             )
         return self
 
@@ -72,10 +80,10 @@ class MixtureDocument(Request):
     def _check_shapes(self) -> Self:
         count, dimensions = self.means.shape
         if count < 1 or self.weights.shape != (count,):
-            raise ValueError(f"weights: {len(self.weights)} values for {count} means")
+            raise ValueError(f"weights: there are {len(self.weights)} weights for {count} means; each mean needs one")
         if self.covariances.shape != (count, dimensions, dimensions):
             expected = (count, dimensions, dimensions)
-            raise ValueError(f"covariances: shape {self.covariances.shape}, expected {expected}")
+            raise ValueError(f"covariances: the array has the shape {self.covariances.shape}, but must have {expected}")
         if not (self.weights > 0).all() or abs(float(self.weights.sum()) - 1.0) > 1e-6:
             raise ValueError("weights: must be positive and add up to 1")
         return self
@@ -169,14 +177,19 @@ class MotionPrimitiveDocument(Request):
     def _check_shapes(self) -> Self:
         width = 3 + 4 * len(self.joints)
         if self.spatial.mean.shape[1] != width:
-            raise ValueError(f"spatial: {self.spatial.mean.shape[1]} channels, but the joints need {width}")
+            raise ValueError(
+                f"spatial: the mean has {self.spatial.mean.shape[1]} channels, but the joints need {width}"
+            )
         if self.temporal.mean.shape[1] != 1:
-            raise ValueError(f"temporal: {self.temporal.mean.shape[1]} channels; it must have 1")
+            raise ValueError(f"temporal: the mean has {self.temporal.mean.shape[1]} channels, but must have 1")
         if self.duration_range_s is not None and not self.duration_range_s[0] <= self.duration_range_s[1]:
             raise ValueError("duration_range_s: the second number must not be less than the first")
         dimensions = len(self.spatial.directions) + len(self.temporal.directions)
         if self.mixture.means.shape[1] != dimensions:
-            raise ValueError(f"mixture: {self.mixture.means.shape[1]} dimensions for the {dimensions} components")
+            raise ValueError(
+                f"mixture: the means have {self.mixture.means.shape[1]} dimensions, but the model has "
+                f"{dimensions} components; the two numbers must be equal"
+            )
         if self.log_slope_range is not None and not self.log_slope_range[0] <= self.log_slope_range[1]:
             raise ValueError("log_slope_range: the second number must not be less than the first")
         return self

@@ -41,9 +41,13 @@ class SampleTreeDocument(Request):
     @model_validator(mode="after")
     def _check_shapes(self) -> Self:
         if len(self.sizes) != len(self.children):
-            raise ValueError(f"children: {len(self.children)} values for {len(self.sizes)} nodes")
+            raise ValueError(
+                f"children: there are {len(self.children)} values for {len(self.sizes)} nodes; each node needs one"
+            )
         if not len(self.sizes) or self.sizes[0] != len(self.samples):
-            raise ValueError(f"sizes: the first node must hold all {len(self.samples)} samples")
+            raise ValueError(f"sizes: the first node must contain all {len(self.samples)} samples")
         if len(self.samples) > MOST_TREE_SAMPLES:
-            raise ValueError(f"samples: {len(self.samples):,} samples; at most {MOST_TREE_SAMPLES:,} are accepted")
+            raise ValueError(
+                f"samples: the tree has {len(self.samples):,} samples; at most {MOST_TREE_SAMPLES:,} are accepted"
+            )
         return self

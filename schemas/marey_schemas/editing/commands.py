@@ -23,7 +23,7 @@ Frame = Annotated[int, Field(ge=0, le=MOST_FRAME)]
 
 def _require_order(frames: tuple[int, int | None]) -> tuple[int, int | None]:
     if frames[1] is not None and frames[1] <= frames[0]:
-        raise ValueError(f"the stop {frames[1]} must lie after the start {frames[0]}")
+        raise ValueError(f"the stop, frame {frames[1]}, must be after the start, frame {frames[0]}")
     return frames
 
 
@@ -65,7 +65,7 @@ class Trim(NamedCommand):
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if self.stop is not None and self.stop <= self.start:
-            raise ValueError(f"the stop {self.stop} must lie after the start {self.start}")
+            raise ValueError(f"the stop, frame {self.stop}, must be after the start, frame {self.start}")
         return self
 
 
@@ -197,7 +197,9 @@ class FlipAxes(NamedCommand):
     @model_validator(mode="after")
     def _check_axes(self) -> Self:
         if self.up[1] == self.forward[1]:
-            raise ValueError(f"up {self.up} and forward {self.forward} lie on one axis; choose two different axes")
+            raise ValueError(
+                f"up {self.up} and forward {self.forward} are directions of the same axis; choose two different axes"
+            )
         return self
 
 

@@ -25,7 +25,7 @@ Quaternion = tuple[float, float, float, float]
 
 def _require_rotation(q: Quaternion) -> Quaternion:
     if not 0.99 <= sum(component**2 for component in q) <= 1.01:
-        raise ValueError("a rotation is a unit quaternion (w, x, y, z)")
+        raise ValueError("a rotation must be a quaternion (w, x, y, z) of length 1")
     return q
 
 

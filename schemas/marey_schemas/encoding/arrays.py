@@ -71,7 +71,7 @@ class EncodedArray:
         try:
             held = blocks.read_spec(self.data)
             if held != claimed:
-                raise ArrayError("bad-array", f"the leaf declares {claimed}, but its blocks contain {held}")
+                raise ArrayError("bad-array", f"the array declares {claimed}, but its blocks contain {held}")
             return blocks.decode(self.data)
         except blocks.BlockError as error:
             raise ArrayError("bad-array", str(error)) from error
@@ -115,10 +115,14 @@ def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:
     dtype = np.dtype(spec.dtype)
     expected = dtype.itemsize * int(np.prod(spec.shape, dtype=np.int64))
     if len(data) != expected:
-        raise ArrayError("bad-array", f"{len(data)} bytes of data; {spec.dtype} {list(spec.shape)} takes {expected}")
+        raise ArrayError(
+            "bad-array",
+            f"the data has {len(data)} bytes, but an array of {spec.dtype} with the shape "
+            f"{list(spec.shape)} has {expected}",
+        )
     raw = np.frombuffer(data, np.uint8)
     if spec.dtype == "|b1" and raw.size and raw.max() > 1:
-        raise ArrayError("bad-array", "a boolean is stored as neither 0 nor 1")
+        raise ArrayError("bad-array", "the data of an array of booleans contains a byte that is neither 0 nor 1")
     return raw.view(dtype).reshape(spec.shape).copy()
 
 
@@ -129,17 +133,23 @@ def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
         for item in level:
             if type(item) is not list or len(item) != size:
                 found = f"a list of {len(item)}" if type(item) is list else type(item).__name__
-                raise ArrayError("bad-array", f"axis {axis} must be a list of {size}, not {found}")
+                raise ArrayError(
+                    "bad-array",
+                    f"the list of elements does not match the shape of the array: on axis {axis}, a list "
+                    f"of {size} is needed, not {found}",
+                )
         level = list(chain.from_iterable(level))
     wrong = set(map(type, level)) - _ELEMENT_TYPES[np.dtype(spec.dtype).kind]
     if wrong:
         names = ", ".join(sorted(found.__name__ for found in wrong))
-        raise ArrayError("bad-array", f"elements of type {names} in an array of dtype {spec.dtype}")
+        raise ArrayError(
+            "bad-array", f"the array has the dtype {spec.dtype}, but contains elements of the type {names}"
+        )
     try:
         with np.errstate(over="ignore"):  # what overflows a float32 becomes infinite and is refused as such
             return np.array(level, dtype=spec.dtype).reshape(spec.shape)
     except OverflowError as error:
-        raise ArrayError("out-of-range", f"an element does not fit in dtype {spec.dtype}") from error
+        raise ArrayError("out-of-range", f"an element of the array is too large for the dtype {spec.dtype}") from error
 
 
 def json_data(array: NDArray[Any]) -> Any:

@@ -39,7 +39,9 @@ class ArraySpec:
         if self.dtype not in DTYPES:
             raise ArrayError("bad-dtype", f"dtype {self.dtype!r} is not one of {', '.join(DTYPES)}")
         if len(self.shape) > MAX_DIMENSIONS:
-            raise ArrayError("bad-shape", f"{len(self.shape)} dimensions; at most {MAX_DIMENSIONS} are allowed")
+            raise ArrayError(
+                "bad-shape", f"the array has {len(self.shape)} dimensions; at most {MAX_DIMENSIONS} are allowed"
+            )
         if any(size < 0 for size in self.shape):
             raise ArrayError("bad-shape", f"shape {list(self.shape)} has a negative size")
         # Empty sizes count as one: [10**12, 0] holds no numbers, yet would be 10**12 lists in JSON.
@@ -73,7 +75,7 @@ class ArraySpec:
     def require(self, max_bytes: int) -> None:
         """Raise `ArrayError` unless the array fits in `max_bytes`."""
         if self.nbytes > max_bytes:
-            raise ArrayError("too-large", f"{self} is larger than the {max_bytes} bytes allowed")
+            raise ArrayError("too-large", f"an array of {self} is larger than the {max_bytes} bytes that are allowed")
 
 
 def little_endian(array: NDArray[Any]) -> NDArray[Any]:

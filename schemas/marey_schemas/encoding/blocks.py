@@ -163,14 +163,16 @@ def decode(
     """
     layout, starts = _read_head(data)
     if not layout.spec.shape and (frames is not None or columns is not None):
-        raise IndexError("an array without axes has no frames or columns to choose from")
+        raise IndexError("frames and columns can only be chosen from an array with at least one axis")
     chosen = range(layout.frames)[frames or slice(None)]
     rows = chosen if chosen.step > 0 else chosen[::-1]
     picked = None if columns is None else _column_indices(columns, layout.columns)
     width = layout.columns if picked is None else len(picked)
     dtype = np.dtype(layout.spec.dtype)
     if max(len(rows), 1) * max(width, 1) * dtype.itemsize > max_bytes:
-        raise BlockError(f"{len(rows)} frames of {width} columns are larger than the {max_bytes} bytes allowed")
+        raise BlockError(
+            f"the chosen {len(rows)} frames of {width} columns take more than the {max_bytes} bytes that are allowed"
+        )
     table = np.empty((len(rows), width), dtype)
     for block, target_rows, tile_rows in _rows_by_block(layout, rows):
         for group, target_columns, tile_columns in _columns_by_group(layout, picked):
@@ -178,7 +180,7 @@ def decode(
             part = _unpack(data[starts[tile] : starts[tile + 1]], layout, block, group)
             table[target_rows, target_columns] = part[tile_rows, tile_columns]
     if dtype.kind == "b" and (table.view(np.uint8) > 1).any():
-        raise BlockError("a boolean is stored as neither 0 nor 1")
+        raise BlockError("the data of an array of booleans contains a byte that is neither 0 nor 1")
     if chosen.step < 0:
         table = np.ascontiguousarray(table[::-1])
     return table if columns is not None else table.reshape(layout.spec.shape and (len(rows), *layout.spec.shape[1:]))
@@ -206,13 +208,13 @@ def _read_head(data: bytes) -> tuple[_Layout, list[int]]:
     sizes = np.frombuffer(data, "<u4", count, table)
     starts = [end + 4, *(end + 4 + np.cumsum(sizes, dtype=np.int64)).tolist()]
     if starts[-1] != len(data):
-        raise BlockError(f"{len(data)} bytes were given, but the index requires {starts[-1]}")
+        raise BlockError(f"the data has {len(data)} bytes, but its index requires {starts[-1]}")
     return layout, starts
 
 
 def _require_sane_tiles(layout: _Layout) -> None:
     if layout.block_frames < 1 or layout.group_columns < 1:
-        raise BlockError("a tile has no frames or no columns")
+        raise BlockError("the header declares tiles without frames or without columns")
     largest = min(layout.block_frames, layout.frames) * min(layout.group_columns, layout.columns)
     if largest * np.dtype(layout.spec.dtype).itemsize > MAX_TILE_BYTES:
         raise BlockError(f"a tile of {largest} elements is larger than {MAX_TILE_BYTES} bytes")
@@ -262,7 +264,7 @@ def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Return the indices counted from zero. Raises `IndexError`."""
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
-        raise IndexError("columns must be one list of integers")
+        raise IndexError("columns must be a one-dimensional list of integers")
     outside = picked[(picked < -count) | (picked >= count)]
     if outside.size:
         raise IndexError(f"column {outside[0]} is outside an array of {count} columns")

@@ -90,7 +90,7 @@ def _canonical(value: Any) -> Any:
 
 def _text_key(key: Any) -> str:
     if not isinstance(key, str):
-        raise TypeError(f"the key {key!r} is not a string")
+        raise TypeError(f"the object has the key {key!r}, which is not a string")
     return key
 
 

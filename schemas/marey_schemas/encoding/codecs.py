@@ -103,7 +103,7 @@ def decode_tree(
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
-        raise CodecError("too-large", "", f"{len(data)} bytes; at most {max_bytes} are read")
+        raise CodecError("too-large", "", f"the document has {len(data)} bytes; at most {max_bytes} are accepted")
     walk = _Walk(
         max_depth,
         array_bytes=max_bytes if max_array_bytes is None else min(max_bytes, max_array_bytes),
@@ -117,14 +117,16 @@ def decode_tree(
     except CodecError:
         raise
     except (RecursionError, msgpack.StackError) as error:
-        raise CodecError("too-deep", "", f"nested deeper than {max_depth} levels") from error
+        raise CodecError("too-deep", "", f"the document is nested deeper than {max_depth} levels") from error
     except (ValueError, bson.errors.BSONError, msgpack.UnpackException) as error:
-        raise CodecError("bad-syntax", walk.pointer, f"not valid {media_type}: {error}") from error
+        raise CodecError("bad-syntax", walk.pointer, f"the document is not valid {media_type}: {error}") from error
 
 
 def _require_media_type(media_type: str) -> None:
     if media_type not in MEDIA_TYPES:
-        raise CodecError("bad-media-type", "", f"{media_type!r} is not one of {', '.join(MEDIA_TYPES)}")
+        raise CodecError(
+            "bad-media-type", "", f"documents cannot be encoded as {media_type!r}; use one of {', '.join(MEDIA_TYPES)}"
+        )
 
 
 def _leaf_as_json(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
@@ -220,10 +222,14 @@ def _too_many_values(pointer: str) -> CodecError:
 
 def _parse_bson(data: bytes) -> Any:
     if int.from_bytes(data[:4], "little", signed=True) != len(data):
-        raise ValueError(f"the size in its header differs from the {len(data)} bytes that were given")
+        raise ValueError(f"the header of the BSON document declares another size than its {len(data)} bytes")
     if _REFERENCE_KEY in data:  # which would become a database reference, unless each object is read when it is used
         if data.count(_BSON_OBJECT) > FREE_LISTS:
-            raise CodecError("too-large", "", f"with a key $ref, BSON may contain at most {FREE_LISTS} objects")
+            raise CodecError(
+                "too-large",
+                "",
+                f"a BSON document with a key $ref may contain at most {FREE_LISTS} objects; use MessagePack",
+            )
         return RawBSONDocument(data)
     count = _Count(data)
 
@@ -320,7 +326,8 @@ class _Walk:
         if LEAF_KEYS.issubset(keys):
             if self._on_array is not None:
                 raise self._error(
-                    "reserved-keys", "dtype, shape and data together mean an array; pass an ndarray instead"
+                    "reserved-keys",
+                    "an object with the keys dtype, shape and data would be read as an array; pass an ndarray instead",
                 )
             return self._array(self._take_leaf, value)
         members = {}
@@ -332,7 +339,11 @@ class _Walk:
 
     def _list(self, value: list[Any] | tuple[Any, ...]) -> list[Any]:
         if len(value) > MAX_LIST:
-            raise self._error("too-large", f"a list of {len(value)}; send more than {MAX_LIST} numbers as an array")
+            raise self._error(
+                "too-large",
+                f"the list has {len(value)} elements; send more than {MAX_LIST} numbers as an array "
+                "(an object with dtype, shape and data)",
+            )
         self._enter(len(value))
         items = []
         for index, item in enumerate(value):
@@ -358,9 +369,9 @@ class _Walk:
 
     def _key(self, key: object) -> str:
         if not isinstance(key, str):
-            raise self._error("bad-key", f"the key {key!r} is not a string")
+            raise self._error("bad-key", f"the object has the key {key!r}, which is not a string")
         if "\0" in key:
-            raise self._error("bad-key", f"the key {key!r} contains NUL")
+            raise self._error("bad-key", f"the key {key!r} contains the character U+0000")
         return self._text(key)
 
     def _text(self, text: str) -> str:
@@ -382,7 +393,7 @@ class _Walk:
 
     def _enter(self, values: int) -> None:
         if len(self._path) >= self._max_depth:
-            raise self._error("too-deep", f"nested deeper than {self._max_depth} levels")
+            raise self._error("too-deep", f"the document is nested deeper than {self._max_depth} levels")
         self._values_left -= values
         if self._values_left < 0:
             raise _too_many_values(self.pointer)

@@ -51,7 +51,9 @@ def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns:
     try:
         size = zstandard.frame_content_size(data)
         if not 0 < size <= 2 + 2 * columns + frames * columns * dtype.itemsize:
-            raise TileError(f"{size} bytes are claimed for {frames} frames of {columns} columns of {dtype.str}")
+            raise TileError(
+                f"the tile declares {size} bytes, which {frames} frames of {columns} columns of {dtype.str} cannot have"
+            )
         content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise TileError(str(error)) from error
@@ -89,7 +91,7 @@ def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) ->
     elif form == QUATERNIONS and dtype == np.dtype("<f4"):
         tile = _from_integers(_undo_prediction(body, columns, frames), dtype).T
     else:
-        raise TileError(f"form {form} is not one of dtype {dtype.str}")
+        raise TileError(f"the tile has the form {form}, which the dtype {dtype.str} does not have")
     body.require_end()
     return tile
 
@@ -102,13 +104,15 @@ class _Sections:
 
     def take(self, size: int) -> Bytes:
         if size > self._rest.size:
-            raise TileError(f"{size} more bytes are expected, {self._rest.size} are left")
+            raise TileError(
+                f"the tile ends too early: its next section needs {size} bytes, but {self._rest.size} are left"
+            )
         taken, self._rest = self._rest[:size], self._rest[size:]
         return taken
 
     def require_end(self) -> None:
         if self._rest.size:
-            raise TileError(f"{self._rest.size} bytes are left over after the last section")
+            raise TileError(f"the tile has {self._rest.size} bytes after its last section")
 
 
 # Floats as integers
@@ -222,10 +226,10 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
     lead = int(body.take(1)[0])
     count = (columns - lead) // 4
     if count < 1:
-        raise TileError(f"there is no quaternion after the first {lead} of {columns} columns")
+        raise TileError(f"the tile declares quaternions after its first {lead} columns, but has only {columns} columns")
     choice = body.take(count)
     if (choice > 7).any():
-        raise TileError("a quaternion's prediction, component + 4 * sign, must be 0 to 7")
+        raise TileError("the number that says how a quaternion is predicted must be 0 to 7 (component + 4 * sign)")
     predicted_rows, other_rows = _rows(choice & 3, columns, lead)
     channels = np.empty((columns, frames), np.uint32)
     channels[other_rows] = others = _undo_difference(body, 4, columns - count, frames)

@@ -32,7 +32,7 @@ class CostOptions(Options):
     @classmethod
     def _check_window(cls, window: int) -> int:
         if window % 2 == 0:
-            raise ValueError("must be odd, with as many frames before as after")
+            raise ValueError("must be odd, so that the window has as many frames before its middle frame as after it")
         return window
 
 

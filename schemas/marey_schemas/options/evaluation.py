@@ -89,4 +89,4 @@ class EvaluationOptions(Grid):
 
 def _require_different(name: str, values: tuple[object, ...]) -> None:
     if len(set(values)) != len(values):
-        raise ValueError(f"{name}: a value is repeated")
+        raise ValueError(f"{name}: the list contains a value twice; remove one")

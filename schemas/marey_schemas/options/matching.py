@@ -82,14 +82,14 @@ class DatabaseOptions(Options):
     @classmethod
     def _check_order(cls, horizons_s: tuple[float, ...]) -> tuple[float, ...]:
         if any(after <= before for before, after in pairwise(horizons_s)):
-            raise ValueError("must be in increasing order")
+            raise ValueError("the values must be in increasing order")
         return horizons_s
 
     @field_validator("extra_joints")
     @classmethod
     def _check_names(cls, extra_joints: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(extra_joints)) < len(extra_joints):
-            raise ValueError("a joint is given twice")
+            raise ValueError("the list contains a joint twice; remove one")
         return extra_joints
 
     @model_validator(mode="after")
@@ -97,7 +97,8 @@ class DatabaseOptions(Options):
         ticks = [0, *(round(horizon_s * self.rate_hz) for horizon_s in self.horizons_s)]
         if any(after <= before for before, after in pairwise(ticks)):
             raise ValueError(
-                f"horizons_s: must be at least one frame (1/{self.rate_hz:g} s) ahead and apart from each other"
+                f"horizons_s: the first must be at least one frame (1/{self.rate_hz:g} s), and so must the "
+                "distances between them"
             )
         return self
 

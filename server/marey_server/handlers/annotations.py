@@ -38,7 +38,10 @@ class AnnotationCommands(Resource):
         answer is 422 with a pointer to this command.
         """
         if kind_of(kind) is not Kind.ANNOTATION:
-            raise NotFoundProblem(f"Commands can be applied to annotations, not to {kind}.", code="no-commands")
+            raise NotFoundProblem(
+                f"These commands can be applied only to annotations, not to an item of the kind {kind}.",
+                code="no-commands",
+            )
         expected_rev = self.precondition.expected_rev
         for _ in range(MOST_TRIES):
             found = await self.look_up(items.find_annotation, project, item)
@@ -70,7 +73,7 @@ class ClipAnnotations(Resource):
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
         """Create an annotation of a clip (kind `clips`), in the clip's folder, from a document of the predecessor."""
         if kind_of(kind) is not Kind.CLIP:
-            raise NotFoundProblem(f"Only clips can be annotated, not {kind}.", code="no-annotations")
+            raise NotFoundProblem(f"Only clips can be annotated, not items of the kind {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)
         prepared = await self.compute(prepare_annotation, clip, body)
         return await self.answer_with(

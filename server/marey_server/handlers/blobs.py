@@ -19,7 +19,9 @@ MAX_BLOB_BYTES = 1024 * MIB
 def require_digest(text: str) -> str:
     """Return the text if it is a digest. Raises `NotFoundProblem`."""
     if not is_digest(text):
-        raise NotFoundProblem("A blob is identified by sha256: and 64 hexadecimal digits.", code="no-blob")
+        raise NotFoundProblem(
+            "This is not the digest of a blob, which is sha256: and 64 hexadecimal digits.", code="no-blob"
+        )
     return text
 
 

@@ -66,7 +66,7 @@ class Events(Resource):
         if text is None:
             return query.after
         if not text.isascii() or not text.isdigit() or len(text) > 18:
-            raise BadRequestProblem("Last-Event-ID must be the number of an event.", code="bad-event-id")
+            raise BadRequestProblem("The header Last-Event-ID must be the number of an event.", code="bad-event-id")
         return int(text)
 
     async def _follow(self, project: str, after: int, listener: Listener) -> None:

@@ -45,7 +45,9 @@ class Readyz(Resource):
         The log says what is missing, and so does the answer to an administrator.
         """
         if self.services.draining.is_set():
-            raise UnavailableProblem("The server is stopping.", code="draining", headers={"Retry-After": "5"})
+            raise UnavailableProblem(
+                "The server is stopping and accepts no more work.", code="draining", headers={"Retry-After": "5"}
+            )
         faults = await self.look_up(fsck.find_faults)
         if disk_fault := self.services.disk.fault():
             faults = [*faults, disk_fault]

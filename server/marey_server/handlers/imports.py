@@ -66,7 +66,7 @@ class ProjectImports(Resource):
         if self.parts is None:
             self.body += chunk
             if len(self.body) > MIB:
-                raise TooLargeProblem(f"A list of files may have at most {MIB} bytes.")
+                raise TooLargeProblem(f"The JSON list of files to import may have at most {MIB} bytes.")
             return
         for piece in self.parts.feed(chunk):
             await self._take(piece)
@@ -246,7 +246,7 @@ def _form_options(form: dict[str, bytearray]) -> ImportOptions:
     try:
         values: dict[str, Any] = {name: value.decode() for name, value in form.items()}
     except UnicodeDecodeError:
-        raise BadRequestProblem("Form fields must be UTF-8.", code="bad-multipart") from None
+        raise BadRequestProblem("The text of form fields must be encoded as UTF-8.", code="bad-multipart") from None
     if "tags" in values:
         values["tags"] = [tag for tag in values["tags"].split(",") if tag]
     try:

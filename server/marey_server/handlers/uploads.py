@@ -48,7 +48,10 @@ class UploadResource(Resource):
         """Check the offset of the piece before it is received."""
         text = self.request.headers.get("Upload-Offset", "")
         if not text.isascii() or not text.isdigit() or len(text) > 12:
-            raise BadRequestProblem("Send Upload-Offset with the offset of the piece.", code="bad-offset")
+            raise BadRequestProblem(
+                "The header Upload-Offset is missing; it must be the offset of this piece in the file, in bytes.",
+                code="bad-offset",
+            )
         self.upload_id, self.offset, self.piece = upload, int(text), bytearray()
         await self._append()
 

@@ -77,13 +77,15 @@ def require_access(operation: Operation, principal: Principal) -> None:
     guests = access is Access.ANYONE or (access is Access.READER and operation.public)
     if principal.kind == "anonymous":
         if not guests:
-            raise UnauthenticatedProblem("Send a token: Authorization: Bearer <token>.", headers=CHALLENGE)
+            raise UnauthenticatedProblem(
+                "The request needs a token; send the header Authorization: Bearer <token>.", headers=CHALLENGE
+            )
         return
     if principal.kind == "attempt":
         _require_attempt_access(operation, principal)
         return
     if access is Access.ATTEMPT:
-        raise ForbiddenProblem("Only the token of a running job attempt may do this.", code="attempt-only")
+        raise ForbiddenProblem("Only the token that a worker gets for a running job may do this.", code="attempt-only")
     if access is Access.ADMINISTRATOR and not principal.administrator:
         raise ForbiddenProblem("Only administrators may do this.", code="administrators-only")
     if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
@@ -99,7 +101,9 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
     if principal.ended and not operation.replays:
         raise lease_lost(principal.job_id or "", principal.fence or 0)
     if operation.access is not Access.ATTEMPT and not operation.attempts:
-        raise ForbiddenProblem("The token of a job attempt may not do this.", code="not-for-attempts")
+        raise ForbiddenProblem(
+            "The token that a worker gets for a running job may not do this.", code="not-for-attempts"
+        )
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,9 @@ def idempotency_key(headers: HTTPHeaders) -> str | None:
     """Return the key by which a repeated request is recognised, if there is one. Raises `BadRequestProblem`."""
     key = headers.get("Idempotency-Key")
     if key is not None and not _KEY.fullmatch(key):
-        raise BadRequestProblem("An Idempotency-Key has 1 to 255 visible ASCII characters.", code="bad-idempotency-key")
+        raise BadRequestProblem(
+            "The header Idempotency-Key must have 1 to 255 visible ASCII characters.", code="bad-idempotency-key"
+        )
     return key
 
 

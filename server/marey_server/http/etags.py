@@ -50,15 +50,15 @@ def parse_tags(header: str) -> list[str]:
         match = _TAG.match(header, position)
         if match is None:
             raise BadRequestProblem(
-                f'Entity tags are written in quotation marks, as in "7.json"; this one is not: {header[:200]}'
+                f'Entity tags must be in quotation marks, as in "7.json"; the header has: {header[:200]}'
             )
         tags.append(match[2])
         position = match.end()
         if position < len(header) and header[position] != ",":
-            raise BadRequestProblem(f"Entity tags are separated by commas: {header[:200]}")
+            raise BadRequestProblem(f"Entity tags in a header must be separated by commas: {header[:200]}")
         position += 1
     if not tags:
-        raise BadRequestProblem("The header contains no entity tag.")
+        raise BadRequestProblem("The header If-Match or If-None-Match contains no entity tag.")
     return tags
 
 
@@ -78,17 +78,23 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
     """
     if if_none_match is not None and may_create:
         if if_none_match.strip() != "*":
-            raise BadRequestProblem("If-None-Match of a change must be *: create the resource, but never replace it.")
+            raise BadRequestProblem(
+                "In a request that creates a resource, If-None-Match must be *, so that an existing "
+                "resource is not replaced."
+            )
         return ABSENT
     if if_match is None:
         hint = "If-Match with the ETag you read, or *" + (", or If-None-Match: * to create" if may_create else "")
-        raise PreconditionRequiredProblem(f"State which version you are changing: {hint}.")
+        raise PreconditionRequiredProblem(f"State which version of the resource the change is for: send {hint}.")
     tags = parse_tags(if_match)
     if tags == ["*"]:
         return ANY_STATE
     revs = sorted({int(rev) for tag in tags if _REV.fullmatch(rev := tag.partition(".")[0])})
     if not revs:
-        raise PreconditionFailedProblem(f"{if_match[:200]} is not a version of this resource; read it again.")
+        raise PreconditionFailedProblem(
+            f"If-Match contains no version of this resource ({if_match[:200]}); read the resource "
+            "again, and send its ETag."
+        )
     if len(revs) > MOST_STATES:
         raise BadRequestProblem(f"If-Match names {len(revs)} versions; at most {MOST_STATES} are possible.")
     return Precondition(revs[0] if len(revs) == 1 else frozenset(revs))

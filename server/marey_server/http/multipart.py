@@ -36,7 +36,7 @@ def boundary_of(content_type: str) -> bytes:
     media_type, parameters = parse_options_header(content_type)
     if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
-            f"Files must be sent as multipart/form-data, not {content_type or 'without a type'}."
+            f"Files must be sent with the Content-Type multipart/form-data, not {content_type or 'without a type'}."
         )
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
@@ -103,7 +103,9 @@ class MultipartReader:
 
     def _begin_part(self) -> None:
         if self._parts_left == 0:
-            raise TooLargeProblem("The request has too many parts; send several requests.", code="too-many-parts")
+            raise TooLargeProblem(
+                "The multipart body has too many parts; send the files in several requests.", code="too-many-parts"
+            )
         self._parts_left -= 1
         self._head_bytes = 0
         self._disposition = None
@@ -119,7 +121,9 @@ class MultipartReader:
     def _count_head(self, more_bytes: int) -> None:
         self._head_bytes += more_bytes
         if self._head_bytes > MAX_HEAD_BYTES:
-            raise TooLargeProblem(f"The head of a part is longer than {MAX_HEAD_BYTES} bytes.")
+            raise TooLargeProblem(
+                f"The header lines of a part of the multipart body are longer than {MAX_HEAD_BYTES} bytes."
+            )
 
     def _end_header(self) -> None:
         if self._name.strip().lower() == b"content-disposition" and self._disposition is None:
@@ -130,7 +134,10 @@ class MultipartReader:
     def _end_head(self) -> None:
         disposition, parameters = parse_options_header(self._disposition)
         if disposition != b"form-data" or b"name" not in parameters:
-            raise BadRequestProblem("A part lacks Content-Disposition: form-data with a name.", code="bad-multipart")
+            raise BadRequestProblem(
+                "A part of the multipart body has no header Content-Disposition: form-data with a name.",
+                code="bad-multipart",
+            )
         file_name = parameters.get(b"filename")
         self._pieces.append(PartHead(_text(parameters[b"name"]), None if file_name is None else _text(file_name)))
 
@@ -143,5 +150,7 @@ def _text(value: bytes) -> str:
     try:
         text = value.decode("utf-8")
     except UnicodeDecodeError:
-        raise BadRequestProblem("The head of a part is not UTF-8.", code="bad-multipart") from None
+        raise BadRequestProblem(
+            "The header lines of a part of the multipart body are not UTF-8.", code="bad-multipart"
+        ) from None
     return text.replace("%22", '"').replace("%0D", "\r").replace("%0A", "\n")

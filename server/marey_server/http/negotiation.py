@@ -76,7 +76,8 @@ def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
     if chosen is None:
         names = ", ".join(map(str, offers))
         raise NotAcceptableProblem(
-            f"This resource is available as {names}.", context={"offered": [str(offer) for offer in offers]}
+            f"The Accept header allows no media type of this resource, which is available as {names}.",
+            context={"offered": [str(offer) for offer in offers]},
         )
     return chosen
 
@@ -126,7 +127,8 @@ def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TY
     name, params = _split_parameters(content_type)
     if name not in known:
         raise UnsupportedMediaTypeProblem(
-            f"A body may be {', '.join(known)}, not {name}.", context={"understood": list(known)}
+            f"The body of this request must have the media type {', '.join(known)}, not {name}.",
+            context={"understood": list(known)},
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
         raise UnsupportedMediaTypeProblem(f"Text must be sent as UTF-8, not {params['charset']}.")
@@ -140,7 +142,7 @@ def require_plain_encoding(content_encoding: str | None) -> None:
     """
     if content_encoding and content_encoding.strip().lower() not in ("", "identity"):
         raise UnsupportedMediaTypeProblem(
-            f"Compressed bodies are not accepted; leave out Content-Encoding: {content_encoding}."
+            f"Compressed request bodies are not accepted; send the body without Content-Encoding: {content_encoding}."
         )
 
 

@@ -44,4 +44,6 @@ class Receiver:
         try:
             self.spool.write(batch)
         except OSError as error:
-            raise StorageFullProblem(f"There is no room to receive this: {error.strerror}.") from error
+            raise StorageFullProblem(
+                f"The server has no disk space to receive the request body: {error.strerror}."
+            ) from error

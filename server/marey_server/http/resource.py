@@ -348,7 +348,8 @@ class Resource(Exchange):
             return
         if self.declared_length() > self._most_bytes(body):
             raise TooLargeProblem(
-                f"The body has {self.declared_length()} bytes; at most {self._most_bytes(body)} are accepted here."
+                f"The request body has {self.declared_length()} bytes; this address accepts at most "
+                f"{self._most_bytes(body)}."
             )
         if body.content is not Bytes and not body.streamed:
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
@@ -373,7 +374,7 @@ class Resource(Exchange):
         try:
             limit = self._most_bytes(body) if body is not None else 0
             if self.received_bytes > limit:
-                raise TooLargeProblem(f"The body is longer than the {limit} bytes that are accepted here.")
+                raise TooLargeProblem(f"The request body is longer than the {limit} bytes that this address accepts.")
             if body is not None and body.streamed:
                 await self.receive(chunk)
             else:
@@ -428,7 +429,7 @@ class Resource(Exchange):
             return data
         if not data:
             if body.required:
-                raise BadRequestProblem("A body is needed.", code="body-missing")
+                raise BadRequestProblem("The request needs a body.", code="body-missing")
             return None
         decode = partial(
             decode_body,

@@ -79,7 +79,7 @@ class RouteTable(Router):
             else:
                 node = node.literals.setdefault(segment, _Node())
         if node.resource is not None:
-            raise ValueError(f"{resource.template()} is served twice")
+            raise ValueError(f"two resources have the path {resource.template()}")
         node.resource = resource
 
     def find_handler(self, request: HTTPServerRequest, **_kwargs: Any) -> HTTPMessageDelegate:

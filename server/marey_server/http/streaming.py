@@ -38,7 +38,7 @@ class ByteRange:
         if start >= stop:
             headers = {"Content-Range": f"bytes */{size}"}
             raise RangeNotSatisfiableProblem(
-                f"The resource has {size} bytes; the range is outside them.", headers=headers
+                f"The requested range is outside the resource, which has {size} bytes.", headers=headers
             )
         return start, stop
 
@@ -130,7 +130,9 @@ class BlobSender(Resource):
             piece = await self.look_up(blobs.read_range, digest, position, stop)
             if len(piece) != stop - position:
                 raise UnavailableProblem(
-                    f"The store has lost bytes of the blob {digest}; run `marey db fsck`.", code="blob-damaged"
+                    f"Bytes of the blob {digest} are missing on the server; its administrator can check the "
+                    "stored data with `marey db fsck`.",
+                    code="blob-damaged",
                 )
             self.write(piece)
             position = stop

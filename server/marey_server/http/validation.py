@@ -77,7 +77,7 @@ def decode_body(
         if error.code == "too-large":
             raise TooLargeProblem(error.detail, errors=[fault]) from None
         refusal = BadRequestProblem if error.code == "bad-syntax" else InvalidProblem
-        raise refusal(f"The body cannot be read: {error}.", code=error.code, errors=[fault]) from None
+        raise refusal(f"The request body cannot be read: {error}.", code=error.code, errors=[fault]) from None
 
 
 def validate_body(model: type[Model], tree: Any) -> Model:
@@ -92,7 +92,7 @@ def validate_body(model: type[Model], tree: Any) -> Model:
     except ValidationError as error:
         faults = field_errors(error, tree)
         first = f"{faults[0].pointer or 'the body'}: {faults[0].detail}"
-        raise InvalidProblem(f"The body is not valid: {first}", code="invalid-body", errors=faults) from None
+        raise InvalidProblem(f"The request body is not valid: {first}", code="invalid-body", errors=faults) from None
 
 
 def survey(tree: Any, steps: tuple[str, ...] = ()) -> bool:

@@ -77,7 +77,7 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
     except MotionError as error:
         wrong = FieldError(pointer="/document", code=error.code, detail=str(error))
         raise InvalidProblem(
-            f"This is not an annotation of the clip: {error}", code=error.code, errors=[wrong]
+            f"The document is not a valid annotation of the clip: {error}", code=error.code, errors=[wrong]
         ) from error
     ref = RevisionRef(item=clip.item.id, revision=clip.item.revision)
     annotation = documents.layer_to_document(layer, ref, given.layer)

@@ -42,7 +42,9 @@ class Message(BaseModel):
             fields: Any = msgpack.unpackb(data)
             return cls.model_validate(fields)
         except (ValueError, TypeError, RecursionError, msgpack.UnpackException, ValidationError) as error:
-            raise BadMessage(f"a child process sent {len(data)} bytes that are no {cls.__name__}: {error}") from error
+            raise BadMessage(
+                f"a child process sent {len(data)} bytes that cannot be read as a {cls.__name__}: {error}"
+            ) from error
 
 
 class AnswerEncoding(Message):

@@ -153,7 +153,8 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
     if held.rig is None:
         fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
         raise InvalidProblem(
-            "The stream was created without a skeleton; send roots, or create a stream with a skeleton.",
+            "Poses need a skeleton, but the stream was created without one; send root positions, or create a "
+            "stream with a skeleton.",
             code="no-skeleton",
             errors=[fault],
         )

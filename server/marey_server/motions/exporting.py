@@ -79,7 +79,8 @@ def find_original(
         if (original := original_of_clip(item_id, info)) is not None:
             return original
     raise NotFoundProblem(
-        "The item was not imported from a file; request another format, such as bvh.", code="no-original"
+        "The item has no original file, because it was not imported from one; request another format, such as bvh.",
+        code="no-original",
     )
 
 
@@ -88,7 +89,10 @@ def write_file(
 ) -> ServedFile:
     """Write the file of an item. Raises `InvalidProblem` if the format cannot represent it."""
     if time == "source" and source.kind is not Kind.PROCESSED:
-        raise InvalidProblem("Only aligned clips can be exported in their source's time.", code="no-such-export")
+        raise InvalidProblem(
+            "Only aligned clips can be exported with the timing of their source clip (time=source).",
+            code="no-such-export",
+        )
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.kind not in WITH_MOTION):
         name, data = write_predecessor(source.kind, source.name, source.parts, source.hierarchy, options)

@@ -57,7 +57,9 @@ class UsableModel:
 def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> FoundModel:
     """Return the model of an item. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFoundProblem(f"An item of the kind {kind} generates no motion; only models do.", code="not-a-model")
+        raise NotFoundProblem(
+            f"Motions can be generated only from models, not from an item of the kind {kind}.", code="not-a-model"
+        )
     part = items.find_part(tx, project, kind, item_id, "model", revision=revision)
     return FoundModel(item_id, items.read_item(tx, project, kind, item_id).name, part)
 
@@ -158,8 +160,8 @@ def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, li
     size = frames * primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
         raise InvalidProblem(
-            f"These samples have {size / MIB:,.0f} MiB of poses; request fewer, with at most "
-            f"{LARGEST_ANSWER_BYTES // MIB} MiB.",
+            f"The poses of these samples take {size / MIB:,.0f} MiB, and an answer may have at most "
+            f"{LARGEST_ANSWER_BYTES // MIB} MiB; request fewer samples.",
             code="samples-too-large",
         )
     motions = primitive.motions(latents)

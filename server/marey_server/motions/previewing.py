@@ -79,7 +79,7 @@ class PreviewOrder(Message):
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
     """Read the inputs of a preview. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
     if kind is not Kind.CLIP:
-        raise NotFoundProblem(f"An item of the kind {kind} cannot be edited; clips can.", code="not-a-clip")
+        raise NotFoundProblem(f"Only clips can be edited, not an item of the kind {kind}.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
     motion = items.read_part(tx, project, Kind.CLIP, item_id, "motion", revision=request.revision).tree
     numbers = _size(motion)
@@ -88,7 +88,9 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         source.sources[name] = items.read_part(tx, project, Kind.CLIP, name, "motion").tree
         numbers += _size(source.sources[name])
     if numbers > MOST_NUMBERS:
-        raise TooLargeProblem("The motions are too long for a preview; submit a job.", code="preview-too-large")
+        raise TooLargeProblem(
+            "The motions are too long for a preview; submit a job of the kind edit instead.", code="preview-too-large"
+        )
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]
         hierarchy = items.read_part(tx, project, Kind.SKELETON, skeleton, "hierarchy", revision=revision)
@@ -151,7 +153,7 @@ def make_preview(packed: bytes) -> bytes:
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
         held = counted(wanted.clip.frame_count, "frame")
-        raise _invalid("/frames", "no-frames", f"The range contains no frame of the result, which has {held}.")
+        raise _invalid("/frames", "no-frames", f"The range contains no frame of the new clip, which has {held}.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:
         raise TooLargeProblem(
@@ -185,7 +187,7 @@ def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
         )
     except MotionError as error:
         if error.code in ("edit-too-large", "edit-too-long"):
-            raise TooLargeProblem(f"{error}; submit a job.", code="preview-too-large") from error
+            raise TooLargeProblem(f"{error}; submit a job instead.", code="preview-too-large") from error
         raise _invalid("/commands", error.code, str(error)) from error
 
 

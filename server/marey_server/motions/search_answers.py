@@ -103,7 +103,8 @@ def _require_room(steps: Sequence[Step], sequel: Sequel) -> None:
     size = frames * steps[0].primitive.spatial.mean.shape[1] * 4
     if not size <= LARGEST_ANSWER_BYTES:
         raise TooLargeProblem(
-            f"The motion found has {frames:,.0f} frames, too many for an answer; ask for fewer steps.",
+            f"The motion that was found has {frames:,.0f} frames, which are too many for one answer; request "
+            "fewer steps.",
             code="search-too-large",
         )
 

@@ -75,7 +75,7 @@ def find_searchables(
 ) -> list[FoundSearchable]:
     """Return the model of each step. Raises `NotFoundProblem`."""
     if kind is not Kind.MODEL:
-        raise NotFoundProblem(f"An item of the kind {kind} cannot be searched; models can.", code="not-a-model")
+        raise NotFoundProblem(f"Only models can be searched, not an item of the kind {kind}.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]
     found = {item: _find(tx, project, item) for item in dict.fromkeys(wanted)}
     return [found[item] for item in wanted]
@@ -129,8 +129,9 @@ def require_drawable(work: float) -> None:
     """Raise `TooLargeProblem` if the trees that a request needs would take more than some seconds to draw."""
     if work > MOST_DRAWING_WORK:
         raise TooLargeProblem(
-            "Drawing samples of so many keyframes, joints or models takes too long for a search; give each model a "
-            "tree of its own first: a job of the kind `tree`, or `marey tree`.",
+            "Without trees, drawing samples from models with so many keyframes, joints or steps takes too "
+            "long for a search; create a tree for each model first, with a job of the kind `tree` or with "
+            "`marey tree`.",
             code="tree-missing",
         )
 

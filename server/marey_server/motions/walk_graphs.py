@@ -35,7 +35,7 @@ def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision
     """Read an evaluation and the displayed frames of its trials. Raises `NotFoundProblem`."""
     if kind is not Kind.EVALUATION:
         raise NotFoundProblem(
-            f"An item of the kind {kind} has no walk graph; evaluations have one.", code="not-an-evaluation"
+            f"Only evaluations have a walk graph, not an item of the kind {kind}.", code="not-an-evaluation"
         )
     name = items.read_item(tx, project, kind, item_id).name
     evaluation, records = (
@@ -75,8 +75,11 @@ def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord])
     rows = 0
     for clip in clips:
         if clip.start != rows or clip.stop < rows:
-            raise ValueError(f"the clip {clip.name!r} has the rows {clip.start} to {clip.stop}, after row {rows}")
+            raise ValueError(
+                f"the clip {clip.name!r} has the rows {clip.start} to {clip.stop}, but the rows of "
+                f"the clips before it end at {rows}"
+            )
         rows = clip.stop
     for record in records:
         if len(record.rows) and not 0 <= record.rows.min() <= record.rows.max() < rows:
-            raise ValueError(f"a trial displayed rows beyond the {rows} of the clips")
+            raise ValueError(f"the record of a trial contains a row that is not among the {rows} rows of the clips")

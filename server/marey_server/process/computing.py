@@ -62,7 +62,7 @@ class ComputeThreads:
             await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_FOR_PLACE_S)
         except TimeoutError:
             raise UnavailableProblem(
-                "Other requests are using all computing threads; try again in a few seconds.",
+                "All computing threads of the server are used by other requests; try again in a few seconds.",
                 code="computing",
                 headers={"Retry-After": str(ASK_AGAIN_S)},
             ) from None

@@ -41,7 +41,9 @@ class DiskSpace:
     def require(self) -> None:
         """Raise `StorageFullProblem` if nothing can be stored."""
         if self._is_low():
-            raise StorageFullProblem("The server's disk has no room left; nothing was written. Deleting is possible.")
+            raise StorageFullProblem(
+                "The disk of the server is full, so nothing was written. Requests that delete data are still accepted."
+            )
 
     def _is_low(self) -> bool:
         now_s = time.monotonic()

@@ -39,7 +39,7 @@ class RequestMemory:
             if others and (exceeds_share or self.held_bytes + more > total):
                 whose = "your requests use" if exceeds_share else "requests use"
                 raise UnavailableProblem(
-                    f"All memory that {whose} is taken; try again in a few seconds, with fewer requests at once.",
+                    f"All the memory that {whose} is in use; try again in a few seconds, with fewer requests at once.",
                     code="memory",
                     headers={"Retry-After": str(RETRY_AFTER_S)},
                 )

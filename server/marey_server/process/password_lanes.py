@@ -64,13 +64,15 @@ class PasswordLane:
         """
         if self._places[address] >= PLACES_PER_ADDRESS:
             raise TooManyRequestsProblem(
-                f"This address may check {PLACES_PER_ADDRESS} passwords at once; wait for an answer first.",
+                f"Your address already has {PLACES_PER_ADDRESS} sign-ins in progress, the most that are "
+                "possible at once; wait for one of them to end.",
                 code="too-many-sign-ins",
                 headers={"Retry-After": "1"},
             )
         if len(self) >= PLACES:
             raise UnavailableProblem(
-                f"The server checks as many passwords at once as it may ({PLACES}); try again in 2 s.",
+                f"The server is already checking {PLACES} passwords, the most that it checks at once; try "
+                "again in 2 s.",
                 code="too-many-passwords",
                 headers={"Retry-After": "2"},
             )

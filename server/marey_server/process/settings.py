@@ -185,7 +185,7 @@ class Settings(BaseSettings):
     @classmethod
     def _check_data(cls, data: Path) -> Path:
         if data.exists() and not data.is_dir():
-            raise ValueError(f"{data} is a file; name a folder, which is created if it does not exist")
+            raise ValueError(f"{data} is a file, but must be a folder; a folder that does not exist is created")
         return data
 
     @field_validator("heartbeat_s")
@@ -194,7 +194,8 @@ class Settings(BaseSettings):
         lease_ttl_s = others.data.get("lease_ttl_s")  # absent where it was refused itself
         if lease_ttl_s is not None and heartbeat_s > lease_ttl_s / 2:
             raise ValueError(
-                f"must be at most half of lease_ttl_s, which is {lease_ttl_s:g}; otherwise running jobs would be lost"
+                f"the value must be at most half of lease_ttl_s, which is {lease_ttl_s:g}; otherwise workers "
+                "would lose running jobs"
             )
         return heartbeat_s
 

@@ -139,7 +139,7 @@ class DatabaseBlobs:
 
     def adopt(self, copy: Path, digest: str) -> None:
         """Refuse: there are no copies."""
-        raise AssertionError(f"{copy} was not made here, for {digest}")
+        raise AssertionError(f"the database keeps no copies of files, but was given the copy {copy} for {digest}")
 
     def check_writable(self) -> None:
         """Do nothing: the server checks the database separately."""

@@ -120,9 +120,11 @@ def put_blob(
 def require_sender(principal: Principal) -> None:
     """Check that the caller may send bytes: users with the scope `write`, for any project, and attempts."""
     if principal.kind == "anonymous":
-        raise UnauthenticatedProblem("Sign in to send bytes.")
+        raise UnauthenticatedProblem("Sign in to upload data.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
-        raise ForbiddenProblem("This token may not write.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            "The token does not allow uploads, because it has no scope to write.", code="insufficient-scope"
+        )
 
 
 EVERY_PROJECT = ""
@@ -138,7 +140,10 @@ def places_of_sender(tx: Transaction) -> tuple[str, ...]:
     if tx.principal.kind != "user" or EVERY_PROJECT in names:
         return (EVERY_PROJECT,)
     if not (found := writable_projects(tx, names)):
-        raise ForbiddenProblem("This token may not write in any project.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            "The token does not allow uploads, because it has no scope to write in any project.",
+            code="insufficient-scope",
+        )
     return tuple(found)
 
 

@@ -54,7 +54,7 @@ def check_length(path: str) -> None:
     """Raise `InvalidProblem` if a path is too long to be stored."""
     if len(path) > MAX_PATH_LENGTH or len(path.encode()) > MAX_PATH_BYTES:
         raise InvalidProblem(
-            f"A path has at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
+            f"A path may have at most {MAX_PATH_LENGTH} characters and {MAX_PATH_BYTES} bytes.", code="long-path"
         )
 
 
@@ -143,7 +143,7 @@ def move_collection(
     old, new = _find(tx, project_row, collection_id, _ALIVE, lock=True).path, request.path
     _require_no_root(old)
     if new.startswith(f"{old}/"):
-        raise InvalidProblem(f"{old!r} cannot be moved into itself.", code="into-itself")
+        raise InvalidProblem(f"The collection {old!r} cannot be moved into itself.", code="into-itself")
     if new != old:
         ensure(tx, project_row, new.rpartition("/")[0])
     with taken(_path_taken(new)):
@@ -236,4 +236,4 @@ def restore_collection(
 
 def _require_no_root(path: str) -> None:
     if not path:
-        raise InvalidProblem("The root of a project cannot be moved or deleted.", code="is-root")
+        raise InvalidProblem("The root collection of a project cannot be moved or deleted.", code="is-root")

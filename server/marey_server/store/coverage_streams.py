@@ -91,7 +91,8 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     if tx.execute(count).scalar_one() >= MOST_STREAMS:
         raise ConflictProblem(
-            f"A project has at most {MOST_STREAMS} coverage streams; delete those that are no longer used.",
+            f"The project already has {MOST_STREAMS} coverage streams, the most that are possible; delete "
+            "those that are no longer used.",
             code="too-many-streams",
         )
     made = Stream(new_id("coverage"), new.settings, new.rig, new.state, 0, None, None, tx.now_us, tx.now_us, 1)
@@ -187,7 +188,8 @@ def _find(tx: Transaction, project_id: str, stream_id: str) -> Stream:
     row = tx.execute(statement).first()
     if row is None:
         raise NotFoundProblem(
-            f"There is no coverage stream {stream_id!r} here; streams are deleted after a day without frames.",
+            f"The project has no coverage stream {stream_id!r}; a stream is deleted when it has received no "
+            "frames for a day.",
             code="no-stream",
         )
     return Stream(**{field.name: row._mapping[field.name] for field in fields(Stream)})

@@ -68,7 +68,7 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
     try:
         canonical = canonical_json(detach_arrays(tree, keep))
     except (ValueError, TypeError, RecursionError) as error:
-        raise InvalidProblem(f"This cannot be stored as a document: {error}", code="bad-document") from error
+        raise InvalidProblem(f"The body cannot be stored as a document: {error}", code="bad-document") from error
     if _NUL.search(canonical):
         raise InvalidProblem("Text in documents must not contain the character U+0000.", code="bad-text")
     return _of_canonical(name, canonical, lambda _, leaf: encoded[leaf["content"]])
@@ -123,7 +123,7 @@ def digest_of_body(body: Tree) -> str:
 
 def _check(tree: Any, schema: str | None) -> str:
     if not isinstance(tree, Mapping):
-        raise InvalidProblem("A document must be an object.", code="bad-document")
+        raise InvalidProblem("A document must be an object, not a list or a single value.", code="bad-document")
     named = tree.get("schema", schema)
     if schema is not None and schema != OPEN_SCHEMA and named != schema:
         raise InvalidProblem(f"This part must have the schema {schema}, not {named!r}.", code="bad-schema")
@@ -137,7 +137,7 @@ def _check(tree: Any, schema: str | None) -> str:
     except ValidationError as error:
         errors = field_errors(error, tree)
         raise InvalidProblem(
-            f"This is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
+            f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error
     return str(named or OPEN_SCHEMA)
 

@@ -66,8 +66,8 @@ def require_kept(tx: Transaction, after: int) -> None:
     last = tx.execute(select(server_state.c.value).where(server_state.c.key == _LAST_DELETED)).scalar()
     if 0 < after < (last or 0):
         raise GoneProblem(
-            f"Events up to number {last} were deleted because they are old; list what you follow again, and continue "
-            f"with after={last}.",
+            f"Events up to number {last} were deleted because they are old; read the resources that you "
+            f"follow again, then continue with after={last}.",
             code="events-deleted",
             context={"after": last},
         )

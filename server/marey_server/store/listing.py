@@ -58,7 +58,7 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
             f"This list cannot be sorted by {unknown[0]!r}, but by {', '.join(keys)}.", code="bad-sort"
         )
     if len(set(bare)) != len(bare):
-        raise BadRequestProblem("A sort key is repeated.", code="bad-sort")
+        raise BadRequestProblem("The parameter sort contains a key twice.", code="bad-sort")
     if unique in bare:
         names = names[: bare.index(unique) + 1]
     else:
@@ -86,7 +86,10 @@ def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> li
         raise _bad_cursor()
     text, fingerprint, values = json.loads(payload)
     if text != order.text or fingerprint != _fingerprint(identity):
-        raise BadRequestProblem("The cursor belongs to a list with other filters or another order.", code="bad-cursor")
+        raise BadRequestProblem(
+            "The cursor belongs to a list with other filters or another order; start again without a cursor.",
+            code="bad-cursor",
+        )
     return list(values)
 
 

@@ -62,7 +62,9 @@ def put_member(
     if expected_rev is None:
         added = tx.execute(tx.insert_or_ignore(member, row).returning(*member.c)).first()
         if added is None and absent:
-            raise PreconditionFailedProblem(f"{user_name!r} is a member already.", code="member-exists")
+            raise PreconditionFailedProblem(
+                f"The user {user_name!r} is already a member of the project.", code="member-exists"
+            )
     changed = added or change_row(
         tx, member, which, {"role": request.role.value}, expected_rev=expected_rev, absent=_no_member(user_name)
     )
@@ -102,7 +104,7 @@ def _require_owner(tx: Transaction, project_row: ProjectRow) -> None:
     owners = select(func.count()).where(member.c.project_id == project_row.id, member.c.role == Role.OWNER.value)
     if tx.execute(owners).scalar_one() == 0:
         raise ConflictProblem(
-            "A project needs at least one owner; make somebody else an owner first.", code="last-owner"
+            "A project needs at least one owner; make another member an owner first.", code="last-owner"
         )
 
 

@@ -100,11 +100,13 @@ def require(
         raise NotFoundProblem(f"There is no project {name!r} that you may see.", code="no-project")
     if not roles.includes(seen.role, need) or (seen.guest and not required.guests):
         if tx.principal.kind == "anonymous":
-            raise UnauthenticatedProblem(f"Sign in to do this in {name!r}.")
-        raise ForbiddenProblem(f"This needs the role {need.value} in {name!r}.", code="insufficient-role")
+            raise UnauthenticatedProblem(f"Sign in to do this in the project {name!r}.")
+        raise ForbiddenProblem(
+            f"You need at least the role {need.value} in the project {name!r} for this.", code="insufficient-role"
+        )
     if not seen.guest and not scopes.allows(tx.principal.scopes, required.scope, name):
         raise ForbiddenProblem(
-            f"This token does not include the scope {required.scope!r} in {name!r}.", code="insufficient-scope"
+            f"This needs a token with the scope {required.scope!r} in the project {name!r}.", code="insufficient-scope"
         )
     return seen
 
@@ -198,7 +200,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
-        raise ForbiddenProblem("This token may not create projects.", code="insufficient-scope")
+        raise ForbiddenProblem("The token does not allow creating projects.", code="insufficient-scope")
     require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,

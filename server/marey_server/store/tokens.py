@@ -133,7 +133,11 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
-        raise ForbiddenProblem(f"Your own credential lacks the scope {beyond[0]!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            "A token can have only scopes of the token that creates it, and yours does not have "
+            f"the scope {beyond[0]!r}.",
+            code="insufficient-scope",
+        )
     ends_us = _end_of(tx, request)
     if tx.principal.token_id is not None:  # the server itself may always make one, for its workers or after a loss
         require_room(tx, "user_tokens")
@@ -169,8 +173,9 @@ def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
     if "expires_in_s" in request.model_fields_set:
         left_s = (own_us - tx.now_us) // 1_000_000
         raise ForbiddenProblem(
-            f"Your own credential ends on {datetime_of(own_us):%Y-%m-%d at %H:%M} UTC, in {_in_words(left_s)}, and a "
-            "token cannot outlive the one that creates it; ask for less, or sign in for a longer time.",
+            "A token cannot be valid longer than the token that creates it, and yours ends on "
+            f"{datetime_of(own_us):%Y-%m-%d at %H:%M} UTC, in {_in_words(left_s)}; request fewer days, or "
+            "sign in for a longer time.",
             code="outlives-credential",
             context={"left_s": left_s, "latest": datetime_of(own_us).isoformat()},
         )
@@ -280,7 +285,9 @@ def _require_user(principal: Principal, scope: str) -> str:
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to see your tokens.")
     if principal.kind != "user" or principal.user_id is None:
-        raise ForbiddenProblem("Only users have tokens.", code="users-only")
+        raise ForbiddenProblem(
+            "Only users have tokens, and the token of a running job does not belong to a user.", code="users-only"
+        )
     if not scopes.allows(principal.scopes, scope):
         raise ForbiddenProblem(f"This token lacks the scope {scope!r}.", code="insufficient-scope")
     return principal.user_id

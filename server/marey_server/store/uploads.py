@@ -59,7 +59,7 @@ def create_upload(tx: Transaction, length: int, *, digest: str | None = None) ->
     """Create an upload of `length` bytes; if `digest` is given, the bytes must have it."""
     sender = _sender(tx)
     if not 0 < length <= MAX_UPLOAD_BYTES:
-        raise TooLargeProblem(f"An upload must have 1 to {MAX_UPLOAD_BYTES} bytes.")
+        raise TooLargeProblem(f"The size of an upload must be 1 to {MAX_UPLOAD_BYTES} bytes.")
     require_room(tx, "user_uploads")
     require_room(tx, "user_upload_bytes", length)
     upload_id = new_id("upload")
@@ -86,7 +86,7 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
         raise _elsewhere(found.offset)
     if offset + len(data) > found.length:
         raise TooLargeProblem(
-            f"The upload was announced with {found.length} bytes; this would make {offset + len(data)}."
+            f"The upload was created for {found.length} bytes, but with this piece it would have {offset + len(data)}."
         )
     if not data:
         return _shown(found)
@@ -192,7 +192,7 @@ def _sender(tx: Transaction) -> dict[str, Any]:
         places = blobs.places_of_sender(tx)
         columns = {"user_id": caller.user_id, "project_ids": None if blobs.EVERY_PROJECT in places else list(places)}
     if columns["user_id"] is None:
-        raise ForbiddenProblem("Only users and their jobs can upload.", code="users-only")
+        raise ForbiddenProblem("Only users and their running jobs can upload data.", code="users-only")
     return columns
 
 
@@ -203,7 +203,7 @@ def _places(row: Row[Any]) -> list[str]:
 def _find(tx: Transaction, upload_id: str) -> Row[Any]:
     caller = tx.principal
     if caller.kind == "anonymous":
-        raise UnauthenticatedProblem("Sign in to upload.")
+        raise UnauthenticatedProblem("Sign in to upload data.")
     if caller.kind == "attempt":
         mine = and_(upload.c.job_id == caller.job_id, upload.c.fence == caller.fence)
     else:

@@ -89,7 +89,7 @@ def change_user(
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
     if request.password is not None and itself:
         if verified_hash is None:
-            raise ForbiddenProblem("Give the current password too.", code="wrong-password")
+            raise ForbiddenProblem("Changing a password needs the current password as well.", code="wrong-password")
         which += (user.c.password_hash == verified_hash,)
     values = _values(request, password_hash)
     tx.lock(_ADMINISTRATORS)
@@ -98,7 +98,10 @@ def change_user(
     except NotFoundProblem:
         if verified_hash is None:
             raise
-        raise PreconditionFailedProblem("The password was changed by another request.", code="wrong-password") from None
+        raise PreconditionFailedProblem(
+            "Another request changed the password at the same time; try again with the new password.",
+            code="wrong-password",
+        ) from None
     _require_some_administrator(tx)
     default = EndTokens.SESSIONS if password_hash is not None else EndTokens.NONE
     tokens.end_tokens(tx, row.id, request.end_tokens or default)
@@ -112,10 +115,10 @@ def _require_changes(principal: Principal, name: str, request: UserChange) -> bo
     if not itself:
         require_administrator(principal, hidden=_no_user(name))
     elif not scopes.allows(principal.scopes, "write"):
-        raise ForbiddenProblem("This token may not change the user.", code="insufficient-scope")
+        raise ForbiddenProblem("The token does not allow changing this user.", code="insufficient-scope")
     if not is_administrator(principal) and (request.administrator is not None or request.disabled is not None):
         raise ForbiddenProblem(
-            "Only administrators can make administrators and disable users.", code="administrators-only"
+            "Only administrators can disable users, and make users administrators.", code="administrators-only"
         )
     return itself
 

@@ -92,7 +92,7 @@ def test_an_aligned_clip_is_given_back_in_its_own_time_where_it_stood(
     assert read.frame_count == len(wanted.poses)
     np.testing.assert_allclose(read.poses[:, :3], wanted.root_translations, atol=0.02)
     assert (
-        "in their source's time"
+        "with the timing of their source clip"
         in run("download", "lab/walks/walk b", "--format", "npz", "--restored", status=1).stderr
     )
 

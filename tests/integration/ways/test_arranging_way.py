@@ -97,17 +97,17 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
     [
         (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is a clip of that name there already."),
         (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
-        (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is nothing at lab/raw/nobody"),
+        (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is no item or folder at lab/raw/nobody"),
         (["mv", "lab/raw/a"], 2, "give the items to move and the destination"),
         (["mv", "lab", "lab/b"], 2, "'lab' is a project"),
         (["mv", "lab/raw", "lab/raw/below/"], 1, "'raw' cannot be moved into itself"),
-        (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is nothing at lab/nobody"),
-        (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? there is no terminal to ask at: confirm with --yes"),
-        (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is in lab/raw, which is given, too"),
-        (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is given twice"),
-        (["rm", "lab/raw/a/", "--yes"], 2, "there is nothing at lab/raw/a"),
-        (["restore", "lab/raw/a"], 2, "there is nothing deleted at lab/raw/a; marey ls --deleted lab shows"),
-        (["tag", "lab/raw/a"], 2, "give tags with --add"),
+        (["mv", "lab/raw/a", "lab/nobody", "lab/other/"], 2, "there is no item or folder at lab/nobody"),
+        (["rm", "lab/raw"], 2, "remove 3 items (lab/raw/)? This needs a confirmation"),
+        (["rm", "lab/raw/a", "lab/raw", "--yes"], 2, "lab/raw/a is inside lab/raw, and the command names both"),
+        (["rm", "lab/raw/a", "lab/raw/a", "--yes"], 2, "lab/raw/a is named twice"),
+        (["rm", "lab/raw/a/", "--yes"], 2, "there is no item or folder at lab/raw/a"),
+        (["restore", "lab/raw/a"], 2, "there is no deleted item at lab/raw/a; `marey ls --deleted lab` lists"),
+        (["tag", "lab/raw/a"], 2, "give them with --add"),
         (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder, and folders have no tags"),
         (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is not a kind of item"),
     ],
@@ -154,7 +154,7 @@ def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_
 def test_of_things_of_one_name_the_kind_says_which(run: Command, lab: ProjectHandle) -> None:
     skeleton = next(lab.skeletons.list())
     skeleton.change(ItemChange(collection="raw", name="a"))
-    assert "lab/raw/a is the name of a skeleton and of a clip" in run("rm", "lab/raw/a", status=2).stderr
+    assert "several items are called lab/raw/a: a skeleton and a clip" in run("rm", "lab/raw/a", status=2).stderr
     run("mv", "lab/raw/a", "lab/raw/rig", "--kind", "skeleton")
     assert lab.skeletons.get(skeleton.id).path == "raw/rig"
     assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
@@ -198,11 +198,11 @@ def test_a_disabled_user_is_let_in_again_and_an_administrator_made(
     assert (marey.users.get("ada").administrator, marey.users.get("ada").display_name) == (True, "Ada L.")
     run("user", "change", "ada", "--no-administrator")
     assert not marey.users.get("ada").administrator
-    assert "give --display-name or --administrator" in run("user", "change", "ada", status=2).stderr
+    assert "give --display-name, --administrator or both" in run("user", "change", "ada", status=2).stderr
 
 
 def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
-    assert "there is nothing at lab/rwa; marey ls lab shows" in run("ls", "lab/rwa", status=2).stderr
+    assert "there is no item or folder at lab/rwa; `marey ls lab` lists" in run("ls", "lab/rwa", status=2).stderr
     (item,) = json.loads(run("ls", "lab/raw/a", "--json").stdout)["items"]
     assert (item["kind"], item["name"]) == ("clip", "a")
     assert json.loads(run("ls", "lab/raw", "--tag", "nobody", "--json").stdout) == {"collections": [], "items": []}

@@ -90,7 +90,7 @@ def test_clips_tagged_as_loops_are_looped_and_frames_can_be_trimmed(lab: Project
     assert [name for name, clip in clips.items() if clip["loop"]] == [first.path]
     rate_hz = second.item.summary["frame_rate_hz"]
     assert clips[second.path]["frames"] == pytest.approx(60 * 60 / rate_hz, abs=2)
-    with pytest.raises(JobUnsuccessful, match="the frames 30:9999 are outside the clip"):
+    with pytest.raises(JobUnsuccessful, match="the range of frames 30:9999 is outside the clip"):
         lab.evaluation(lab.evaluate("walks", **{**options, "trims": {second.id: (30, 9999)}}))
 
 

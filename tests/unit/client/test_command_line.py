@@ -162,7 +162,10 @@ BUILD = ("build-model", "lab/walks", "--name", "w")
         (["pipeline", "nowhere.json", "--project", "lab"], "nowhere.json cannot be read: No such file or directory"),
         (["pipeline", "half.json", "--project", "lab"], "/steps/a/params/x: a string contains half of a surrogate"),
         (["edit", "apply", "lab/a", "--into", "x", "--file", "binary.json"], "binary.json is not text in UTF-8"),
-        (["edit", "apply", "lab/a", "--into", "x", "--file", "source.json"], "source other/x must be in the project"),
+        (
+            ["edit", "apply", "lab/a", "--into", "x", "--file", "source.json"],
+            "source clip other/x must be in the project",
+        ),
         (["search", "lab/m", "--request", "search.json"], "constraints: Input should be a valid tuple"),
         ([*BUILD, "--set", "align.window=5", "--set", "align.window.x=2"], "conflicts with --set align.window=5"),
         ([*BUILD, "--set", "annotate.proposal=steps", "--propose", "steps"], "--propose steps conflicts with --set"),
@@ -299,7 +302,7 @@ def test_who_asks_for_an_item_at_a_folder_is_told_that_it_is_one(
     with pytest.raises(WrongUsage, match=r"^lab/raw is a folder; marey ls lab/raw lists it$"):
         find(script.marey())
     script.answers = [page(), page()]
-    with pytest.raises(WrongUsage, match=r"^there is .* at lab/raw; marey ls lab shows what there is$"):
+    with pytest.raises(WrongUsage, match=r"^there is .* at lab/raw; `marey ls lab` lists the project$"):
         find(script.marey())
 
 

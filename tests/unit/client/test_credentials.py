@@ -100,7 +100,7 @@ def test_logins_are_readable_by_their_owner_alone_and_can_be_forgotten(environme
         ("", 0o600, "one token"),
         ("two words", 0o600, "one token"),
         ("token", 0o644, "chmod 600"),
-        ("tökén", 0o600, "no token"),
+        ("tökén", 0o600, "contains no token"),
     ],
 )
 def test_files_that_hold_no_token_or_that_others_can_read_are_refused(

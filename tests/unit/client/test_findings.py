@@ -57,7 +57,7 @@ def test_suggestions_are_asked_for_by_the_revision_that_was_read_and_with_what_w
     }
     assert found.summary == {"fillings": 3}
     assert found.document() == {"schema": "marey/suggestions@1"}
-    with pytest.raises(LookupError, match="made no report"):
+    with pytest.raises(LookupError, match="has no report"):
         found.report()
 
 

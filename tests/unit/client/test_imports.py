@@ -43,7 +43,9 @@ def test_files_that_would_get_one_name_are_refused_and_none_is_left_out_silently
     for name in ("monday/walk.bvh", "tuesday/walk.bvh"):
         (tmp_path / name).parent.mkdir()
         (tmp_path / name).write_text("x")
-    with pytest.raises(errors.SameName, match=r"monday/walk\.bvh and .*tuesday/walk\.bvh would both be walk\.bvh"):
+    with pytest.raises(
+        errors.SameName, match=r"monday/walk\.bvh and .*tuesday/walk\.bvh would both get the name walk\.bvh"
+    ):
         find_files([tmp_path / "monday", tmp_path / "tuesday"])
     assert len(find_files([tmp_path]).files) == 2
     assert len(find_files([tmp_path / "monday", tmp_path / "monday/walk.bvh"]).files) == 1

@@ -93,7 +93,7 @@ def test_what_the_reader_of_files_can_be_told_an_upload_can_say() -> None:
         ("--rate-hz -1", "--rate-hz: Input should be greater than 0"),
         ("--window 2", "--window: must be odd"),
         ("--slope-limit many", "--slope-limit: 'many' is not a number"),
-        ("--weight Hips", "'Hips': write name=number"),
+        ("--weight Hips", "'Hips' is not a name with a number"),
     ],
 )
 def test_what_the_model_refuses_is_told_with_the_option(arguments: str, told: str) -> None:

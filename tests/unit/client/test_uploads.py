@@ -100,5 +100,5 @@ def test_a_file_that_shrinks_is_noticed(script: ScriptedServer, upload_server: U
         return upload_server(request)
 
     script.answers = [upload_server, shrink, upload_server]
-    with pytest.raises(errors.FileChanged, match="shorter"):
+    with pytest.raises(errors.FileChanged, match="was shortened"):
         script.marey().blobs.put_file(path)

@@ -163,7 +163,7 @@ def test_labels_follow_a_reference_that_is_named() -> None:
     labelled[0] = replace(labelled[0], cuts=(Cut(("start",), 20),))
     error = raised(labelled, TO_FIRST)
     assert "walk b" in str(error)
-    assert "the clip has the cuts contact, the others have start" in str(error)
+    assert "the annotation cuts the clip at contact, but the other clips at start" in str(error)
 
 
 def test_clips_of_several_rates_are_aligned_at_the_commonest_that_of_the_reference_or_the_one_asked_for() -> None:
@@ -236,7 +236,7 @@ def short(frames: int) -> SourceExample:
 @pytest.mark.parametrize(
     ("odd", "options", "code", "said"),
     [
-        (short(3), None, "too-short", "short: the clip has 3 frames at 60 Hz; 4 to 4000 can be aligned"),
+        (short(3), None, "too-short", "short: the clip has 3 frames at 60 Hz; a clip to align must have 4 to 4000"),
         (
             SourceExample("long@1", "long", generate_gait(1.3, 0.2, 67.0)),
             None,
@@ -247,13 +247,13 @@ def short(frames: int) -> SourceExample:
             SourceExample("bones@1", "bones", generate_gait(1.3, 0.2, 1.0, stature_m=1.5)),
             None,
             "skeleton-mismatch",
-            "bones: the clip has another skeleton than the other clips; retarget it first",
+            "bones: the clip has a different skeleton from the other clips; retarget it first",
         ),
         (
             SourceExample("cut@1", "cut", walk(), (Cut(("contact",), 60),)),
             None,
             "outside-clip",
-            "cut: contact, frame 60: the frame is outside the clip, whose frames are 0 to 59",
+            "cut: contact, frame 60: the cut is outside the clip, whose frames are 0 to 59",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
         (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is not one"),
@@ -291,4 +291,4 @@ def test_more_than_fits_into_memory_is_refused_before_anything_is_computed() -> 
     examples = [SourceExample(f"long@{index}", "long", long) for index in range(30)]
     error = raised(examples, AlignOptions(rate_hz=1000.0))
     assert error.code == "too-much"
-    assert "a lower rate" in str(error)
+    assert "a lower frame rate" in str(error)

@@ -114,12 +114,12 @@ def test_both_directions_cost_the_same() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"a": np.zeros((3, 4, 2))}, "need shape"),
-        ({"b": np.zeros((3, 5, 3))}, "equally many points"),
-        ({"a": np.full((3, 4, 3), np.nan)}, "frame 0: positions must be finite"),
-        ({"weights": (1, 2)}, "weights: .*; 4 points need one weight each"),
-        ({"weights": (1, 1, 1, -1)}, "not negative"),
-        ({"weights": (0, 0, 0, 0)}, "not all zero"),
+        ({"a": np.zeros((3, 4, 2))}, "must have the shape"),
+        ({"b": np.zeros((3, 5, 3))}, "same number of points"),
+        ({"a": np.full((3, 4, 3), np.nan)}, "frame 0: a position is infinite or not a number"),
+        ({"weights": (1, 2)}, "weights: .* one weight for each of 4 points"),
+        ({"weights": (1, 1, 1, -1)}, "at least 0"),
+        ({"weights": (0, 0, 0, 0)}, "one must be above 0"),
     ],
 )
 def test_what_makes_no_cost_is_refused(arguments: dict[str, Any], said: str) -> None:

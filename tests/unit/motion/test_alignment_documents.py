@@ -88,7 +88,7 @@ def changed(aligned: AlignedSet, **info: Any) -> list[StoredExample]:
         ({"keyframes": {"down": 31}}, "not aligned together"),
         ({"reference": {"item": "clip_b", "revision": 1, "mirrored": False}}, "not aligned together"),
         ({"frame_rate_hz": 30.0}, "60 frames at 60 Hz, but its time function has 60 at 30 Hz"),
-        ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "the set contains this clip twice"),
+        ({"clip": {"item": "clip_c", "revision": 1, "mirrored": True}}, "the set of clips contains this clip twice"),
     ],
 )
 def test_examples_that_were_not_aligned_together_are_told_apart(
@@ -99,7 +99,7 @@ def test_examples_that_were_not_aligned_together_are_told_apart(
 
 
 def test_no_examples_make_no_set() -> None:
-    with pytest.raises(MotionError, match="no aligned clips"):
+    with pytest.raises(MotionError, match="needs at least one clip"):
         set_from_examples([])
 
 

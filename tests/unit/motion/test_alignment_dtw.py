@@ -224,5 +224,5 @@ def test_what_cannot_be_aligned_is_refused() -> None:
         align(np.array([[0.0, np.nan]]))
     with pytest.raises(MotionError, match="max_run"):
         align(np.zeros((3, 3)), max_run=-1)
-    with pytest.raises(MotionError, match="equally many points"):
+    with pytest.raises(MotionError, match="same number of points"):
         distances(walking_points(3, points=4), walking_points(3, points=5))

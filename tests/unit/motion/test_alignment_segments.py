@@ -48,7 +48,7 @@ def test_labels_that_repeat_are_numbered_in_the_order_of_time() -> None:
     layer = Layer(60, (Segment("left", 0, 20), Segment("right", 20, 40), Segment("left", 40, 60)))
     assert [cut.labels for cut in cuts_of(layer)] == [("left",), ("right",), ("left 2",)]
     clash = Layer(60, (Segment("left", 0, 20), Segment("left", 20, 40), Segment("left 2", 40, 60)))
-    with pytest.raises(AnnotationError, match="left 2: numbering repeated labels gives two labels this name"):
+    with pytest.raises(AnnotationError, match="left 2: a repeated label gets a number"):
         cuts_of(clash)
 
 
@@ -75,11 +75,13 @@ def test_the_labels_that_most_examples_have_are_the_common_ones() -> None:
     assert common_labels({"2": usual, "1": odd, "3": usual}) == usual
     assert common_labels({"2": usual, "1": other}) == usual
     require_labels(usual, usual)
-    with pytest.raises(AnnotationError, match="the clip has the cuts b, a, the others have a, b"):
+    with pytest.raises(AnnotationError, match="the annotation cuts the clip at b, a, but the other clips at a, b"):
         require_labels(other, usual)
-    with pytest.raises(AnnotationError, match="the clip has the cuts none, the others have a"):
+    with pytest.raises(AnnotationError, match="the annotation cuts the clip at none, but the other clips at a"):
         require_labels(((), ()), odd)
-    with pytest.raises(AnnotationError, match=r"the clip has the cuts a \(first frame\), the others have a:"):
+    with pytest.raises(
+        AnnotationError, match=r"the annotation cuts the clip at a \(first frame\), but the other clips at a;"
+    ):
         require_labels((("a",), ()), odd)
 
 

@@ -197,7 +197,7 @@ def test_what_is_no_body_can_be_constrained_but_has_no_front_and_no_feet(tumblin
             {"kind": "position", "joint": "left_wrist", "frames": [110, 130]},
             "frames 110:130 are not a range",
         ),
-        ({"kind": "position", "joint": "left_wrist", "top": "right_shoulder"}, "is not a descendant of"),
+        ({"kind": "position", "joint": "left_wrist", "top": "right_shoulder"}, "is not an ancestor of"),
     ],
 )
 def test_what_cannot_be_asked_for_is_refused_by_place(walk: Clip, constraint: dict[str, Any], says: str) -> None:

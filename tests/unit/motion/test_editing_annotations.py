@@ -146,7 +146,9 @@ def test_a_layer_cannot_hold_overlapping_segments() -> None:
 def test_a_piece_knows_its_own_segment_and_the_keyframes_within_it() -> None:
     piece = piece_of(WALK, WALK.segments[1], 6, 20)
     assert piece == Layer(14, (Segment("right", 4, 12),), (Keyframe("lift", 7), Keyframe("strike", 7)))
-    with pytest.raises(AnnotationError, match="the frames 11:20 of the clip's 30 do not contain this segment"):
+    with pytest.raises(
+        AnnotationError, match="the segment is not within the frames 11:20 that are kept of the clip's 30 frames"
+    ):
         piece_of(WALK, WALK.segments[1], 11, 20)
 
 

@@ -107,19 +107,19 @@ def test_a_pose_can_be_appended_to_a_pose() -> None:
 def test_clips_of_other_skeletons_are_refused() -> None:
     stranger = game_skeleton()
     pose = np.concatenate((stranger.offsets[0], stranger.rest_rotations.ravel())).astype(np.float32)
-    with pytest.raises(EditError, match="has another skeleton; retarget it first"):
+    with pytest.raises(EditError, match="has a different skeleton from the edited clip; retarget it first"):
         join(make_walk(), Clip(stranger, 60.0, pose[None]))
 
 
 def test_unknown_sources_are_told_with_those_that_there_are() -> None:
-    with pytest.raises(EditError, match=r"no source is called 'third'; known are: second"):
+    with pytest.raises(EditError, match=r"no source clip is called 'third'; the source clips are: second"):
         apply_edit(make_walk(), [Concatenate(source="third")], sources={"second": make_walk()})
 
 
 def test_joining_stops_before_memory_does() -> None:
     walk = make_walk()
     again = [Concatenate(source="walk")] * 40
-    with pytest.raises(EditError, match="the result would have") as refused:
+    with pytest.raises(EditError, match="the edited clip would have") as refused:
         apply_edit(walk, again, sources={"walk": walk}, most_numbers=20 * walk.poses.size)
     assert refused.value.code == "edit-too-large"
 

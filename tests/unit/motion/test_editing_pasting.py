@@ -78,7 +78,9 @@ def test_joints_whose_axes_differ_are_refused_by_name() -> None:
     rest = walk.skeleton.rest_rotations.copy()
     rest[walk.skeleton.index_of("LeftForeArm")] = quaternions.from_axis_angle([0.0, 1.0, 0.0], 0.5)
     other = replace(walk, skeleton=replace(walk.skeleton, rest_rotations=rest))
-    with pytest.raises(EditError, match="joint LeftForeArm: the joint's orientation in the rest pose") as refused:
+    with pytest.raises(
+        EditError, match="joint LeftForeArm: the joint has different orientations in the rest poses"
+    ) as refused:
         paste(walk, other)
     assert refused.value.code == "other-axes"
 

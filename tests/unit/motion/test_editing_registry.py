@@ -119,7 +119,7 @@ def test_unknown_commands_and_parameters_are_refused_by_name() -> None:
 
 
 def test_one_clip_is_not_asked_of_what_makes_several() -> None:
-    with pytest.raises(EditError, match="return 2 clips instead of one"):
+    with pytest.raises(EditError, match="split the clip into 2 clips"):
         apply_edit(make_walk(), [Split(at=[50])])
 
 

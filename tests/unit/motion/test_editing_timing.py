@@ -46,7 +46,7 @@ def test_there_and_back_is_nearly_the_motion() -> None:
 @pytest.mark.parametrize("command", [Resample(frame_rate_hz=100_000.0), Retime(speed=0.01)])
 def test_a_result_that_is_too_long_is_refused_before_it_is_made(command: Resample | Retime) -> None:
     walk = make_walk()
-    with pytest.raises(EditError, match="frames; the limit for this skeleton") as refused:
+    with pytest.raises(EditError, match="frames; with this skeleton a clip may have") as refused:
         apply_edit(walk, [command], most_numbers=10 * walk.poses.size)
     assert refused.value.code == "edit-too-large"
 
@@ -56,7 +56,7 @@ def test_a_result_of_the_greatest_size_is_made_and_a_larger_one_is_refused() -> 
     frames = 2 * walk.frame_count - 1
     most = frames * walk.poses.shape[1]
     assert apply_edit(walk, [slow], most_numbers=most).frame_count == frames
-    with pytest.raises(EditError, match=f"the result would have {frames} frames"):
+    with pytest.raises(EditError, match=f"the edited clip would have {frames} frames"):
         apply_edit(walk, [slow], most_numbers=most - 1)
 
 

@@ -328,7 +328,7 @@ def test_grids_that_do_not_fit_are_refused() -> None:
         OnlineCoverage(
             RATE_HZ, Grid(speeds_m_s=tuple(0.1 * n for n in range(1, 102)), turn_rates_deg_s=tuple(range(20)))
         )
-    with pytest.raises(MotionError, match="as in the grid"):
+    with pytest.raises(MotionError, match="of the grid"):
         OnlineCoverage(RATE_HZ, seconds=np.zeros((9, 8)))
 
 

@@ -85,7 +85,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
         rows_of_sources(database.clips, ["nobody"])
     with pytest.raises(MotionError, match="no clip is left"):
         without_sources(database, list(clips_by_source(database.clips)))
-    with pytest.raises(MotionError, match="both databases have the clip clip_000"):
+    with pytest.raises(MotionError, match="both databases contain the clip clip_000"):
         joined(database, synthetic_database(tracks[:1]))
     with pytest.raises(MotionError, match="same options"):
         joined(database, replace(database, options=database.options.replace(end_policy="trim")))

@@ -149,7 +149,7 @@ def test_rows_one_asks_about_are_listed_with_why_they_could_not_be_chosen() -> N
 def test_ticks_and_rows_that_there_are_not_are_refused() -> None:
     made = played()
 
-    with pytest.raises(MotionError, match="the trial has 780 ticks and no tick 780"):
+    with pytest.raises(MotionError, match="the trial has no tick 780; it has 780 ticks"):
         explained(made, 780)
     with pytest.raises(MotionError, match="row -1"):
         explained(made, 0, others=(-1,))

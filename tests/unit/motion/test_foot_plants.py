@@ -157,7 +157,7 @@ def test_the_root_comes_down_for_a_leg_that_is_too_short(walk: Clip) -> None:
 
 def test_contacts_that_do_not_fit_the_motion_are_refused(walk: Clip) -> None:
     short = FootContacts(np.ones(3, np.bool_), np.ones(3, np.bool_))
-    with pytest.raises(EditError, match="but the motion has 240 frames"):
+    with pytest.raises(EditError, match="each of the motion's 240 frames"):
         plant_feet(walk.skeleton, Motion.of(walk), 60.0, _feet(walk.skeleton), contacts=[short, short])
     with pytest.raises(ValidationError, match="blend_s"):
         PlantOptions(blend_s=-1.0)

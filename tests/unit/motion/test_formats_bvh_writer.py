@@ -114,5 +114,5 @@ def test_numbers_are_written_to_six_decimals(value: float) -> None:
 
 
 def test_lengths_that_no_loader_could_read_are_refused() -> None:
-    with pytest.raises(FormatError, match="does not fit"):
+    with pytest.raises(FormatError, match="is too large to be written"):
         format_table(np.array([[1e13]]))

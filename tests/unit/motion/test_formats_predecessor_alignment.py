@@ -58,7 +58,7 @@ def test_where_the_stair_stands_time_goes_on_evenly() -> None:
     [
         ({}, "'time_function' must be a list"),
         ({"time_function": "["}, "'time_function' cannot be read"),
-        ({"time_function": [0, 0.5]}, "list of two frames"),
+        ({"time_function": [0, 0.5]}, "list of at least two frames"),
         ({"time_function": [0, 1e308]}, "names frame 1e.308, which no source has"),
         ({"time_function": [0, 5, 4]}, "goes back at canonical frame 2"),
         (

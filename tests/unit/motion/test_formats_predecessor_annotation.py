@@ -91,8 +91,8 @@ def test_labels_that_overlap_can_be_read_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("document", "told"),
     [
-        ({}, "must have 'sections'"),
-        ({"sections": 3}, "must have 'sections'"),
+        ({}, "must have either the field 'sections'"),
+        ({"sections": 3}, "must have either the field 'sections'"),
         ({"sections": [{"start_idx": 1}]}, "'end_idx' must be int"),
         ({"sections": {"a": {"start_idx": 1}}}, "'a' must be list"),
         ({"sections": "{"}, "'sections' cannot be read"),
@@ -100,7 +100,7 @@ def test_labels_that_overlap_can_be_read_one_by_one() -> None:
         ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "the end of a segment must be after its start"),
         ({"semantic_annotation": {"a": [1.5]}}, "whole numbers"),
         ({"semantic_annotation": {"a": ["x"]}}, "'a'"),
-        ({"semantic_annotation": {"a": [True]}}, "list of frames"),
+        ({"semantic_annotation": {"a": [True]}}, "list of frame numbers"),
         ({"semantic_annotation": {"a": [-3]}}, "within the clip's frames 0:40"),
         ({"semantic_annotation": {"a": [10**400]}}, "'a'"),
         ({"sections": [], "keyframes": [3]}, "'keyframes' must be dict"),

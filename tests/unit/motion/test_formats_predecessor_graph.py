@@ -67,11 +67,15 @@ def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing() -> No
         (["nodes", "walk"], [], "'walk' must be dict"),
         (["nodes", "walk", "12", "name"], 3, "'name' must be str"),
         (["nodes", "walk", "12", "name"], "end", "walk: two nodes are called 'end'"),
-        (["nodes", "walk", "12", "type"], "begin", "walk/begin: 'begin' is not a type"),
+        (["nodes", "walk", "12", "type"], "begin", "walk/begin: 'begin' is not a type of node"),
         (["nodes", "walk", "12", "transitions"], [], "walk/begin: 'transitions' must be an object"),
-        (["nodes", "walk", "12", "transitions"], {"walk:99": {}}, "walk/begin: there is no node 'walk:99'"),
-        (["start_node"], "idle", "'start_node' must be an action and a model"),
-        (["start_node"], ["idle", "99"], "there is no node"),
+        (
+            ["nodes", "walk", "12", "transitions"],
+            {"walk:99": {}},
+            "walk/begin: a transition leads to the node 'walk:99', which",
+        ),
+        (["start_node"], "idle", "'start_node' must be a list of two names"),
+        (["start_node"], ["idle", "99"], "names the node"),
     ],
 )
 def test_damaged_graphs_are_refused_by_the_node(path: list[str], value: object, told: str) -> None:

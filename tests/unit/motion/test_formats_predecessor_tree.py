@@ -58,15 +58,15 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "told"),
     [
-        (["data"], [], r"'data' has shape \(0,\)"),
+        (["data"], [], r"'data' has the shape \(0,\)"),
         (["data"], [[1.0], [2.0, 3.0]], "'data'"),
         (["data", 3, 1], 1e308, "'data', row 3: a number beyond those of single precision"),
-        (["root", "indices"], [0, 1], "root: its indices must name each of the 40"),
-        (["root", "indices"], [*range(39), 40], "root: indices must lie between 0 and 39"),
-        (["root", "children", 0, "indices"], [], "root.0: indices must name one sample or more"),
+        (["root", "indices"], [0, 1], "root: the field indices must contain the number of each of the 40"),
+        (["root", "indices"], [*range(39), 40], "root: each of the indices must be from 0 to 39"),
+        (["root", "children", 0, "indices"], [], "root.0: the field indices must contain at least one sample"),
         (["root", "children", 0, "indices"], [0, 0.5], "root.0"),
-        (["root", "children", 1, "indices"], [0], "do not share its samples"),
-        (["root", "children", 0, "children", 0], 3, r"root\.0\.0: a node has a list"),
+        (["root", "children", 1, "indices"], [0], "must together have all samples"),
+        (["root", "children", 0, "children", 0], 3, r"root\.0\.0: each node needs a list"),
     ],
 )
 def test_damaged_trees_are_refused_by_the_node(path: list[Any], value: object, told: str) -> None:

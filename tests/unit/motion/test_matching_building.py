@@ -291,12 +291,12 @@ class TestRootBone:
 class TestRefusals:
     def test_clips_of_another_skeleton_are_refused_by_name(self) -> None:
         clip, _ = game_walk()
-        with pytest.raises(MotionError, match="stray: the clip moves another skeleton") as caught:
+        with pytest.raises(MotionError, match="stray: the clip has a different skeleton") as caught:
             build_database([SourceClip("a", "walk", WALK), SourceClip("b", "stray", clip)], BODY)
         assert caught.value.code == "skeleton-mismatch"
 
     def test_bones_of_other_lengths_are_another_skeleton(self) -> None:
-        with pytest.raises(MotionError, match="another skeleton"):
+        with pytest.raises(MotionError, match="a different skeleton"):
             built(generate_gait(1.2, 0.0, 1.0, stature_m=1.6))
 
     def test_a_uid_names_one_clip(self) -> None:
@@ -305,11 +305,11 @@ class TestRefusals:
         assert caught.value.code == "uid-repeated"
 
     def test_frames_that_are_not_there_are_refused_by_name(self) -> None:
-        with pytest.raises(MotionError, match="one, slice: frames 100:500"):
+        with pytest.raises(MotionError, match="one, slice: the range of frames 100:500"):
             built(WALK, frames=(100, 500))
 
     def test_no_clips_make_no_database(self) -> None:
-        with pytest.raises(MotionError, match="no clips"):
+        with pytest.raises(MotionError, match="none were given"):
             build_database([], BODY)
 
     def test_a_body_that_never_faces_anywhere_is_refused_by_name(self) -> None:
@@ -319,7 +319,7 @@ class TestRefusals:
         skeleton = replace(WALK.skeleton, offsets=offsets, end_sites=())
         poses = np.tile(np.concatenate(([0, 1, 0], skeleton.rest_rotations.reshape(-1))), (30, 1)).astype(np.float32)
         body = replace(BODY, skeleton=skeleton)
-        with pytest.raises(MotionError, match="one: the left and right joints lie above each other") as caught:
+        with pytest.raises(MotionError, match="one: the forward direction of the body cannot be computed") as caught:
             built(Clip(skeleton, 60.0, poses), DatabaseOptions(keep_rest_poses=True), body)
         assert caught.value.code == "heading-undefined"
 

@@ -408,14 +408,14 @@ def test_a_search_period_of_less_than_a_tick_is_refused() -> None:
 def test_a_trajectory_of_another_rate_is_refused() -> None:
     database = synthetic_database([arc_track(1.0, 0.0, 5.0)])
 
-    with pytest.raises(MotionError, match="30 ticks per second, the database 60"):
+    with pytest.raises(MotionError, match="30 ticks per second, but the database has 60"):
         play(database, reference(circle(1.0, 0.0), rate_hz=30.0))
 
 
 def test_an_index_of_other_rows_is_refused() -> None:
     database, other = synthetic_database([arc_track(1.0, 0.0, 5.0)]), synthetic_database([arc_track(1.0, 0.0, 6.0)])
 
-    with pytest.raises(MotionError, match="360 rows, the database 300"):
+    with pytest.raises(MotionError, match="360 rows, but the database has 300"):
         run_trial(database, index_of(other), reference(circle(1.0, 0.0)), EXACT)
 
 

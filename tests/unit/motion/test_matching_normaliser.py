@@ -73,12 +73,12 @@ def test_a_normaliser_survives_being_kept_as_a_tree() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"offset": np.zeros(27)}, "it was changed"),
+        ({"offset": np.zeros(27)}, "the numbers of the normaliser were changed"),
         ({"scale": np.zeros(27)}, "scales positive"),
         ({"scale": np.ones(3)}, "do not match"),
         ({"offset": np.full(27, np.nan)}, "must be finite"),
-        ({"names": None}, "not a normaliser"),
-        ({"offset": "abc"}, "not a normaliser"),
+        ({"names": None}, "not a valid normaliser"),
+        ({"offset": "abc"}, "not a valid normaliser"),
     ],
 )
 def test_a_tree_that_is_no_normaliser_is_refused(change: dict[str, Any], message: str) -> None:

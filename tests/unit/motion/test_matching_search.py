@@ -301,7 +301,7 @@ def test_clips_without_selectable_rows_and_empty_clips_are_passed_over() -> None
 
 
 def test_a_database_in_which_nothing_can_be_chosen_says_so() -> None:
-    with pytest.raises(MotionError, match="no row can be chosen") as caught:
+    with pytest.raises(MotionError, match="no row of the database can be selected") as caught:
         build_index(np.zeros((20, 27)), np.array([0, 20]), np.zeros(20, bool))
     assert caught.value.code == "nothing-selectable"
 

@@ -172,8 +172,8 @@ def test_a_left_turn_in_the_mirror_is_a_right_turn() -> None:
 @pytest.mark.parametrize(
     ("partners", "message"),
     [
-        ([0, 1], "one partner that no other joint has"),
-        ([0, 2, 2], "one partner that no other joint has"),
+        ([0, 1], "no two joints may have the same"),
+        ([0, 2, 2], "no two joints may have the same"),
         ([1, 0, 2], "the root must be its own partner"),
     ],
 )

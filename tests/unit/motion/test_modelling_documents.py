@@ -120,7 +120,7 @@ def test_a_model_of_other_joints_is_refused() -> None:
         (("spatial", "knots"), "knots"),
         (("spatial", "projections"), "projections"),
         (("temporal", "variances"), "variances"),
-        (("mixture", "means"), "dimensions for"),
+        (("mixture", "means"), "components; the two numbers must be equal"),
         (("mixture", "weights"), "weights"),
     ],
 )

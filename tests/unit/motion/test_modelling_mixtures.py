@@ -184,7 +184,7 @@ def test_the_choice_can_be_made_by_hand() -> None:
 def test_numbers_that_are_none_are_refused() -> None:
     with pytest.raises(MotionError, match="finite"):
         fit_mixture(np.full((5, 2), np.nan))
-    with pytest.raises(MotionError, match="do not vary"):
+    with pytest.raises(MotionError, match="all latent vectors are equal"):
         fit_mixture(np.ones((5, 2)))
 
 

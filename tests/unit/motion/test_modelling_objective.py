@@ -271,8 +271,8 @@ def test_a_constraint_that_makes_no_sense_is_refused_by_its_field(make: Callable
             JointPositionConstraint(joint="head", at="contact", target_m=(0.0, 0.0, 0.0)),
             "no keyframe 'contact'; it has start, end, middle",
         ),
-        (JointPositionConstraint(joint="head", at=-1.0, target_m=(0.0, 0.0, 0.0)), "not within 0 to 30"),
-        (RootPositionConstraint(at=FRAMES, target_m=(0.0, 0.0)), "not within 0 to 30"),
+        (JointPositionConstraint(joint="head", at=-1.0, target_m=(0.0, 0.0, 0.0)), "the canonical frames are 0 to 30"),
+        (RootPositionConstraint(at=FRAMES, target_m=(0.0, 0.0)), "the canonical frames are 0 to 30"),
     ],
 )
 def test_what_the_model_has_not_is_refused_by_the_place_of_the_constraint(constraint: Any, message: str) -> None:
@@ -288,7 +288,7 @@ def test_a_heading_needs_hips_and_shoulders() -> None:
 
 
 def test_too_many_constraints_are_refused() -> None:
-    with pytest.raises(InvalidConstraint, match="more than"):
+    with pytest.raises(InvalidConstraint, match="at most"):
         build_objective(sliding(), [RootPositionConstraint(at=0, target_m=(0.0, 0.0))] * (MOST_SOUGHT + 1), {})
 
 

@@ -52,7 +52,7 @@ def test_what_is_no_basis_is_refused() -> None:
     for frames, count in ((30, 3), (1, 7)):
         with pytest.raises(MotionError):
             SplineBasis.clamped(frames, count)
-    with pytest.raises(MotionError, match="between 0 and 29"):
+    with pytest.raises(MotionError, match="from 0 to 29"):
         SplineBasis.clamped(30, 9).matrix([29.5])
     with pytest.raises(MotionError, match="12 samples"):
         SplineBasis.clamped(30, 9).fit(np.zeros((12, 1)))

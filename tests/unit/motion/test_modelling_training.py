@@ -317,7 +317,7 @@ def test_examples_that_make_no_model_are_refused_by_name() -> None:
     back[5] = back[6]
     for members, told in (
         ({"motion": holes}, "not finite"),
-        ({"motion": loose}, "bone_1 moves against its parent"),
+        ({"motion": loose}, "bone_1 moves relative to its parent"),
         ({"motion": odd.motion.at_frames(np.arange(20))}, "20 frames"),
         ({"time_function": back}, "is not strictly increasing"),
     ):

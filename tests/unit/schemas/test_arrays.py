@@ -58,7 +58,7 @@ def test_a_model_dumped_to_python_keeps_its_arrays() -> None:
         (POSES * np.float32(np.nan), "nan; only finite numbers"),
         (POSES.tolist(), "expected an array"),
         ("poses", "expected an array"),
-        (leaf([1, 2]), r"axis 0 must be a list of 3, not a list of 2"),
+        (leaf([1, 2]), r"on axis 0, a list of 3 is needed, not a list of 2"),
         (EncodedArray("<f4", (3, 7), b"rubbish"), "not a block-encoded array"),
     ],
 )

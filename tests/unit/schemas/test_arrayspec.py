@@ -42,7 +42,7 @@ def test_claims_beyond_reason_are_refused(shape: list[int]) -> None:
 def test_a_limit_names_the_array_that_exceeds_it() -> None:
     spec = ArraySpec("<f8", (100, 10))
     spec.require(8000)
-    with pytest.raises(ArrayError, match=r"<f8 \[100, 10\] is larger than the 7999 bytes allowed"):
+    with pytest.raises(ArrayError, match=r"<f8 \[100, 10\] is larger than the 7999 bytes that are allowed"):
         spec.require(7999)
 
 

@@ -65,7 +65,7 @@ def changed(change: Callable[..., Any]) -> dict[str, Any]:
         ),
         (
             lambda one: one["actions"]["walk"]["primitives"]["left"]["transitions"].pop(0),
-            "walk/right: it cannot be reached from the start",
+            "walk/right: this primitive cannot be reached from the start",
         ),
         (
             lambda one: (
@@ -74,7 +74,7 @@ def changed(change: Callable[..., Any]) -> dict[str, Any]:
                     {"action": "fall", "primitive": "down"}
                 )
             ),
-            "fall/down: no primitive that ends a sequence can be reached from it",
+            "fall/down: no primitive that ends a sequence can be reached from this one",
         ),
         (lambda one: one["actions"]["walk"]["primitives"]["left"].update(type="turn"), "type"),
         (lambda one: one.update(actions={}), "actions"),

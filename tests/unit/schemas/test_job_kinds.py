@@ -52,10 +52,10 @@ def test_every_kind_describes_itself_with_a_json_schema() -> None:
 
 
 def test_a_kind_that_counts_its_tasks_says_who_gathers_them_and_spreads_no_input() -> None:
-    with pytest.raises(ValueError, match="declare task_count and gathering together"):
+    with pytest.raises(ValueError, match="declare either both of task_count and gathering"):
         declare(task_count=lambda _params: 2)
     clips = {"clips": InputSpec(kind=Kind.CLIP, many=True)}
-    with pytest.raises(ValueError, match="not from both"):
+    with pytest.raises(ValueError, match="not both"):
         declare(task_count=lambda _params: 2, gathering="tidy:gather", inputs=clips, fan_out="clips")
     assert declare(task_count=lambda _params: 2, gathering="tidy:gather").document().gathers
 

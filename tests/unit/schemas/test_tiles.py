@@ -87,7 +87,7 @@ def test_straight_lines_cost_next_to_nothing(dtype: str) -> None:
 
 
 def test_a_tile_that_claims_another_size_is_refused_unread() -> None:
-    with pytest.raises(TileError, match="claimed"):
+    with pytest.raises(TileError, match="the tile declares"):
         tiles.unpack(forged(bytes(1 << 24)), FLOAT, 4, 4)
 
 

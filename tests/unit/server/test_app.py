@@ -87,7 +87,7 @@ def test_a_port_that_is_taken_is_told_with_what_to_do(tmp_path: Path) -> None:
         serve = [sys.executable, "-m", "marey_client.cli", "serve", "--data", str(tmp_path), "--workers", "0"]
         done = subprocess.run([*serve, "--port", str(port)], capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert f"port {port}: Address already in use; choose others with --host and --port" in done.stderr.splitlines()[-1]
+    assert f"port {port}: Address already in use; choose another address with --host" in done.stderr.splitlines()[-1]
 
 
 def test_a_server_whose_database_is_away_stops_all_the_same(

@@ -1,4 +1,4 @@
-"""Rows of coverage streams: compare-and-swap, repeated requests, deletion after a day."""
+"""Rows of coverage streams: compare-and-swap, repeated requests, deletion no frames for a day."""
 
 from collections.abc import Callable
 from typing import Any
@@ -168,7 +168,7 @@ def test_what_nobody_uses_for_a_day_is_dropped_and_what_is_used_stays(
     assert garbage.collect_garbage(lab.database).coverage_streams == 0
     clock.advance(0.5 * DAY_S)
     for gone in (coverage_streams.read_stream, coverage_streams.read_to_advance):
-        with pytest.raises(NotFoundProblem, match="after a day"):  # even before it is swept
+        with pytest.raises(NotFoundProblem, match="no frames for a day"):  # even before it is swept
             lab.read(gone, "lab", stream.id)
     assert [one.id for one in lab.read(coverage_streams.list_streams, "lab").items] == [used.id]
     assert garbage.collect_garbage(lab.database).coverage_streams == 1

@@ -28,7 +28,7 @@ def test_pointers_escape_as_rfc_6901_says() -> None:
 def test_a_rule_of_ours_is_told_in_its_own_words() -> None:
     (fault,) = told(Trim, BACKWARDS)
     assert (fault.pointer, fault.code) == ("", "value-error")
-    assert fault.detail == "the stop 2 must lie after the start 5"
+    assert fault.detail == "the stop, frame 2, must be after the start, frame 5"
 
 
 def test_a_fault_of_a_document_is_told_as_one_of_a_body() -> None:

@@ -84,7 +84,10 @@ DAMAGES = {
         "blob-corrupt",
         sqlalchemy.update(blob_chunk).where(blob_chunk.c.digest == digest_of(FILE)).values(data=b"X" * len(FILE)),
     ),
-    "lost bytes": ("blob-incomplete", sqlalchemy.delete(blob_chunk).where(blob_chunk.c.digest == digest_of(FILE))),
+    "are missing on the server": (
+        "blob-incomplete",
+        sqlalchemy.delete(blob_chunk).where(blob_chunk.c.digest == digest_of(FILE)),
+    ),
     "shortened bytes": (
         "blob-incomplete",
         sqlalchemy.update(blob_chunk).where(blob_chunk.c.digest == digest_of(FILE)).values(data=b"X"),

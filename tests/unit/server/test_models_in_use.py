@@ -77,7 +77,7 @@ def test_samples_that_would_be_too_large_are_refused_before_they_are_made(loaded
         duration_range_s=None,
         log_slope_range=None,
     )
-    with pytest.raises(InvalidProblem, match="MiB of poses; request fewer"):
+    with pytest.raises(InvalidProblem, match="MiB; request fewer samples"):
         sample_document(FOUND, dataclasses.replace(model, primitive=slow), 2, 0)
 
 

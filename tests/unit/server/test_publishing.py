@@ -310,7 +310,7 @@ def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(
 ) -> None:
     publish(lab, rig_draft(), clip_draft())
     monkeypatch.setattr(publishing, "write_head", lambda *_args: False)
-    with pytest.raises(ConflictProblem, match="'walk' is being changed") as refused:
+    with pytest.raises(ConflictProblem, match="are changing the item 'walk'") as refused:
         publish(lab, rig_draft(), clip_draft(seed=1))
     assert refused.value.error_code == "contended"
 

@@ -27,7 +27,7 @@ def test_a_misspelt_setting_in_the_file_is_refused(tmp_path: Path, monkeypatch: 
 
 def test_a_data_folder_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "takes.zip").touch()
-    with pytest.raises(ValueError, match=r"takes\.zip is a file; name a folder"):
+    with pytest.raises(ValueError, match=r"takes\.zip is a file, but must be a folder"):
         Settings(data=tmp_path / "takes.zip")
 
 

@@ -196,7 +196,7 @@ def refusal(project: Project, **params: Any) -> JobRefused:
     [
         ({"reference": "clip_z"}, "unknown-reference", "clip_z is not one of the clips"),
         ({"weights": {"Tail": 1.0}}, "unknown-joint", "Tail"),
-        ({"layer": "steps"}, "no-annotations", "none are given"),
+        ({"layer": "steps"}, "no-annotations", "no annotations are given"),
     ],
 )
 def test_what_cannot_be_done_refuses_the_job(project: Project, params: dict[str, Any], code: str, said: str) -> None:

@@ -112,7 +112,11 @@ def read_evaluated_clips(
     Raises `JobRefused` if the evaluation does not list its clips.
     """
     if "clip_set" not in document:
-        raise JobRefused("clips-unknown", f"{evaluation.path} does not record its clips; evaluate them again")
+        raise JobRefused(
+            "clips-unknown",
+            f"the evaluation {evaluation.path} does not list its clips, because an old version "
+            "created it; evaluate the clips again",
+        )
     wanted = ClipSet.from_tree(document["clip_set"])
     normaliser = Normaliser.from_tree(document["normaliser"])
     with refusing_motion_errors():
@@ -191,14 +195,15 @@ def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, 
         place = commonest.path
         raise JobRefused(
             "several-skeletons",
-            f"the clips have {len(others) + 1} skeletons: {count} of {len(used)} have {place}, but not {_listed(odd)}; "
-            "move all clips to one skeleton first, with marey retarget",
+            f"the clips have {len(others) + 1} different skeletons: {count} of {len(used)} have {place}, but "
+            f"{_listed(odd)} do not; move all clips to one skeleton first, with `marey retarget`",
         )
     skeleton = max(used, key=lambda ref: ref.revision)
     edited = wanted.rig
     if edited is not None and edited.item != most:
         raise JobRefused(
-            "wrong-rig", f"the input rig is the skeleton {edited.item}, but the clips have the skeleton {most}"
+            "wrong-rig",
+            f"the input `rig` is the skeleton {edited.item}, but the clips have the skeleton {most}; give that one",
         )
     mapping = skeleton if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
     return Rig(skeleton, mapping)
@@ -209,7 +214,8 @@ def _trim(pin: PinnedInput, motion: MotionDocument, trims: Mapping[str, tuple[in
     if trim is not None and trim[1] > len(motion.poses):
         frames = len(motion.poses)
         raise JobRefused(
-            "bad-trim", f"{pin.path}: the frames {trim[0]}:{trim[1]} are outside the clip, which has {frames}"
+            "bad-trim",
+            f"{pin.path}: the range of frames {trim[0]}:{trim[1]} is outside the clip, which has {frames} frames",
         )
     return trim
 

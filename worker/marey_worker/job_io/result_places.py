@@ -30,8 +30,8 @@ class ResultPlaces:
             if (kind, "/".join(filter(None, (self._into, collection))), name) in self._inputs:
                 path = "/".join(filter(None, (self._into, collection, name)))
                 raise MotionError(
-                    f"the result would take the place of {path}, which is an input of the job; choose "
-                    "another folder or another name for the results",
+                    f"the result would replace {path}, which is an input of the job; choose another folder or "
+                    "another name for the results",
                     code="own-input",
                 )
         self._taken |= {(kind, collection, name) for name in names}
@@ -44,7 +44,8 @@ class ResultPlaces:
     def _require_free(self, kind: Kind, collection: str, name: str) -> None:
         if len(name) > MAX_NAME_LENGTH:
             raise MotionError(
-                f"{name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are possible", code="name-too-long"
+                f"the name {name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are possible",
+                code="name-too-long",
             )
         if (kind, collection, name) in self._taken:
             raise MotionError(f"another result of the job is called {name!r}", code="same-name")

@@ -102,7 +102,8 @@ class _Job:
         long = [name for _, name in names if len(name) > MAX_NAME_LENGTH]
         if long:
             raise JobRefused(
-                "name-too-long", f"{long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible"
+                "name-too-long",
+                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible",
             )
 
     def _name(self, pin: PinnedInput, twin: str) -> str:
@@ -144,7 +145,8 @@ class _Job:
             if edited.item != skeleton.item:
                 raise JobRefused(
                     "wrong-rig",
-                    f"the input rig is the skeleton {edited.item}, but the clips have the skeleton {skeleton.item}",
+                    f"the input `rig` is the skeleton {edited.item}, but the clips have the skeleton "
+                    f"{skeleton.item}; give that one",
                 )
             return Rig(skeleton, RevisionRef(item=edited.item, revision=edited.revision))
         return Rig.as_stored(skeleton)
@@ -165,13 +167,14 @@ class _Job:
         if count < 2:
             raise JobRefused(
                 "too-few-clips",
-                f"{len(examples)} of {len(clips)} clips are left; alignment needs two{self._refusals.first}",
+                f"only {len(examples)} of {len(clips)} clips can be aligned, but alignment needs at least "
+                f"two{self._refusals.first}",
             )
         if count > MOST_EXAMPLES and self._params.reference == MEDOID:
             raise JobRefused(
                 "too-many-clips",
-                f"{count} clips are too many to compare each with every other, which is possible for {MOST_EXAMPLES}; "
-                f"choose a clip or {NEAREST_MEAN_LENGTH} as reference",
+                f"{count} clips are too many to compare each clip with every other; this is possible for at "
+                f"most {MOST_EXAMPLES}; choose a clip or {NEAREST_MEAN_LENGTH} as reference",
             )
 
     # -- annotations --
@@ -181,7 +184,9 @@ class _Job:
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
-                raise JobRefused("no-annotations", "layer and labels need annotations, but none are given")
+                raise JobRefused(
+                    "no-annotations", "the parameters layer and labels select annotations, but no annotations are given"
+                )
             return None
         found: dict[str, list[_ClipAnnotation]] = {}
         for pin, tree in self._context.documents(pins, "annotation"):
@@ -198,7 +203,7 @@ class _Job:
         if len(known) != 1:
             layers = ", ".join(sorted({one.annotation.layer for one in known}))
             raise MotionError(
-                f"it has {len(known)} suitable annotations (layers: {layers}); name one layer"
+                f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
                 else "none of the annotations belongs to this clip" + self._of_layer(),
                 code="several-annotations" if known else "no-annotation",

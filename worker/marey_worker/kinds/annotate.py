@@ -92,7 +92,7 @@ def _joints(rigged: Rigged, names: Sequence[str]) -> tuple[int, ...]:
         own = name if name in rigged.skeleton else rigged.mapping.joints.get(name)
         if own is None:
             raise UnknownJoint(
-                "it is neither a joint of the skeleton nor a standard joint that the skeleton has", where=name
+                "the skeleton has no joint of this name, and its joint mapping has no such standard joint", where=name
             )
         found.append(rigged.skeleton.index_of(own))
     return tuple(found)

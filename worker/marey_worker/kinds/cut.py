@@ -103,8 +103,8 @@ class _Cutting:
             return self._context.item(Kind.CLIP, clip.item)
         if clip.item not in self._clips:
             raise MotionError(
-                f"the annotation belongs to the clip {clip.item}, which is not among the clips that are given; add it, "
-                "or give no clips",
+                f"the annotation belongs to the clip {clip.item}, which is not among the given clips; add "
+                "this clip, or give no clips at all",
                 code="clip-not-given",
             )
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
@@ -124,7 +124,8 @@ class _Cutting:
             labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
             known = f"their labels are {', '.join(labels)}" if labels else "they have no segments"
             raise JobRefused(
-                "nothing-to-cut", f"no segment of {len(todo)} annotations was selected; {known}{self._refusals.first}"
+                "nothing-to-cut",
+                f"the chosen labels select no segment of {len(todo)} annotations; {known}{self._refusals.first}",
             )
         (folder, name), count = places.most_common(1)[0]
         if count > 1:
@@ -136,7 +137,8 @@ class _Cutting:
         long = [name for _, name in places if len(name) > MAX_NAME_LENGTH]
         if long:
             raise JobRefused(
-                "name-too-long", f"{long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible"
+                "name-too-long",
+                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible",
             )
 
     def _folder(self, one: _AnnotatedClip, segment: Segment) -> str:

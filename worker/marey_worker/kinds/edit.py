@@ -86,7 +86,7 @@ class _Editing:
             try:
                 sources[pin.item] = documents.clip_from_document(motion, self._body(motion).skeleton)
             except MotionError as error:
-                raise JobRefused(error.code, f"the source {pin.path}: {error}") from error
+                raise JobRefused(error.code, f"the source clip {pin.path} cannot be used: {error}") from error
         return sources
 
     def _edited(
@@ -99,7 +99,10 @@ class _Editing:
         clip = documents.clip_from_document(motion, body.skeleton)
         made = edit_clip(clip, self._edit.commands, body=body, sources=sources)
         if self._params.in_place and len(made) > 1:
-            raise EditError("the edit splits the clip, and several clips cannot replace one", code="several-clips")
+            raise EditError(
+                "the edit splits the clip, so it cannot be applied in place: several clips cannot replace one",
+                code="several-clips",
+            )
         info = self._info(pin, known)
         names = [f"{pin.name}{self._params.suffix}" + "".join(f"-{n}" for n in one.pieces) for one in made]
         if self._params.in_place:
@@ -209,10 +212,12 @@ def _wanted_sources(context: Context, edit: EditDocument) -> dict[str, PinnedInp
     given = [pin for pin in context.inputs.get("sources", ()) if pin.item in edit.sources]
     found = {pin.item: pin for pin in given}
     if len(found) < len(given):
-        raise JobRefused("which-source", "a source is given at two revisions; give each source once")
+        raise JobRefused("which-source", "the input `sources` contains two revisions of one clip; give each clip once")
     missing = [item for item in edit.sources if item not in found]
     if missing:
-        raise JobRefused("source-missing", f"the commands name {', '.join(missing)}, which the input sources lacks")
+        raise JobRefused(
+            "source-missing", f"the commands name {', '.join(missing)}, which the input `sources` does not contain"
+        )
     return found
 
 

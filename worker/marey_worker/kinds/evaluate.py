@@ -92,7 +92,7 @@ def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, 
         trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:
         named = f"{min(unknown)!r}; a name is like {trials[0].name!r}"
-        raise JobRefused("unknown-trial", f"trial_figures: the suite has no trial {named}")
+        raise JobRefused("unknown-trial", f"trial_figures: the evaluation has no trial {named}")
     return trials
 
 

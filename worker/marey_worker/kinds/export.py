@@ -50,7 +50,9 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
             written.add(name)
             target.writestr(_entry(name), file.data)
     if not written:
-        raise JobRefused("nothing-to-export", f"none of {counted(len(pins), 'clip')} can be written as {params.format}")
+        raise JobRefused(
+            "nothing-to-export", f"none of {counted(len(pins), 'clip')} can be exported in the format {params.format}"
+        )
     size = archive.stat().st_size
     stored = StoredFile(blob=context.put_file(archive), size_bytes=size)
     return {"archive": stored.model_dump(mode="json"), "clips": len(written), "refused": refused}
@@ -83,7 +85,9 @@ class _Exporting:
     def _original(self, pin: PinnedInput, info: dict[str, Any]) -> _File:
         original = original_of_clip(pin.item, info)
         if original is None:
-            raise MotionError("the clip was not imported from a file", code="no-original")
+            raise MotionError(
+                "the clip was not imported from a file, so it has no original file to export", code="no-original"
+            )
         ending = original.name.rpartition(".")[2] if "." in original.name else ""
         return _File(f"{_place(pin)}.{ending}" if ending else _place(pin), self._context.blob(original.digest))
 

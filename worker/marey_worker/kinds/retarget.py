@@ -45,7 +45,9 @@ class _Retargeting:
         try:
             read_rigged(context, self._target)
         except MotionError as error:
-            raise JobRefused(error.code, f"skeleton {self._target_pin.name}: {error}") from error
+            raise JobRefused(
+                error.code, f"the target skeleton {self._target_pin.name} cannot be used: {error}"
+            ) from error
 
     def run(self) -> dict[str, Any]:
         """Retarget all clips; return a summary."""

@@ -127,7 +127,7 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
         raise _wrong(
             made,
             "segments-overlap",
-            f"the new segment overlaps {covered[0]}; set overwrite, or move that segment first",
+            f"the new segment overlaps {covered[0]}; set overwrite, or move the other segment first",
         )
     _require_segments((made,), layer.frame_count)  # what is no segment must not cut others
     before = [one._replace(end=start) for one in covered if one.start < start]
@@ -345,7 +345,9 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     gone = Keyframe(label, frame)
     place = layer._place_of(gone)
     if gone not in layer.keyframes[place : place + 1]:
-        raise AnnotationError("the layer has no such keyframe", code="no-keyframe", where=str(gone))
+        raise AnnotationError(
+            "the layer has no keyframe with this label and frame", code="no-keyframe", where=str(gone)
+        )
     return layer._with_keyframes(place, place + 1)
 
 
@@ -398,7 +400,8 @@ def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
         raise _wrong(
             segment,
             "outside-clip",
-            f"the frames {start}:{end} of the clip's {layer.frame_count} do not contain this segment",
+            f"the segment is not within the frames {start}:{end} that are kept of the clip's "
+            f"{layer.frame_count} frames",
         )
     return Layer(
         end - start,

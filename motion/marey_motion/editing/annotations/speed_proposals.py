@@ -109,7 +109,9 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
     """Compute the distance (F,) of a wrist from its position at the start of the clip, in metres."""
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
-        raise MappingError("the skeleton's mapping lacks this standard joint; add it", where=f"{side}_wrist")
+        raise MappingError(
+            "the joint mapping of the skeleton has no joint for this standard joint; add one", where=f"{side}_wrist"
+        )
     positions = kinematics.global_positions(clip).astype(np.float64)
     forward = kinematics.forward_directions(positions, body.lefts, body.rights)
     x, z = (positions[:, wrist] - positions[:, body.hips])[:, (0, 2)].T

@@ -212,7 +212,7 @@ def pose_problem(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], 
                 where=f"targets[{number}]",
             )
     if not targets:
-        raise EditError("at least one target is needed", where="targets")
+        raise EditError("inverse kinematics needs at least one target", where="targets")
     paths = [set(skeleton.path_to_root(target.joint)) for target in targets]
     joints = sorted(set[int]().union(*paths))
     carries = np.array([[joint in path for path in paths] for joint in joints], dtype=np.bool_)
@@ -230,7 +230,7 @@ def _body(skeleton: Skeleton, motion: Motion, joints: list[int], carries: Flags,
     movable = np.array([joint in may_turn for joint in joints], dtype=np.bool_)
     if not movable.any() and not freedom.root_moves:
         raise EditError(
-            "no target depends on the joints that may turn; include a joint between root and target",
+            "turning the chosen joints moves none of the targets; include a joint between the root and a target",
             code="chain-invalid",
             where="joints",
         )
@@ -285,7 +285,7 @@ def _checked_values(target: Target, number: int, frames: int) -> Floats:
         raise EditError(str(error), where=f"targets[{number}]") from None
     if len(values) not in (1, frames):
         raise EditError(
-            f"the target has {len(values)} values for {frames} frames; one value, or one per frame, is needed",
+            f"the target has {len(values)} values for {frames} frames; give one value, or one per frame",
             where=f"targets[{number}]",
         )
     if isinstance(target, PositionTarget) and (not target.axes or set(target.axes) - set("xyz")):

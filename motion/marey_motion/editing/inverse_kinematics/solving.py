@@ -155,8 +155,8 @@ def solve(
     if solver == "two_bone" or (solver == "auto" and asked is not None and not freedom.limits):
         if asked is None or limb is None:
             raise EditError(
-                "the two-bone solver needs a limb, one position target in all axes for its end, and at most one "
-                "orientation target for its end; use another solver",
+                "the two-bone solver needs a limb and, for the end of the limb, one position target in all "
+                "axes and at most one orientation target; use another solver",
                 code="solver-unfit",
                 where="solver",
             )
@@ -299,12 +299,16 @@ def solve_two_bone(
     targets: tuple[Target, ...] = (position,) if orientation is None else (position, orientation)
     if limb_targets(targets, limb) is None:
         raise EditError(
-            "all targets must be for the end of the limb, and the position target must have all axes", where="targets"
+            "in the two-bone solver, all targets must be for the end of the limb, and the position target "
+            "must have all axes",
+            where="targets",
         )
     path = skeleton.path_to_root(limb.end)
     if not {limb.middle, limb.start} <= set(path) or not limb.start < limb.middle < limb.end:
         raise EditError(
-            "middle must be a descendant of start, and end a descendant of middle", code="chain-invalid", where="limb"
+            "the joint `middle` of a limb must be a descendant of `start`, and `end` a descendant of `middle`",
+            code="chain-invalid",
+            where="limb",
         )
     problem = pose_problem(skeleton, motion, targets, Freedom(limb.joints))
     found = problem.found

@@ -126,7 +126,9 @@ class JointLimit:
             raise EditError(f"each swing limit must be from 0 to π, not {self.swing_rad}", where="swing_rad")
         axis, side = _vector(self.axis, "axis"), _vector(self.side, "side")
         if not np.allclose((axis @ axis, side @ side, axis @ side), (1.0, 1.0, 0.0), atol=1e-6):
-            raise EditError("axis and side must be perpendicular unit vectors", where="axis")
+            raise EditError(
+                "the vectors `axis` and `side` must have length 1 and be perpendicular to each other", where="axis"
+            )
 
     @classmethod
     def hinge(
@@ -249,7 +251,7 @@ def chain_of(skeleton: Skeleton, effector: int, top: int) -> tuple[int, ...]:
     if top not in path:
         names = skeleton.joint_names
         raise EditError(
-            f"{names[effector]} is not a descendant of {names[top]}; choose an ancestor",
+            f"the joint {names[top]} is not an ancestor of the target's joint {names[effector]}; choose one that is",
             code="chain-invalid",
             where=names[top],
         )

@@ -92,7 +92,9 @@ def find_near_duplicates(
                 progress(number + 1, families.count, families.source(number))
             if cancelled is not None and cancelled():
                 pool.shutdown(cancel_futures=True)
-                raise EvaluationCancelled(f"stopped with {number + 1} of {families.count} clips compared")
+                raise EvaluationCancelled(
+                    f"the search for duplicates was stopped after {number + 1} of {families.count} clips"
+                )
     found.sort(key=lambda pair: (pair.distance_cm, pair.first, pair.second))
     return NearDuplicates(tuple(found), threshold_cm, aligned, compared)
 

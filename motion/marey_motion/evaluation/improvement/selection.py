@@ -111,11 +111,13 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
     MotionError    if skeletons or options differ, or both databases have the same clip
     """
     if first.options != second.options:
-        raise MotionError("both databases must be made with the same options", where="options")
+        raise MotionError(
+            "the two databases were built with different options; build both with the same options", where="options"
+        )
     require_same_skeleton(first, second)
     shared = sorted({clip.uid for clip in first.clips} & {clip.uid for clip in second.clips})
     if shared:
-        raise MotionError(f"both databases have the clip {shared[0]}", where=shared[0])
+        raise MotionError(f"both databases contain the clip {shared[0]}; remove it from one of them", where=shared[0])
     origins = [(clip, 0) for clip in first.clips] + [(clip, first.row_count) for clip in second.clips]
     clips, rows, start = [], [], 0
     for clip, offset in sorted(origins, key=lambda origin: origin[0].uid):
@@ -178,5 +180,7 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
     """
     if not same_skeleton(first, second):
         raise MotionError(
-            "the clips have another skeleton; retarget them first", code="skeleton-mismatch", where="skeleton"
+            "the clips to add have a different skeleton from those of the database; retarget them first",
+            code="skeleton-mismatch",
+            where="skeleton",
         )

@@ -152,7 +152,11 @@ def reweighted(database: MatchingDatabase, weights: FeatureWeights) -> MatchingD
         if before.weight == after.weight:
             continue
         if before.weight == 0.0:
-            raise MotionError("its weight was 0; start from a database in which it is not", where=before.name)
+            raise MotionError(
+                "this weight cannot be varied, because it is 0 in the database; start from a "
+                "database in which it is above 0",
+                where=before.name,
+            )
         own = slice(before.start, before.stop)
         scale[own] = scale[own] * (before.weight / after.weight) if after.weight > 0.0 else UNMATCHED_SCALE
     return replace(database, options=options, normaliser=replace(database.normaliser, scale=scale))

@@ -58,7 +58,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     document = decode_document(data, file)
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
-        raise FormatError(f"field {TIME_FUNCTION!r} must be a list of two frames or more", file=file)
+        raise FormatError(f"field {TIME_FUNCTION!r} must be a list of at least two frames", file=file)
     if frames.max() > MOST_FRAME:
         message = f"field {TIME_FUNCTION!r} names frame {frames.max():g}, which no source has"
         raise FormatError(message, code="time-function-invalid", file=file)

@@ -154,7 +154,8 @@ def _sections(sections: Any, end_index: EndIndex, file: str) -> list[Segment]:
             _section(one, label, end_index, file) for label in sections for one in field_of(sections, label, list, file)
         ]
     raise FormatError(
-        f"the document must have {SECTIONS!r}, a list or an object by label, or {SEMANTIC!r}, an object by label",
+        f"the document must have either the field {SECTIONS!r}, which is a list or an object with labels as "
+        f"keys, or the field {SEMANTIC!r}, which is an object with labels as keys",
         code="document-unknown",
         file=file,
     )
@@ -178,10 +179,10 @@ def _frames_by_label(by_label: Mapping[str, Any], file: str) -> list[Segment]:
 
 def _frames(given: Any, label: str, file: str) -> list[int]:
     if not isinstance(given, list) or any(isinstance(one, bool) for one in given):
-        raise FormatError(f"field {label!r} must be a list of frames", file=file)
+        raise FormatError(f"field {label!r} must be a list of frame numbers", file=file)
     numbers = number_array(given, file, label)
     if numbers.ndim != 1 or (numbers != np.floor(numbers)).any() or (np.abs(numbers) > 2**53).any():
-        raise FormatError(f"field {label!r} must be a list of frames, which are whole numbers", file=file)
+        raise FormatError(f"field {label!r} must be a list of frame numbers, which are whole numbers", file=file)
     return [int(one) for one in numbers]
 
 

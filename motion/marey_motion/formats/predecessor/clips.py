@@ -94,7 +94,8 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
     skeleton = clip.skeleton
     if clip.translated_joints:
         raise FormatError(
-            "the predecessor's clips hold rotations alone; this joint also moves against its parent",
+            "clips in the predecessor's format contain only rotations, but this joint also moves relative to "
+            "its parent",
             code="translations-unsupported",
             joint=skeleton.joint_names[clip.translated_joints[0]],
         )
@@ -149,10 +150,12 @@ def _clip_fields(document: dict[str, Any], file: str) -> tuple[list[str], NDArra
         raise FormatError("the joint sequence names a joint twice", file=file)
     width = 3 + 4 * len(names)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < width:
-        raise FormatError(f"poses of shape {poses.shape}; {len(names)} joints need rows of {width} numbers", file=file)
+        raise FormatError(
+            f"the poses have the shape {poses.shape}, but {len(names)} joints need rows of {width} numbers", file=file
+        )
     # Some writers counted the tips of chains as joints and filled their columns with zeros.
     if poses[:, width:].any():
-        raise FormatError(f"{poses.shape[1]} columns for {len(names)} joints, which need {width}", file=file)
+        raise FormatError(f"the poses have {poses.shape[1]} columns, but {len(names)} joints need {width}", file=file)
     return names, poses[:, :width], float(frame_time_s)
 
 
@@ -174,7 +177,9 @@ def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float
     indices = {name: joint for joint, name in enumerate(source.joint_names)}
     unknown = next((name for name in names if name not in indices), None)
     if unknown is not None:
-        raise FormatError("the skeleton has no such joint; is this the clip's skeleton?", file=file, joint=unknown)
+        raise FormatError(
+            "the skeleton has no joint of this name; it may not be the skeleton of this clip", file=file, joint=unknown
+        )
     given = poses[:, 3:].reshape(len(poses), len(names), 4) * MIRROR_ROTATION
     rotations = np.tile(source.rest_rotations, (len(poses), 1, 1))
     rotations[:, [indices[name] for name in names]] = as_rotations(given, tuple(names), file, source.warnings)

@@ -83,7 +83,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
         for model_id, node in field_of(nodes, action, dict, file).items():
             place = (action, field_of(node, "name", str, file))
             if place in names.values():
-                raise FormatError(f"{action}: two nodes are called {place[1]!r}", file=file)
+                raise FormatError(f"action {action}: two nodes are called {place[1]!r}", file=file)
             listed[action, model_id] = node
             names[action, model_id] = place
     known = {**{place: place for place in names.values()}, **names}
@@ -128,7 +128,9 @@ def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "js
 def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
     kind = node.get("type", "standard")
     if kind not in TYPES:
-        raise FormatError(f"{'/'.join(place)}: {kind!r} is not a type; choose from {', '.join(TYPES)}", file=file)
+        raise FormatError(
+            f"{'/'.join(place)}: {kind!r} is not a type of node; the types are {', '.join(TYPES)}", file=file
+        )
     return str(kind)
 
 
@@ -146,7 +148,9 @@ def _transitions(
         candidates = [(action, str(one)) for one in (wanted.get("model_id"), wanted.get("model_name"), model) if one]
         other = next((known[one] for one in candidates if one in known), None)
         if other is None:
-            raise FormatError(f"{'/'.join(place)}: there is no node {key!r} that follows it", file=file)
+            raise FormatError(
+                f"{'/'.join(place)}: a transition leads to the node {key!r}, which does not exist", file=file
+            )
         found.append(other)
     return tuple(dict.fromkeys(found))
 
@@ -155,12 +159,12 @@ def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], 
     name = next((name for name in START_FIELDS if name in document), None)
     if name is None:
         raise FormatError(
-            f"field {START_FIELDS[0]!r} is missing: it names the action and the model to begin with", file=file
+            f"field {START_FIELDS[0]!r} is missing; it must name the first action and its first model", file=file
         )
     given = document[name]
     if not isinstance(given, list) or len(given) != 2:
-        raise FormatError(f"field {name!r} must be an action and a model", file=file)
+        raise FormatError(f"field {name!r} must be a list of two names: an action and a model", file=file)
     start = known.get((str(given[0]), str(given[1])))
     if start is None:
-        raise FormatError(f"field {name!r}: there is no node {given!r}", file=file)
+        raise FormatError(f"field {name!r} names the node {given!r}, which does not exist", file=file)
     return start

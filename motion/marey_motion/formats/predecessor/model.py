@@ -133,7 +133,9 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
     except FormatError:
         raise
     except MotionError as error:
-        raise FormatError(f"the numbers describe no model: {error}", code="model-invalid", file=file) from error
+        raise FormatError(
+            f"the numbers in the file are not a valid model: {error}", code="model-invalid", file=file
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +173,7 @@ def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
     rate_sources = (time or {}, document, skeleton if isinstance(skeleton, dict) else {})
     frame_time_s = next((one["frame_time"] for one in rate_sources if one.get("frame_time")), DEFAULT_FRAME_TIME_S)
     if not isinstance(frame_time_s, int | float) or not 1e-5 < frame_time_s < 10.0:
-        raise FormatError(f"field 'frame_time' is {frame_time_s!r}; seconds are needed", code="bad-number", file=file)
+        raise FormatError(f"field 'frame_time' is {frame_time_s!r}, not seconds above 0", code="bad-number", file=file)
     joints = next((one for one in (space, document) if "animated_joints" in one), None)
     if joints is None and isinstance(skeleton, dict) and isinstance(skeleton.get("animated_joints"), list):
         joints = skeleton
@@ -247,7 +249,7 @@ def _keyframes(document: Document, file: str) -> dict[str, int]:
     given = field_of(document, "keyframes", dict, file)
     for label, frame in given.items():
         if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
-            raise FormatError(f"field 'keyframes': {label!r} is {frame!r}, a frame is needed", file=file)
+            raise FormatError(f"field 'keyframes': {label!r} must be the number of a frame, not {frame!r}", file=file)
     return dict(given)
 
 
@@ -270,7 +272,9 @@ def _read(parts: _Parts, layout: Layout, skeleton: Skeleton, file: str) -> Prede
     temporal, error = as_log_slopes(time, latents[:, len(spatial_vectors) :], spread[len(spatial_vectors) :], file)
     spatial = components_of(basis, spatial_mean, spatial_vectors, spread[: len(spatial_vectors)])
     if odd := [label for label, frame in parts.keyframes.items() if frame >= frames]:
-        raise FormatError(f"field 'keyframes': {odd[0]!r} is beyond the {frames} canonical frames", file=file)
+        raise FormatError(
+            f"field 'keyframes': frame {odd[0]!r} is outside the {frames} canonical frames of the model", file=file
+        )
     primitive = MotionPrimitive(
         parts.name, skeleton, 1.0 / parts.frame_time_s, spatial, temporal, 1.0, mixture, parts.keyframes
     )
@@ -288,22 +292,36 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
     basis = _basis(part, what, file)
     start, stop = basis.span
     if start != 0.0 or abs(stop - round(stop)) > 1e-6 or stop < 2.0:
-        raise FormatError(f"{what}: the knots span {start:g} to {stop:g}, not 0 to a last frame", file=file)
+        raise FormatError(
+            f"{what}: the knots of the spline go from {start:g} to {stop:g}, but must go from 0 "
+            "to the number of the last frame",
+            file=file,
+        )
     mean = _numbers(field_of(part, "mean", list, file), file, f"{what}: mean")
     if mean.size % basis.count or mean.size == 0:
-        raise FormatError(f"{what}: a mean of {mean.size} numbers for {basis.count} coefficients", file=file)
+        raise FormatError(
+            f"{what}: the mean has {mean.size} numbers, which is not a multiple of the "
+            f"{basis.count} spline coefficients",
+            file=file,
+        )
     if part.get("n_coeffs", basis.count) != basis.count:
         message = f"{what}: n_coeffs is {part['n_coeffs']}, but the knots are those of {basis.count} coefficients"
         raise FormatError(message, file=file)
     channels = mean.size // basis.count
     if part.get("n_dims", channels) != channels:
-        raise FormatError(f"{what}: n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file)
+        raise FormatError(
+            f"{what}: the field n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file
+        )
     given = part.get("eigen") or []
     vectors = _numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
     if vectors.ndim == 2 and vectors.shape[1] != mean.size and vectors.shape[0] == mean.size:
         vectors = vectors.T
     if vectors.ndim != 2 or vectors.shape[1] != mean.size:
-        raise FormatError(f"{what}: eigenvectors of shape {vectors.shape} for a mean of {mean.size} numbers", file=file)
+        raise FormatError(
+            f"{what}: the eigenvectors have the shape {vectors.shape}, which does not fit a mean "
+            f"of {mean.size} numbers",
+            file=file,
+        )
     shape = (basis.count, channels)
     return basis, mean.reshape(shape), np.ascontiguousarray(vectors).reshape(len(vectors), *shape)
 
@@ -313,15 +331,23 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
     if "knots" not in part and "n_frames" in part:
         frames, count = (field_of(part, name, int, file) for name in ("n_frames", "n_coeffs"))
         if not 2 <= count <= frames <= MOST_FRAMES:
-            raise FormatError(f"{what}: {count} coefficients over {frames} frames", code="model-invalid", file=file)
+            raise FormatError(
+                f"{what}: {count} spline coefficients are not possible for {frames} frames",
+                code="model-invalid",
+                file=file,
+            )
         _check_size(frames, count, what, file)
         return SplineBasis.clamped(frames, count)
     knots = _numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
     if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
-        raise FormatError(f"{what}: knots must be at most {MOST_FRAMES} numbers up to {MOST_FRAMES}", file=file)
+        raise FormatError(
+            f"{what}: there may be at most {MOST_FRAMES} knots, and no knot may be above {MOST_FRAMES}", file=file
+        )
     degree = part.get("degree", DEGREE)
     if isinstance(degree, bool) or not isinstance(degree, int) or not 1 <= degree < 10:
-        raise FormatError(f"{what}: degree is {degree!r}, a small whole number is needed", file=file)
+        raise FormatError(
+            f"{what}: the degree of the spline is {degree!r}, but must be a small whole number", file=file
+        )
     basis = SplineBasis(knots, degree)
     _check_size(basis.frame_count, basis.count, what, file)
     return basis
@@ -344,7 +370,7 @@ def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleto
         raise FormatError("field 'animated_joints' names a joint twice", file=file)
     unknown = next((name for name in animated if name not in skeleton), None)
     if unknown is not None:
-        raise FormatError("the skeleton has no such joint", code="joints-mismatch", file=file, joint=unknown)
+        raise FormatError("the skeleton has no joint of this name", code="joints-mismatch", file=file, joint=unknown)
     if (np.linalg.norm(basis.at_frames @ mean[:, 3:], axis=1) == 0).any():
         raise FormatError("the mean motion has frames without any rotation", code="model-invalid", file=file)
     return animated
@@ -405,10 +431,15 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
     if means.ndim != 2 or covariances.shape != (len(means), *[means.shape[1]] * 2) or weights.shape != (len(means),):
         shapes = f"{weights.shape}, {means.shape} and {covariances.shape}"
         raise FormatError(
-            f"gmm: the shapes {shapes} of weights, means and covars do not match", code="model-invalid", file=file
+            f"gmm: the shapes of weights, means and covars, {shapes}, do not fit each other",
+            code="model-invalid",
+            file=file,
         )
     if len(means) > MOST_COMPONENTS or means.shape[1] > MOST_DIMENSIONS:
-        raise FormatError(f"gmm: more than {MOST_COMPONENTS} distributions or {MOST_DIMENSIONS} dimensions", file=file)
+        raise FormatError(
+            f"gmm: the mixture has more than {MOST_COMPONENTS} distributions or more than {MOST_DIMENSIONS} dimensions",
+            file=file,
+        )
     covered = means.shape[1] - spatial
     if not 0 <= covered <= temporal:
         message = f"gmm: {means.shape[1]} dimensions, but space has {spatial} components and time {temporal}"
@@ -426,7 +457,9 @@ def _numbers(values: Any, file: str, name: str) -> Floats:
     """Convert nested lists to an array. Raises `FormatError` if a number is too large for the motion of a body."""
     numbers = number_array(values, file, name)
     if np.abs(numbers).max(initial=0.0) > LARGEST:
-        raise FormatError(f"field {name!r} holds numbers beyond {LARGEST:g}", code="bad-number", file=file)
+        raise FormatError(
+            f"field {name!r} contains numbers that are larger than {LARGEST:g}", code="bad-number", file=file
+        )
     return numbers
 
 

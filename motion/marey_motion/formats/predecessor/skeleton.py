@@ -50,7 +50,8 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
         nodes, mirrored = _nested_nodes(document["root"], file), False
     else:
         raise FormatError(
-            "the document has neither 'poses' nor 'frames' of a clip, nor 'jointDescs' or a 'root' node of a skeleton",
+            "the document is neither a clip, which has a field 'poses' or 'frames', nor a skeleton, which "
+            "has a field 'jointDescs' or 'root'",
             code="document-unknown",
             file=file,
         )
@@ -89,7 +90,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
         listed[name] = node
         for child in text_list(node, "children", file):
             if child in parents:
-                raise FormatError("two joints have this child", file=file, joint=child)
+                raise FormatError("two joints name this joint as their child", file=file, joint=child)
             parents[child] = name
     unknown = next((child for child in parents if child not in listed), None)
     roots = [name for name in listed if name not in parents]
@@ -124,7 +125,7 @@ def _nested_nodes(root: Document, file: str) -> list[tuple[str, str | None, Docu
 
 def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file: str) -> SourceMotion:
     if len(nodes) > 2 * MAX_JOINTS:
-        raise FormatLimit(f"{len(nodes)} nodes; {MAX_JOINTS} joints are accepted", file=file)
+        raise FormatLimit(f"the skeleton has {len(nodes)} joints; at most {MAX_JOINTS} are accepted", file=file)
     inner = {parent for _, parent, _ in nodes if parent is not None} | {nodes[0][0]}
     indices: dict[str, int] = {}
     parents, offsets, rotations, tips = [], [], [], []
@@ -139,7 +140,7 @@ def _source(nodes: list[tuple[str, str | None, Document]], mirrored: bool, file:
         length = float(np.linalg.norm(rotation))
         if length < 1e-6:
             raise FormatError(
-                "the rotation is zero; four numbers w, x, y, z of a turn are needed", file=file, joint=name
+                "all four numbers of the rotation are zero; it must be a quaternion w, x, y, z", file=file, joint=name
             )
         parents.append(-1 if parent is None else indices[parent])
         offsets.append(offset)

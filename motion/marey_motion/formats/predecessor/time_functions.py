@@ -89,7 +89,9 @@ def as_log_slopes(
         wanted = time.time_functions(scores)
         steps = np.diff(wanted, axis=1)
     if not (np.isfinite(steps).all() and (steps > 0).all() and (np.abs(np.log(steps)) < ODD_LOG_SLOPE).all()):
-        raise FormatError("the time function does not run forward at a plausible speed", code="bad-time", file=file)
+        raise FormatError(
+            "the time function decreases, or its slope is too steep or too flat", code="bad-time", file=file
+        )
     basis = _basis_over(steps.shape[1])
     # The fit over scores comes before the one over time, which is linear as well: a few functions are left by then.
     at_mean, by_score = _linear_fit(scores, np.log(steps))

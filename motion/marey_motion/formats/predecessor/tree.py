@@ -75,7 +75,9 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
     """
     samples = number_array(field_of(document, "data", list, file), file, "data")
     if samples.ndim != 2 or not len(samples):
-        raise FormatError(f"field 'data' has shape {samples.shape}; a row for each sample is needed", file=file)
+        raise FormatError(
+            f"field 'data' has the shape {samples.shape}, but must have one row for each sample", file=file
+        )
     if np.abs(samples).max(initial=0.0) > np.finfo(np.float32).max:
         place = int(np.argmax(np.abs(samples).max(axis=1)))
         message = f"field 'data', row {place}: a number beyond those of single precision, which samples are kept in"
@@ -137,19 +139,23 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
         node, place, level = waiting.popleft()
         below = node.get("children") or [] if isinstance(node, Mapping) else None
         if not isinstance(below, list) or level > MOST_LEVELS:
-            raise FormatError(f"{place}: a node has a list of children, down to {MOST_LEVELS} levels", file=file)
+            raise FormatError(
+                f"{place}: each node needs a list of children, and a tree has at most {MOST_LEVELS} levels", file=file
+            )
         held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
         if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
-            raise FormatError(f"{place}: indices must name one sample or more", file=file)
+            raise FormatError(f"{place}: the field indices must contain at least one sample", file=file)
         if held.min() < 0 or held.max() >= count:
-            raise FormatError(f"{place}: indices must lie between 0 and {count - 1}", file=file)
+            raise FormatError(f"{place}: each of the indices must be from 0 to {count - 1}", file=file)
         indices.append(held.astype(np.int64))
         children.append(len(below))
         if len(indices) + len(waiting) + len(below) > MOST_NODES:
             raise FormatError(f"the tree has more than {MOST_NODES} nodes", code="format-limit", file=file)
         waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
     if len(np.unique(indices[0])) != count or len(indices[0]) != count:
-        raise FormatError(f"root: its indices must name each of the {count} samples once", file=file)
+        raise FormatError(
+            f"root: the field indices must contain the number of each of the {count} samples once", file=file
+        )
     return indices, children
 
 

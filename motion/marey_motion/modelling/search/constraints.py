@@ -68,10 +68,12 @@ def frame_at(primitive: MotionPrimitive, at: Moment) -> float:
         moments: Mapping[str, int] = {START: 0, END: last, **primitive.keyframes}
         if at not in moments:
             known = ", ".join(moments)
-            raise InvalidConstraint(f"{primitive.name} has no keyframe {at!r}; it has {known}", where="at")
+            raise InvalidConstraint(f"the model {primitive.name} has no keyframe {at!r}; it has {known}", where="at")
         return float(moments[at])
     if not 0 <= at <= last:
-        raise InvalidConstraint(f"canonical frame {at:g} is not within 0 to {last}", where="at")
+        raise InvalidConstraint(
+            f"canonical frame {at:g} does not exist; the canonical frames are 0 to {last}", where="at"
+        )
     return float(at)
 
 

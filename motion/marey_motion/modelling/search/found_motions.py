@@ -86,7 +86,10 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
             )
         if step.primitive.frame_rate_hz != first.frame_rate_hz:
             rates = f"{step.primitive.frame_rate_hz:g} Hz, the first step's {first.frame_rate_hz:g} Hz"
-            raise InvalidConstraint(f"the model of this step has {rates}", where=f"steps[{number}]")
+            raise InvalidConstraint(
+                f"the models of all steps need the same frame rate; the model of this step has {rates}",
+                where=f"steps[{number}]",
+            )
     placed = [
         _placed(step.primitive.motions(latent[None])[0], placement)
         for step, latent, placement in zip(steps, sequel.latents, sequel.measured.placements, strict=True)

@@ -186,7 +186,9 @@ def build_objective(
     InvalidConstraint    naming the constraint and its defect
     """
     if len(constraints) > MOST_SOUGHT:
-        raise InvalidConstraint(f"{len(constraints)} constraints are more than {MOST_SOUGHT}", where="constraints")
+        raise InvalidConstraint(
+            f"the search has {len(constraints)} constraints; at most {MOST_SOUGHT} are possible", where="constraints"
+        )
     tracked = {one: place for place, one in enumerate(also)}
     moments: dict[float, int] = {}
     rows = []
@@ -273,7 +275,11 @@ def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTimeConstr
     least, most = primitive.duration_range_s
     ends = frame == primitive.frame_count - 1
     if constraint.seconds > most or (ends and constraint.seconds < least):
-        raise InvalidConstraint(f"motions of {primitive.name} last {least:.2f} to {most:.2f} s", where="seconds")
+        raise InvalidConstraint(
+            f"the constraint's time is not possible: motions of the model {primitive.name} last "
+            f"{least:.2f} to {most:.2f} s",
+            where="seconds",
+        )
 
 
 def _position_row(item: int, target: tuple[float | None, ...]) -> _ResidualRow:

@@ -113,9 +113,15 @@ def _descend(
 def _check(objective: Objective, tree: SampleTree, candidates: int, top: int) -> None:
     if tree.dimensions != objective.primitive.dimensions:
         held, needed = tree.dimensions, objective.primitive.dimensions
-        raise MotionError(f"the tree has samples of {held} numbers, the model needs {needed}", code="tree-of-another")
+        raise MotionError(
+            f"each sample of the tree has {held} numbers, but the model needs {needed}; make a new tree for the model",
+            code="tree-of-another",
+        )
     if candidates < 1 or top < 1:
-        raise MotionError("a search follows at least one candidate and returns at least one sample", where="candidates")
+        raise MotionError(
+            "the number of candidates to follow and the number of samples to return must be at least 1",
+            where="candidates",
+        )
 
 
 def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluations: int) -> FoundSamples:

@@ -138,7 +138,7 @@ class SeveralSteps:
         InvalidConstraint    naming step and constraint
         """
         if not 1 <= len(steps) <= MOST_SEARCH_STEPS:
-            raise InvalidConstraint(f"{len(steps)} steps are not within 1 to {MOST_SEARCH_STEPS}", where="steps")
+            raise InvalidConstraint(f"a search has 1 to {MOST_SEARCH_STEPS} steps, not {len(steps)}", where="steps")
         joints = tuple(name for name in transitions.joints if all(name in step.standard_joints for step in steps))
         alone = len(steps) == 1
         links: list[_Link] = []

@@ -115,7 +115,10 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
     """
     missing = [name for name in (*LEFTS, *RIGHTS) if name not in standard_joints]
     if missing:
-        raise MappingError(f"a heading needs {', '.join(missing)}, which the skeleton's mapping does not name")
+        raise MappingError(
+            f"a constraint on the heading needs {', '.join(missing)}, which the joint mapping of "
+            "the skeleton does not contain"
+        )
     lefts, rights = (tuple(standard_joints[name] for name in side) for side in (LEFTS, RIGHTS))
     return Tracked(frame, lefts, rights)
 

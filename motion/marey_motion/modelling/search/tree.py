@@ -50,15 +50,21 @@ class SampleTree:
         nodes = len(self.sizes)
         sound = nodes > 0 and self.samples.ndim == 2 and self.sizes.shape == self.children.shape == (nodes,)
         if not sound or self.sizes[0] != len(self.samples) or self.sizes.min() < 1 or self.children.min() < 0:
-            raise MotionError("samples, sizes and children of the tree do not fit each other", code="tree-invalid")
+            raise MotionError(
+                "the numbers of samples, sizes and children of the tree do not match", code="tree-invalid"
+            )
         if 1 + int(self.children.sum()) != nodes or (self.first_children > nodes).any():
-            raise MotionError("a node of the tree has no parent, or two", code="tree-invalid")
+            raise MotionError(
+                "each node of the tree except the first must have exactly one parent", code="tree-invalid"
+            )
         inner = np.flatnonzero(self.children)
         if (self.first_children[inner] <= inner).any():
-            raise MotionError("a node of the tree comes before its parent", code="tree-invalid")
+            raise MotionError("each node of the tree must come after its parent", code="tree-invalid")
         parts = np.add.reduceat(self.sizes, self.first_children[inner]) if inner.size else self.sizes[:0]
         if inner.size and not np.array_equal(parts[: inner.size], self.sizes[inner]):
-            raise MotionError("children of a node of the tree do not share its samples", code="tree-invalid")
+            raise MotionError(
+                "the children of each node of the tree must together have all samples of the node", code="tree-invalid"
+            )
 
     @property
     def dimensions(self) -> int:
@@ -160,7 +166,11 @@ def _features(
     if options.features == "latent":
         return np.ascontiguousarray(samples[:, : primitive.spatial.count])
     if not end_effectors:
-        raise MotionError("the skeleton's mapping names neither hands nor feet nor head", where="features")
+        raise MotionError(
+            "the joint mapping of the skeleton contains no hands, no feet and no head, whose "
+            "positions a tree is made from",
+            where="features",
+        )
     frames = feature_frames(primitive)
     chains = track_points(primitive, [Tracked(frame, (joint,)) for frame in frames for joint in end_effectors])
     points = np.empty((len(samples), len(chains.turned), 3))

@@ -106,7 +106,9 @@ def draw_figure(
     if kind is None:
         raise MotionError(f"there is no figure {name!r}; choose from {', '.join(FIGURES)}", code="unknown-figure")
     if trial is not None and kind.trials == "none":
-        raise MotionError(f"the figure {name!r} shows the whole suite, not a trial", code="figure-without-trial")
+        raise MotionError(
+            f"the figure {name!r} shows all trials together; leave out the trial", code="figure-without-trial"
+        )
     subjects = [Subject("", result)] if other is None else [Subject(labels[0], result), Subject(labels[1], other)]
     return finish(kind.draw(subjects, trial, options or FigureOptions()), name, kind.number, kind.title)
 

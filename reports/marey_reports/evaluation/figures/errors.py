@@ -76,7 +76,11 @@ def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureO
 def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
     series, kept = view.series, view.evaluated
     if not kept.any():
-        raise MotionError("no step of the trial is evaluated", code="nothing-to-draw", where=view.trial.name)
+        raise MotionError(
+            "the figure cannot be drawn, because no step of the trial was evaluated",
+            code="nothing-to-draw",
+            where=view.trial.name,
+        )
     sign = -1.0 if negate else 1.0
     speeds, turn_rates = (
         sign * (recorded - wished)[kept]

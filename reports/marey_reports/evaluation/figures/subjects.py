@@ -115,4 +115,7 @@ def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequen
         if candidates:
             return max(candidates, key=lambda each: strain(each).worst).trial
     wanted = f"trial {name!r}" if name is not None else "trial"
-    raise MotionError(f"the evaluation has no {wanted} of the kind {' or '.join(families)}", code="unknown-trial")
+    raise MotionError(
+        f"the figure cannot be drawn: the evaluation has no {wanted} of the kind {' or '.join(families)}",
+        code="unknown-trial",
+    )

@@ -60,9 +60,9 @@ class DatabaseClock:
                 stored_us, wall_us = stored_high_water_us(connection), wall_clock_us()
                 if stored_us and wall_us - stored_us > FAR_AHEAD_DAYS * DAY_US:
                     raise ClockFarAhead(
-                        f"the clock of this machine says {datetime_of(wall_us):%Y-%m-%d}, but the database was last "
-                        f"used on {datetime_of(stored_us):%Y-%m-%d}; mend the clock, or confirm it with "
-                        "`marey db clock --set`"
+                        f"the clock of this machine says {datetime_of(wall_us):%Y-%m-%d}, but the database "
+                        f"was last used on {datetime_of(stored_us):%Y-%m-%d}; correct the clock, or confirm "
+                        "its time with `marey db clock --set`"
                     )
                 if (ahead_s := (stored_us - wall_us) / 1e6) > NOTABLY_AHEAD_S:
                     log.warning(

@@ -179,7 +179,10 @@ class Database:
                 if (
                     error.connection_invalidated
                 ):  # nobody knows whether it was committed; doing it again could do it twice
-                    raise _no_answer("It is unknown whether this was written; check before you try again.") from error
+                    raise _no_answer(
+                        "The connection to the database broke during the commit, so it is unknown whether "
+                        "the change was stored; check before you try again."
+                    ) from error
                 raise
         self._high_water_us = high_water_us
         if self.is_sqlite:
@@ -247,7 +250,7 @@ class Database:
                 async for _ in connection.notifies():
                     yield
         except driver.Error as error:
-            raise _no_answer("The connection for notifications has ended.") from error
+            raise _no_answer("The database connection for notifications has ended.") from error
 
     def close(self) -> None:
         """Finish the running transactions, then close all connections."""

@@ -55,7 +55,7 @@ class _QueuedCall:
 
     def _call(self) -> Any:
         if self.client.is_gone():
-            raise ClientGoneProblem("The client closed the connection before this was begun.")
+            raise ClientGoneProblem("The client closed the connection before the server began to handle the request.")
         return self.function()
 
 
@@ -96,7 +96,8 @@ class FairLine(Generic[T]):
         own = self._groups[client.known].get(client.key, ())
         if self._lengths[client.known] >= self._most_waiting or len(own) >= self._most_each:
             raise UnavailableProblem(
-                f"{len(self)} calls are waiting already, {len(own)} of them yours; try again in a few seconds.",
+                f"{len(self)} requests are already waiting for the database, {len(own)} of them yours; try "
+                "again in a few seconds.",
                 code="busy",
                 headers={"Retry-After": str(RETRY_AFTER_S)},
             )

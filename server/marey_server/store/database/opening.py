@@ -24,11 +24,13 @@ def opening(url: str) -> Iterator[None]:
         yield
     except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
         raise DatabaseUnusable(
-            "the database_url is not the URL of a supported database; write sqlite:////folder/file.db, "
-            "or postgresql://user@host/name with the extra `postgres` installed"
+            "the setting database_url is not the URL of a supported database; write "
+            "sqlite:////folder/file.db, or postgresql://user@host/name with the extra `postgres` installed"
         ) from None
     except UnavailableProblem as error:
-        raise DatabaseUnusable(f"the database {_shown(url)} does not answer: {_reason(error.__cause__)}") from error
+        raise DatabaseUnusable(
+            f"the server of the database {_shown(url)} does not answer: {_reason(error.__cause__)}"
+        ) from error
     except StorageFullProblem as error:
         raise DatabaseUnusable(f"the database {_shown(url)} cannot be opened for writing: {error.detail}") from error
     except exc.DBAPIError as error:

@@ -116,7 +116,7 @@ def _compile(statement: Statement, dialect: Dialect, parameters: Parameters) -> 
     )
     binds: Mapping[str, BindParameter[Any]] = compiled.binds
     if unknown := parameters.keys() - binds.keys():
-        raise TypeError(f"the statement has no parameters of these names: {', '.join(sorted(unknown))}")
+        raise TypeError(f"the SQL statement has no parameters of these names: {', '.join(sorted(unknown))}")
     state = compiled.construct_expanded_state(dict(parameters))
     converts = {
         name: convert

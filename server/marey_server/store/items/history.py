@@ -49,7 +49,7 @@ def _revision_rows() -> Select[Any]:
 def _find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
     row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
     if row is None:
-        raise NotFoundProblem(f"{item_id!r} has no revision {number}.", code="no-revision")
+        raise NotFoundProblem(f"The item {item_id!r} has no revision {number}.", code="no-revision")
     return row
 
 

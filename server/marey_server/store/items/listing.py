@@ -74,7 +74,9 @@ def list_items(
     Attempts of jobs may only look up names. Raises `ForbiddenProblem`.
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
-        raise ForbiddenProblem("An attempt finds items by their names: send `name`.", code="not-for-attempts")
+        raise ForbiddenProblem(
+            "A running job can list only items of a given name: send the parameter `name`.", code="not-for-attempts"
+        )
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if filters.deleted else Role.READER)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, kind.value, asdict(filters)]

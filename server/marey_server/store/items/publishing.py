@@ -51,7 +51,7 @@ def publish(
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
-        raise InvalidProblem("Two results of the request have the same name.", code="duplicate-output")
+        raise InvalidProblem("Two results in the request have the same name.", code="duplicate-output")
     publication = _Publication(tx, project_row, author_id, job_id)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
@@ -87,7 +87,10 @@ def _load_parts(tx: Transaction, drafts: Sequence[Draft]) -> list[_Loaded]:
 def _contents(draft: Draft) -> dict[str, PreparedDocument | StoredDocument]:
     specs = PARTS[draft.kind]
     if unknown := [part for part in draft.parts if part not in specs]:
-        raise InvalidProblem(f"A {draft.kind} has no part {unknown[0]!r}; it has {', '.join(specs)}.", code="no-part")
+        raise InvalidProblem(
+            f"An item of the kind {draft.kind} has no part {unknown[0]!r}; its parts are {', '.join(specs)}.",
+            code="no-part",
+        )
     given = {part: draft.parts[part] for part in specs if part in draft.parts}
     return {
         part: content if isinstance(content, StoredDocument) else documents.prepared(content, schema=specs[part].schema)
@@ -184,7 +187,9 @@ class _Publication:
             if not waiting:
                 return
         name = waiting[0].draft.item_name
-        raise ConflictProblem(f"{name!r} is being changed by other requests; try again.", code="contended")
+        raise ConflictProblem(
+            f"Other requests are changing the item {name!r} at the same time; try again.", code="contended"
+        )
 
     def _store(self, group: Sequence[_Loaded]) -> list[_Ready]:
         """Store the documents of drafts, with references to earlier drafts replaced by their revisions."""
@@ -275,7 +280,9 @@ class _Publication:
         for one in new:
             if None in one.required:
                 lacking = _required(kind)[one.required.index(None)]
-                raise InvalidProblem(f"A {kind} needs the part {lacking!r}.", code="part-required")
+                raise InvalidProblem(
+                    f"The part {lacking!r} is missing: every item of the kind {kind} needs it.", code="part-required"
+                )
         ids = sorted(new_id(kind.value) for _ in new)  # in the order of the drafts
         rows = {item_id: self._row(one, item_id) for item_id, one in zip(ids, new, strict=True)}
         names = {item_id: _names(one.draft) for item_id, one in zip(ids, new, strict=True)}
@@ -290,7 +297,10 @@ class _Publication:
         for one in new:
             if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
                 place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
-                raise ConflictProblem(f"There is a {kind} {place!r} already.", code="name-taken")
+                raise ConflictProblem(
+                    f"There is already a {kind} {place!r}; choose another name, or change the existing item.",
+                    code="name-taken",
+                )
 
     def _row(self, one: _Ready, item_id: str) -> dict[str, Any]:
         summary = summarise(one.draft.kind, one.bodies)

@@ -166,7 +166,7 @@ def find_part(
     else:
         row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
-        raise NotFoundProblem(f"There is no part {part!r} of {kind} {item_id!r} at that revision.", code="no-part")
+        raise NotFoundProblem(f"The {kind} {item_id!r} has no part {part!r} at the requested revision.", code="no-part")
     return FoundPart(row.document_digest, row.number, row.rev)
 
 
@@ -186,7 +186,10 @@ def cut_part(
     `InvalidProblem` if they do not fit the document.
     """
     if tree["schema"] != "marey/motion@1":
-        raise InvalidProblem("frames and joints can only be selected from motions.", code="not-a-motion")
+        raise InvalidProblem(
+            "The parameters frames and joints select parts of a motion, but this document is not a motion.",
+            code="not-a-motion",
+        )
     return slice_motion(tree, frames, joints, encoded=encoded)
 
 

@@ -53,7 +53,8 @@ def in_order(names: Mapping[str, Sequence[str]]) -> list[str]:
                 ordered[path.pop()] = None
             elif waiting[0] in path:
                 raise InvalidProblem(
-                    f"Results refer to each other: {' -> '.join([*path, waiting[0]])}.", code="output-cycle"
+                    f"The results refer to each other in a circle: {' -> '.join([*path, waiting[0]])}.",
+                    code="output-cycle",
                 )
             else:
                 path.append(waiting[0])
@@ -129,7 +130,11 @@ class ReferenceCheck:
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
         """Return the body of a part of the revision that `ref` names."""
         if "output" in ref:
-            raise _invalid(pointer, f"no-{kind.value}", f"There is no result {ref['output']!r} in this request.")
+            raise _invalid(
+                pointer,
+                f"no-{kind.value}",
+                f"A document refers to the result {ref['output']!r}, which is not in this request.",
+            )
         key = (ref["item"], ref["revision"], kind, part)
         if key not in self._seen:
             body = self._look_up(*key)

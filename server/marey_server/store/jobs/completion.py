@@ -226,7 +226,7 @@ def _result(
     place = (one.job, one.fence)
     try:
         if place not in own:
-            raise NotFoundProblem(f"You have not claimed attempt {one.fence} of {one.job}.")
+            raise NotFoundProblem(f"You have not claimed attempt {one.fence} of the job {one.job}.")
         if place in refused:
             raise refused[place]
         answer = answers.get(place) or _same_answer(tx, place, one.write_id)

@@ -84,7 +84,7 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
     if principal.kind == "system":
         return
     if principal.kind != "attempt" or principal.job_id != job_id:
-        raise NotFoundProblem(f"There is no attempt {fence} of {job_id} that this credential may write to.")
+        raise NotFoundProblem(f"The job {job_id} has no attempt {fence} that your token may write to.")
     if principal.fence != fence:
         raise lease_lost(job_id, fence)
 

@@ -20,7 +20,7 @@ def labels_key(labels: Mapping[str, str]) -> str:
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
-        raise _refusal(f"The labels take {len(key)} characters; at most {LONGEST_KEY} fit.")
+        raise _refusal(f"The labels have {len(key)} characters together; at most {LONGEST_KEY} are possible.")
     return key
 
 

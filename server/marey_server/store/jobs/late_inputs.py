@@ -72,7 +72,11 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)
     except UnknownKindError as error:
-        raise LateInputError("unknown-kind", f"This server no longer knows the kind of the job: {error}.") from error
+        raise LateInputError(
+            "unknown-kind",
+            "This version of the server does not know the kind of the job, which an earlier "
+            f"version accepted: {error}.",
+        ) from error
     except ValidationError as error:
         detail = f"{kind.name} does not take these parameters any more: {without_prefix(error.errors()[0]['msg'])}"
         raise LateInputError("invalid-params", detail) from error
@@ -125,7 +129,11 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
     for name, entries in row.inputs.items():
         spec = kind.inputs.get(name)
         if spec is None:
-            raise LateInputError("unknown-input", f"{kind.name} has no input {name!r} any more.")
+            raise LateInputError(
+                "unknown-input",
+                f"In this version of the server, jobs of the kind {kind.name} have no input {name!r}; "
+                "submit the job again.",
+            )
         chosen: dict[tuple[str, int], Pin] = {}
         for entry in entries:
             for one in _resolved(tx, row.project_id, name, spec, entry, made):

@@ -119,7 +119,7 @@ def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list
     renewed = update(job).where(HELD).values(lease_expires_us=_renewed(tx, policy)).returning(*_LEASE_COLUMNS)
     rows = sorted(tx.execute(renewed, held_parameters(places)).all(), key=_pick_order)
     if not rows:
-        raise LeaseLostProblem("No lease of this claim is held any more. Claim under a new `claim_id`.")
+        raise LeaseLostProblem("All leases of this claim have ended. Claim jobs with a new `claim_id`.")
     return _leases(tx, rows, [_issue_token(tx, claim_id, row) for row in rows], policy)
 
 

@@ -169,7 +169,9 @@ def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLIC
     propagate_ends(tx, [as_ended(one) for one in (*tasks, *whole) if one.state != "running"])
     document = job_documents(tx, [job_id])[0]
     if not whole and document.state != JobState.CANCELLED:
-        raise ConflictProblem(f"The job has already {document.state} and cannot be cancelled.", code="job-ended")
+        raise ConflictProblem(
+            f"The job has already ended ({document.state}) and cannot be cancelled.", code="job-ended"
+        )
     return document
 
 
@@ -220,4 +222,6 @@ def require_own(tx: Transaction, row: Row[Any], project: ProjectRow, what: str) 
     if roles.includes(project.role, Role.MAINTAINER):
         return
     if not roles.includes(project.role, Role.CONTRIBUTOR) or row.author_id != tx.principal.user_id:
-        raise ForbiddenProblem(f"Only maintainers may {what} jobs of other users.", code="insufficient-role")
+        raise ForbiddenProblem(
+            f"Only maintainers of the project may {what} jobs of other users.", code="insufficient-role"
+        )

@@ -40,7 +40,10 @@ def retry_job(tx: Transaction, job_id: str) -> Job:
             f"Only a failed or cancelled job can be retried; this one is {row.state}.", code="not-failed"
         )
     if row.parent_id is not None:
-        raise ConflictProblem(f"This is a task of the job {row.parent_id}; retry that job.", code="is-task")
+        raise ConflictProblem(
+            f"This job is a task of the job {row.parent_id} and cannot be retried alone; retry the other job.",
+            code="is-task",
+        )
     family = _Family(tx, project)
     family.add_with_needed([job_id])
     family.add_dependants()
@@ -132,7 +135,9 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
         kind = find_kind(row.kind)
     except UnknownKindError as error:
         raise ConflictProblem(
-            f"This server no longer knows the kind of the job: {error}.", code="unknown-kind"
+            "This version of the server does not know the kind of the job, which an earlier version "
+            f"accepted: {error}.",
+            code="unknown-kind",
         ) from error
     return Submission(
         kind,

@@ -63,7 +63,7 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
     pins: PinnedInputs = hold(tx, job_id, fence, job.c.inputs).inputs
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
-        raise InvalidProblem("Two results have the same name.", code="duplicate-output")
+        raise InvalidProblem("Two results of the attempt have the same name.", code="duplicate-output")
     of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
     last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
     replaced = tx.execute(
@@ -123,7 +123,10 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
         return [source.item, source.revision]
     asked = "" if source.revision is None else f" at revision {source.revision}"
     known = f"; the job has its {', '.join(f'revision {one}' for one in given)}" if given else ""
-    raise InvalidProblem(f"{source.item}{asked} is not among the job's inputs {role!r}{known}.", code="no-input")
+    raise InvalidProblem(
+        f"A result names as its source {source.item}{asked}, which is not among the inputs {role!r} of the job{known}.",
+        code="no-input",
+    )
 
 
 # -- publishing -------------------------------------------------------------------------------------------------------

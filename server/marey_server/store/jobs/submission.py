@@ -171,7 +171,7 @@ def _lock_upstream(
     found = lock_jobs(tx, project, places.values())
     for place, one in places.items():
         if one not in found:
-            raise _invalid(place, "unknown-job", f"There is no job {one!r} in the project.")
+            raise _invalid(place, "unknown-job", f"An input names the job {one!r}, which is not in the project.")
     return found
 
 

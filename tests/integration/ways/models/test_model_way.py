@@ -162,7 +162,7 @@ def test_questions_that_make_no_sense_are_refused(walk: ModelHandle, query: dict
 
 def test_only_models_have_samples(lab: ProjectHandle) -> None:
     clip = next(iter(lab.clips.list()))
-    with pytest.raises(RequestFailed, match="only models do"):
+    with pytest.raises(RequestFailed, match="generated only from models"):
         lab.transport.send("GET", f"{clip.url}/samples")
 
 
