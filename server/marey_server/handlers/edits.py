@@ -27,7 +27,8 @@ class EditPreviewResource(Resource):
         """
         source = await self.look_up(previewing.read_preview, project, kind_of(kind), item, body)
         order = partial(previewing.preview_order, source, body, self.media.encoding)
-        return Reply(await self.compute_apart(previewing.MAKE_PREVIEW, order), media_type=str(self.media))
+        preview = await self.compute_apart(previewing.MAKE_PREVIEW, order, bytes)
+        return Reply(preview, media_type=str(self.media))
 
 
 RESOURCES: tuple[type[Resource], ...] = (EditPreviewResource,)

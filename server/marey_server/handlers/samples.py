@@ -10,11 +10,13 @@ from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT, MOTION_MEDIA_TYP
 from marey_server.handlers.items import kind_of
 from marey_server.http.declarations import Access, Bytes, Document, reads
 from marey_server.http.queries import MAX_INTEGER
-from marey_server.http.reply import Rendered, Reply, render
+from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import IMMUTABLE, attachment
-from marey_server.motions import models
-from marey_server.motions.models import FoundModel, UsableModel
+from marey_server.motions import models, searching
+from marey_server.motions.child import ComputedFile
+from marey_server.motions.models import FoundModel, SampleFileOrder, SampleOrder
+from marey_server.motions.searching import FoundSearchable
 
 
 class SampleQuery(Request):
@@ -44,17 +46,19 @@ class SampleFileQuery(SampleQuery):
 class ModelUser(Resource):
     """Base of resources that let a model generate motion."""
 
-    async def usable_model(
-        self, project: str, kind: str, item: str, revision: int | None
-    ) -> tuple[FoundModel, UsableModel]:
-        """Return the requested model, parsed; the most recently used ones are cached."""
-        found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
-        known = self.services.models.get(found.part.digest)
+    async def packed_model(self, project: str, found: FoundSearchable) -> bytes:
+        """Return the documents of a model for a child; the most recently used ones are cached."""
+        known = self.services.models.get(found.key)
         if known is None:
-            loaded = await self.look_up(models.load_model, project, found)
-            known = await self.compute(models.parse_model, loaded)
-            self.services.models.put(found.part.digest, known)
-        return found, known
+            loaded = await self.look_up(searching.load_searchable, project, found)
+            known = await self.compute(loaded.pack)
+            self.services.models.put(found.key, known)
+        return known
+
+    async def found_model(self, project: str, kind: str, item: str, revision: int | None) -> tuple[FoundModel, bytes]:
+        """Return the requested model with its documents for a child."""
+        found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
+        return found, await self.packed_model(project, FoundSearchable(found, tree=None, mapping=None))
 
 
 class ModelSamples(ModelUser):
@@ -64,19 +68,15 @@ class ModelSamples(ModelUser):
     tag = "Models"
 
     @reads(access=Access.READER, query=SampleQuery, answer=Document, etag=True)
-    async def get(self, project: str, kind: str, item: str, query: SampleQuery) -> Rendered:
+    async def get(self, project: str, kind: str, item: str, query: SampleQuery) -> Reply:
         """Return motions drawn from a model (kind `models`), with their latent vectors and likelihoods.
 
         The same revision and seed give the same answer. `motions` are documents like the part `motion` of a clip.
         """
-        found, model = await self.usable_model(project, kind, item, query.revision)
-        form, answers = self.answer_form, self.services.answers
-
-        def drawn() -> Rendered:
-            document = models.sample_document(found, model, query.n, query.seed)
-            return render(Reply(document, rev=_state(found, query), headers=_caching(query)), form, answers)
-
-        return await self.compute(drawn)
+        found, model = await self.found_model(project, kind, item, query.revision)
+        order = SampleOrder(found=found, model=model, count=query.n, seed=query.seed, encoding=self.media.encoding)
+        drawn = await self.compute_apart(models.DRAW_SAMPLES, order.pack, bytes)
+        return Reply(drawn, media_type=str(self.media), rev=_state(found, query), headers=_caching(query))
 
 
 class SampleFiles(ModelUser):
@@ -93,8 +93,11 @@ class SampleFiles(ModelUser):
     )
     async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
         """Return motions drawn from a model (kind `models`) as files: one alone, several as a ZIP archive."""
-        found, model = await self.usable_model(project, kind, item, query.revision)
-        file = await self.compute(models.sample_file, found, model, query.n, query.seed, query.format, query.unit)
+        found, model = await self.found_model(project, kind, item, query.revision)
+        order = SampleFileOrder(
+            found=found, model=model, count=query.n, seed=query.seed, format=query.format, unit=query.unit
+        )
+        file = await self.compute_apart(models.WRITE_SAMPLES, order.pack, ComputedFile.unpack)
         headers = {"Content-Disposition": attachment(file.name), **_caching(query)}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 

@@ -205,15 +205,15 @@ class Resource(Exchange):
         finally:
             self._in_children.discard(task)
 
-    async def compute_apart(self, function: str, make: Callable[[], bytes]) -> bytes:
-        """Call `function` (`module:name`) in a child process with `make()` as argument, and return its result.
+    async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
+        """Like `compute_in_child`, for a request that does nothing else.
 
         Raises `UnavailableProblem` if too many requests use children.
         """
         async with self.using_children():
             order = await self.compute(make)
             self.holding.grow(len(order))
-            return await self.compute_in_child(function, lambda: order, bytes)
+            return await self.compute_in_child(function, lambda: order, read)
 
     @property
     def _child_user(self) -> str:

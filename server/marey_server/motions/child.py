@@ -58,6 +58,14 @@ class AnswerEncoding(Message):
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
 
+class ComputedFile(Message):
+    """File that a child writes for a client: its name, media type, and content."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
 def pack_tree(tree: Any) -> bytes:
     """Return a document as bytes for an order; arrays that are encoded already are copied as they are."""
     return encode_tree(tree, MSGPACK, arrays="blocks")

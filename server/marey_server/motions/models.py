@@ -1,4 +1,4 @@
-"""Models that generate motion for requests: reading, parsing and sampling. Parsed models are cached."""
+"""Models that generate motion for requests: read in one transaction; parsed, cached and sampled in a child process."""
 
 from __future__ import annotations
 
@@ -9,20 +9,26 @@ from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.formats import ZIP_EPOCH, MotionFormat
+from marey_schemas.formats import ZIP_EPOCH, MotionFormat, WrittenUnit
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.motions.child import AnswerEncoding, ComputedFile, Message, pack_tree, unpack_tree
 from marey_server.store import items
 from marey_server.store.items.reading import FoundPart
 from marey_server.store.transaction import Transaction
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # numeric modules are loaded by children alone
     from marey_motion.arrays import Floats
     from marey_motion.clip import Clip
     from marey_motion.modelling.primitive import MotionPrimitive
 
-
+DRAW_SAMPLES = "marey_server.motions.models:draw_samples"
+WRITE_SAMPLES = "marey_server.motions.models:write_samples"
+"""Functions that child processes run."""
 MIB = 1 << 20
+MODEL_CACHE_BYTES = 32 * MIB
+"""Greatest size of a child's cache of parsed models; models with search trees have a cache of the same size."""
 LARGEST_ANSWER_BYTES = 32 * MIB
 """Greatest size in bytes of the poses of all samples in an answer."""
 
@@ -46,6 +52,40 @@ class LoadedModel:
     hierarchy: dict[str, Any]
 
 
+class PackedModel(Message):
+    """Documents of a model as bytes, with the tree and the mapping that searches use, if they exist."""
+
+    model: bytes
+    hierarchy: bytes
+    tree: bytes | None = None
+    mapping: bytes | None = None
+
+    def loaded(self) -> LoadedModel:
+        """Return the documents of the model, with decoded arrays."""
+        return LoadedModel(unpack_tree(self.model), unpack_tree(self.hierarchy))
+
+
+class SampleOrder(Message):
+    """Order to draw samples from a model, as a document."""
+
+    found: FoundModel
+    model: bytes
+    count: int
+    seed: int
+    encoding: AnswerEncoding
+
+
+class SampleFileOrder(Message):
+    """Order to draw samples from a model, as a file."""
+
+    found: FoundModel
+    model: bytes
+    count: int
+    seed: int
+    format: MotionFormat
+    unit: WrittenUnit
+
+
 @dataclass(frozen=True, slots=True)
 class UsableModel:
     """Parsed model that can generate motion."""
@@ -65,11 +105,42 @@ def find_model(tx: Transaction, project: str, kind: Kind, item_id: str, revision
 
 
 def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
-    """Read the model's documents. Raises `NotFoundProblem` if its skeleton was deleted."""
-    model = items.load_part(tx, found.part, arrays="decoded")
+    """Read the model's documents, with encoded arrays. Raises `NotFoundProblem` if its skeleton was deleted."""
+    model = items.load_part(tx, found.part)
     ref = model["skeleton"]
     skeleton = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"])
     return LoadedModel(model, skeleton.tree)
+
+
+def pack_model(loaded: LoadedModel, tree: dict[str, Any] | None, mapping: dict[str, Any] | None) -> bytes:
+    """Return the documents of a model as a packed `PackedModel`."""
+    return PackedModel(
+        model=pack_tree(loaded.model),
+        hierarchy=pack_tree(loaded.hierarchy),
+        tree=None if tree is None else pack_tree(tree),
+        mapping=None if mapping is None else pack_tree(mapping),
+    ).pack()
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def draw_samples(packed: bytes) -> bytes:
+    """Carry out a `SampleOrder` and return the document of the samples."""
+    order = SampleOrder.unpack(packed)
+    model = _usable_model(order.found, order.model)
+    return order.encoding.encode(sample_document(order.found, model, order.count, order.seed))
+
+
+def write_samples(packed: bytes) -> bytes:
+    """Carry out a `SampleFileOrder` and return a `ComputedFile`."""
+    order = SampleFileOrder.unpack(packed)
+    model = _usable_model(order.found, order.model)
+    return sample_file(order.found, model, order.count, order.seed, order.format, order.unit).pack()
+
+
+def _usable_model(found: FoundModel, packed: bytes) -> UsableModel:
+    return _MODELS.get_or_make(found.part.digest, lambda: parse_model(PackedModel.unpack(packed).loaded()))
 
 
 def parse_model(loaded: LoadedModel) -> UsableModel:
@@ -95,7 +166,8 @@ def size_bytes(model: UsableModel) -> int:
     return 3 * primitive.mixture.covariances.nbytes + sum(array.nbytes for array in arrays)
 
 
-# -- samples -----------------------------------------------------------------------------------------------------------
+_MODELS: LruCache[str, UsableModel] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=size_bytes)
+"""Cache of a child: parsed models by the digest of their document."""
 
 
 def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int) -> dict[str, Any]:
@@ -116,18 +188,9 @@ def sample_document(found: FoundModel, model: UsableModel, count: int, seed: int
     }
 
 
-@dataclass(frozen=True, slots=True)
-class SampleFile:
-    """File with samples: one motion, or an archive of several."""
-
-    name: str
-    media_type: str
-    data: bytes
-
-
 def sample_file(
     found: FoundModel, model: UsableModel, count: int, seed: int, file_format: MotionFormat, unit: str
-) -> SampleFile:
+) -> ComputedFile:
     """Return one sample as a file, or several as a ZIP archive of files. Raises `InvalidProblem`."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
@@ -139,12 +202,12 @@ def sample_file(
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
     stem = f"{found.name}_{seed}"
     if count == 1:
-        return SampleFile(stem + files[0].suffix, files[0].media_type, files[0].data)
+        return ComputedFile(name=stem + files[0].suffix, media_type=files[0].media_type, data=files[0].data)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for place, file in enumerate(files, start=1):
             archive.writestr(_entry(f"{stem}_{place:04d}{file.suffix}"), file.data, compresslevel=6)
-    return SampleFile(f"{stem}.zip", "application/zip", packed.getvalue())
+    return ComputedFile(name=f"{stem}.zip", media_type="application/zip", data=packed.getvalue())
 
 
 def _entry(name: str) -> zipfile.ZipInfo:

@@ -1,4 +1,4 @@
-"""Results of searches: motions, and the error of each constraint."""
+"""Searches in a child process, and their results: motions, and the error of each constraint."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from math import degrees, radians
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.formats import MotionFormat
+from marey_schemas.formats import MotionFormat, WrittenUnit
 from marey_schemas.options.searching import RefineOptions, TransitionOptions
 from marey_schemas.problems import FieldError
 from marey_schemas.search import ConstraintError, FoundStep, SearchAnswer, SearchRequest, StartPlacement
 from marey_schemas.search_constraints import JointPositionConstraint, RootPositionConstraint, SearchConstraint
 from marey_server.errors import InvalidProblem, TooLargeProblem
-from marey_server.motions.models import LARGEST_ANSWER_BYTES, SampleFile
-from marey_server.motions.searching import FoundSearchable, Searchable
+from marey_server.motions import searching
+from marey_server.motions.child import AnswerEncoding, ComputedFile, Message
+from marey_server.motions.models import LARGEST_ANSWER_BYTES
+from marey_server.motions.searching import FoundSearchable, Searchable, SearchedModels, usable_searchables
 
 if TYPE_CHECKING:
     from marey_motion.alignment.aligned import Placement
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
     from marey_motion.modelling.search.steps import Step
 
 
+ANSWER_SEARCH = "marey_server.motions.search_answers:answer_search"
+WRITE_SEARCH = "marey_server.motions.search_answers:write_search"
+"""Functions that child processes run."""
 FAR_CM = 5.0
 """Error of a position constraint above which the model cannot reach it; inverse kinematics would hide the error."""
 
@@ -38,6 +43,40 @@ UNITS = {
     "root_heading": "deg", "keyframe_time": "s",
 }  # fmt: skip
 CM = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class SearchLimits:
+    """Greatest costs of a search, in nanoseconds of one thread (estimated)."""
+
+    work: float
+    drawing_work: float
+
+
+class SearchOrder(Message):
+    """Order to search the models of each step."""
+
+    request: SearchRequest
+    models: SearchedModels
+    limits: SearchLimits
+
+    def search(self) -> tuple[SearchResult, list[Searchable]]:
+        """Return what the search finds, and the model of each step."""
+        usable = usable_searchables(self.models, self.request.seed, self.limits.drawing_work)
+        return search(usable, self.request, self.limits.work), usable
+
+
+class SearchAnswerOrder(SearchOrder):
+    """Order to answer a search with a document."""
+
+    encoding: AnswerEncoding
+
+
+class SearchFileOrder(SearchOrder):
+    """Order to answer a search with a motion file."""
+
+    format: MotionFormat
+    unit: WrittenUnit
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +95,28 @@ class SearchResult:
         return last.motion.as_clip(last.skeleton, last.frame_rate_hz)
 
 
-def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchResult:
+def search_limits() -> SearchLimits:
+    """Return the limits of every search."""
+    return SearchLimits(MOST_WORK, searching.MOST_DRAWING_WORK)
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def answer_search(packed: bytes) -> bytes:
+    """Carry out a `SearchAnswerOrder` and return the document of the answer."""
+    order = SearchAnswerOrder.unpack(packed)
+    result, usable = order.search()
+    return order.encoding.encode(answer_of(result, usable, order.models.found, order.request))
+
+
+def write_search(packed: bytes) -> bytes:
+    """Carry out a `SearchFileOrder` and return a `ComputedFile`."""
+    order = SearchFileOrder.unpack(packed)
+    return file_of(order.search()[0], order.models.found, order.format, order.unit).pack()
+
+
+def search(searchables: Sequence[Searchable], request: SearchRequest, most_work: float) -> SearchResult:
     """Find the motions that a request describes.
 
     Raises `InvalidProblem` with a pointer to the faulty constraint, and `TooLargeProblem` for searches that would take
@@ -74,24 +134,24 @@ def search(searchables: Sequence[Searchable], request: SearchRequest) -> SearchR
     effort = {"candidates": request.candidates, "passes": request.passes}
     try:
         work = search_work.searching_work(SeveralSteps.of(steps), trees, refining=refining, **effort)
-        _require_quick(work)
+        _require_quick(work, most_work)
         start = placement_of(request.start)
         transitions = TransitionOptions(tolerance_m=request.transition_tolerance_m)
         sequel = search_steps(steps, trees, start=start, refining=refining, transitions=transitions, **effort)
         _require_room(steps, sequel)
         found, finished = found_motion(steps, sequel), None
         if request.finish:
-            _require_quick(work + search_work.finishing_work(steps, found))
+            _require_quick(work + search_work.finishing_work(steps, found), most_work)
             finished = finish_motion(steps, found, searchables[0].mapping)
     except MotionError as error:
         raise _invalid(request, error) from error
     return SearchResult(steps, sequel, found, finished)
 
 
-def _require_quick(work: float) -> None:
-    if work > MOST_WORK:
+def _require_quick(work: float, most_work: float) -> None:
+    if work > most_work:
         raise TooLargeProblem(
-            f"This search takes about {work / MOST_WORK:.1f} times as long as allowed; request fewer steps, "
+            f"This search takes about {work / most_work:.1f} times as long as allowed; request fewer steps, "
             "constraints, candidates, passes or iterations.",
             code="search-too-large",
         )
@@ -150,7 +210,9 @@ def answer_of(
     return answer.model_dump(by_alias=True, exclude_none=True)
 
 
-def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str) -> SampleFile:
+def file_of(
+    result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str
+) -> ComputedFile:
     """Write all steps to one file. Raises `InvalidProblem` if the format cannot represent it."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
@@ -160,7 +222,7 @@ def file_of(result: SearchResult, found: Sequence[FoundSearchable], file_format:
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
     name = " ".join(dict.fromkeys(one.model.name for one in found))
-    return SampleFile(f"{name} found{file.suffix}", file.media_type, file.data)
+    return ComputedFile(name=f"{name} found{file.suffix}", media_type=file.media_type, data=file.data)
 
 
 def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintError, ...]:

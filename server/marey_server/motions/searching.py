@@ -1,17 +1,20 @@
-"""Models that requests search for motions, with their trees. Parsed models are cached."""
+"""Models that requests search for motions, with their trees: read in a transaction, parsed and cached in a child."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from marey_schemas.documents.models import log_likelihoods
 from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.kinds import Kind
+from marey_schemas.lru import LruCache
 from marey_schemas.search import SearchRequest
 from marey_server.errors import InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.motions import models
-from marey_server.motions.models import FoundModel, LoadedModel, UsableModel
+from marey_server.motions.child import Message, unpack_tree
+from marey_server.motions.models import FoundModel, LoadedModel, PackedModel, UsableModel
 from marey_server.store import items
 from marey_server.store.items.reading import FoundPart
 from marey_server.store.transaction import Transaction
@@ -37,20 +40,31 @@ class FoundSearchable:
     tree: FoundPart | None
     mapping: FoundPart | None
 
-    def key(self, seed: int) -> SearchableKey:
-        """Return the cache key; it contains `seed` if the model has no tree, which then determines the tree."""
-        tree = f"seed {seed}" if self.tree is None else self.tree.digest
-        return self.model.part.digest, tree, "" if self.mapping is None else self.mapping.digest
+    @property
+    def key(self) -> SearchableKey:
+        """The digests of the documents; empty for those that do not exist."""
+        tree, mapping = ("" if part is None else part.digest for part in (self.tree, self.mapping))
+        return self.model.part.digest, tree, mapping
+
+
+class SearchedModels(Message):
+    """Models of the steps of a search; `packed` contains a `PackedModel` for each item."""
+
+    found: tuple[FoundSearchable, ...]
+    packed: dict[str, bytes]
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedSearchable:
     """Documents of a model that can be searched."""
 
-    found: FoundSearchable
     model: LoadedModel
     tree: dict[str, Any] | None
     mapping: dict[str, Any] | None
+
+    def pack(self) -> bytes:
+        """Return the documents as a packed `PackedModel`."""
+        return models.pack_model(self.model, self.tree, self.mapping)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +97,51 @@ def find_searchables(
 
 def load_searchable(tx: Transaction, project: str, found: FoundSearchable) -> LoadedSearchable:
     """Read the documents of a model and its tree. Raises `NotFoundProblem` if its skeleton was deleted."""
-    tree, mapping = (
-        None if part is None else items.load_part(tx, part, arrays="decoded") for part in (found.tree, found.mapping)
-    )
-    return LoadedSearchable(found, models.load_model(tx, project, found.model), tree, mapping)
+    tree, mapping = (None if part is None else items.load_part(tx, part) for part in (found.tree, found.mapping))
+    return LoadedSearchable(models.load_model(tx, project, found.model), tree, mapping)
 
 
-def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
+def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
+    model = models.find_model(tx, project, Kind.MODEL, item_id, None)
+    ref = items.load_part(tx, model.part, arrays="none")["skeleton"]
+    held = items.read_item(tx, project, Kind.SKELETON, ref["item"]).parts
+    tree = mapping = None
+    if "tree" in items.read_item(tx, project, Kind.MODEL, item_id).parts:
+        found = items.find_part(tx, project, Kind.MODEL, item_id, "tree")
+        if items.load_part(tx, found, arrays="none")["model_digest"] == model.part.digest:
+            tree = found
+    if "mapping" in held:
+        mapping = items.find_part(tx, project, Kind.SKELETON, ref["item"], "mapping")
+    return FoundSearchable(model, tree, mapping)
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def usable_searchables(models: SearchedModels, seed: int, most_work: float) -> list[Searchable]:
+    """Return the model of each step, parsed or from the cache.
+
+    Raises `TooLargeProblem` if all trees together that must be drawn would take too long.
+    """
+    usable: dict[str, Searchable] = {}
+    for one in models.found:
+        item = one.model.item
+        if item not in usable:
+            drawn_from = seed if one.tree is None else None
+            usable[item] = _SEARCHABLES.get_or_make(
+                (one.key, drawn_from), partial(_parse_packed, models.packed[item], seed, most_work)
+            )
+            require_drawable(sum(each.drawing_work for each in usable.values()), most_work)
+    return [usable[one.model.item] for one in models.found]
+
+
+def _parse_packed(packed: bytes, seed: int, most_work: float) -> Searchable:
+    documents = PackedModel.unpack(packed)
+    tree, mapping = (None if part is None else unpack_tree(part) for part in (documents.tree, documents.mapping))
+    return parse_searchable(LoadedSearchable(documents.loaded(), tree, mapping), seed, most_work)
+
+
+def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> Searchable:
     """Return the parsed model with a tree.
 
     Raises `InvalidProblem` if its numbers are not valid, and `TooLargeProblem` if drawing a tree would take too long.
@@ -115,7 +167,7 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
         else:
             known = [standard_joints[name] for name in END_EFFECTORS if name in standard_joints]
             work = drawing_work(primitive, end_effectors=known)
-            require_drawable(work)
+            require_drawable(work, most_work)
             tree = build_tree(primitive, seed, end_effectors=known)
         tree.means, tree.starts  # noqa: B018    computed here, once for all searches
     except MotionError as error:
@@ -125,9 +177,9 @@ def parse_searchable(loaded: LoadedSearchable, seed: int) -> Searchable:
     return Searchable(usable, tree, stored, work, mapping, standard_joints, likelihoods)
 
 
-def require_drawable(work: float) -> None:
+def require_drawable(work: float, most_work: float) -> None:
     """Raise `TooLargeProblem` if the trees that a request needs would take more than some seconds to draw."""
-    if work > MOST_DRAWING_WORK:
+    if work > most_work:
         raise TooLargeProblem(
             "Without trees, drawing samples from models with so many keyframes, joints or steps takes too "
             "long for a search; create a tree for each model first, with a job of the kind `tree` or with "
@@ -136,20 +188,12 @@ def require_drawable(work: float) -> None:
         )
 
 
-def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
-    model = models.find_model(tx, project, Kind.MODEL, item_id, None)
-    ref = items.load_part(tx, model.part, arrays="none")["skeleton"]
-    held = items.read_item(tx, project, Kind.SKELETON, ref["item"]).parts
-    tree = mapping = None
-    if "tree" in items.read_item(tx, project, Kind.MODEL, item_id).parts:
-        found = items.find_part(tx, project, Kind.MODEL, item_id, "tree")
-        if items.load_part(tx, found, arrays="none")["model_digest"] == model.part.digest:
-            tree = found
-    if "mapping" in held:
-        mapping = items.find_part(tx, project, Kind.SKELETON, ref["item"], "mapping")
-    return FoundSearchable(model, tree, mapping)
-
-
 def size_bytes(made: Searchable) -> int:
     """Return the size in bytes of a model's arrays and of its tree's arrays."""
     return models.size_bytes(made.usable) + made.tree.samples.nbytes + made.tree.means.nbytes
+
+
+_SEARCHABLES: LruCache[tuple[SearchableKey, int | None], Searchable] = LruCache(
+    max_bytes=models.MODEL_CACHE_BYTES, size_of=size_bytes
+)
+"""Cache of a child: parsed models by the digests of their documents, and the seed of a tree that was drawn."""

@@ -14,10 +14,7 @@ from marey_schemas.lru import LruCache
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import AuthorLostProblem, UnavailableProblem
-from marey_server.motions.models import UsableModel
-from marey_server.motions.models import size_bytes as model_bytes
-from marey_server.motions.searching import Searchable, SearchableKey
-from marey_server.motions.searching import size_bytes as searchable_bytes
+from marey_server.motions.searching import SearchableKey
 from marey_server.process.children import Children
 from marey_server.process.computing import ComputeThreads
 from marey_server.process.disk_space import DiskSpace
@@ -39,7 +36,7 @@ LARGEST_ANSWER_SHARE = 8
 ANSWER_ENTRY_BYTES = 512
 """Memory in bytes of an entry in the cache of answers, in addition to its body."""
 MODEL_CACHE_BYTES = 64 << 20
-"""Greatest size of the cache of parsed models; models with search trees have a cache of the same size."""
+"""Greatest size of the cache of models' documents."""
 TOKENS_REMEMBERED = 10_000
 ADMISSIONS_REMEMBERED = 10_000
 
@@ -72,10 +69,8 @@ class Services:
             largest_bytes=settings.answer_cache_bytes // LARGEST_ANSWER_SHARE,
             size_of=lambda body: len(body) + ANSWER_ENTRY_BYTES,
         )
-        self.models: LruCache[str, UsableModel] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=model_bytes)
-        self.searchables: LruCache[SearchableKey, Searchable] = LruCache(
-            max_bytes=MODEL_CACHE_BYTES, size_of=searchable_bytes
-        )
+        self.models: LruCache[SearchableKey, bytes] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=len)
+        """Documents of models as bytes for children, with their search trees and mappings where these are used."""
         self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)
         """Times at which callers were admitted, by what the admission depends on."""
         self.draining = asyncio.Event()
