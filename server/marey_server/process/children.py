@@ -126,6 +126,8 @@ class Children:
         """Number of the last turn of each caller, of whom no one has two before another has one."""
         self._turn = 0
         self._threads: list[threading.Thread] = []
+        self._idle: set[int] = set()
+        """Numbers of the children that wait for a task."""
         self._starting: set[ChildProcess] = set()
         self._closed = False
 
@@ -196,7 +198,8 @@ class Children:
     def _start_thread(self) -> None:
         if len(self._threads) == self.limits.children:
             return
-        thread = threading.Thread(target=self._work, name=f"marey-child-{len(self._threads) + 1}", daemon=True)
+        number = len(self._threads) + 1
+        thread = threading.Thread(target=self._work, args=[number], name=f"marey-child-{number}", daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -208,22 +211,25 @@ class Children:
 
     # -- the thread of one child --
 
-    def _work(self) -> None:
-        """Run one task after another until the pool is closed."""
+    def _work(self, number: int) -> None:
+        """Run one task after another until the pool is closed; a child that has ended is replaced at once."""
         child, orders = self._started(), 0
-        while (task := self._next_task()) is not None:
-            if child is None or not child.alive or orders >= ORDERS_PER_CHILD:
+        while (task := self._next_task(number)) is not None:
+            if child is None or not child.alive:
                 _discard(child)
                 child, orders = self._started(), 0
             orders += 1
+            usable = child is not None and self._perform(task, child) and orders < ORDERS_PER_CHILD
             if child is None:
                 task.fail(UnavailableProblem("The server cannot start a child process; its log says why."))
-            elif not self._perform(task, child):
-                _discard(child)
-                child = None
             with self._changed:
                 self._running.remove(task)
+                if usable:
+                    self._idle.add(number)
                 self._changed.notify_all()
+            if child is not None and not usable:
+                _discard(child)
+                child, orders = None if self._closed else self._started(), 0
         _discard(child)
 
     def _started(self) -> ChildProcess | None:
@@ -245,15 +251,21 @@ class Children:
                 self._starting.discard(child)
         return child
 
-    def _next_task(self) -> ChildTask[Any] | None:
-        """Wait for the next task; None if the pool is closed."""
+    def _next_task(self, number: int) -> ChildTask[Any] | None:
+        """Wait for the next task of the child with this number; None if the pool is closed.
+
+        Tasks go to the idle child with the lowest number, whose caches are most likely to contain what they need.
+        """
         with self._changed:
+            self._idle.add(number)
             while not self._closed:
-                if eligible := self._eligible():
+                eligible = self._eligible()
+                if len(eligible) > sum(other < number for other in self._idle):
                     using = Counter(task.caller for task in self._running)
                     task = min(eligible, key=lambda one: (using[one.caller], self._turns.get(one.caller, 0)))
                     self._waiting.remove(task)
                     self._running.append(task)
+                    self._idle.remove(number)
                     self._turn += 1
                     self._turns[task.caller] = self._turn
                     return task

@@ -75,6 +75,20 @@ def test_a_child_stays_for_the_next_order(children: Children) -> None:
     assert process_id(children) == process_id(children)
 
 
+def test_of_idle_children_the_first_one_gets_the_next_order(children: Children, tmp_path: Path) -> None:
+    tasks = [wait_for(children, tmp_path, name, caller=name) for name in ("otto", "olga")]
+    processes = {int((tmp_path / name).read_text()) for name in ("otto", "olga")}
+    for name in ("olga", "otto"):
+        let_go(tmp_path, name)
+    assert [task.future.result(PATIENCE_S) for task in tasks] == [b"waited", b"waited"]
+    used = set()
+    for _ in range(10):
+        until(lambda: children.sizes == (0, 0))
+        used.add(process_id(children))
+    assert len(used) == 1
+    assert used < processes
+
+
 def test_no_child_sees_a_secret(children: Children) -> None:
     seen = run(children, "environment").decode()
     assert "PATH=" in seen
