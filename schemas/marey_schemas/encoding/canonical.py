@@ -77,14 +77,15 @@ def attach_arrays(tree: Any, load: Callable[[str], NDArray[Any] | EncodedArray])
 def _canonical(value: Any) -> Any:
     if type(value) is str or value is None:
         return value
+    # Numbers come before containers, because asking whether a number is a mapping takes far longer.
+    if isinstance(value, float):
+        return int(value) if value.is_integer() and abs(value) < 1 << 63 else value
+    if isinstance(value, int):
+        return float(value) if not isinstance(value, bool) and abs(value) >= 1 << 63 else value
     if isinstance(value, Mapping):
         return {_text_key(key): _canonical(member) for key, member in value.items()}
     if isinstance(value, list | tuple):
         return [_canonical(item) for item in value]
-    if isinstance(value, float) and value.is_integer() and abs(value) < 1 << 63:
-        return int(value)
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) >= 1 << 63:
-        return float(value)
     return value
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self
 
+import orjson
+
 from marey_motion.formats.predecessor.graph import GraphNode, PredecessorGraph
 from marey_motion.importing.files import import_file, mapping_part
 from marey_motion.importing.items import FileToImport, GivenSkeleton, ImportedFile, ImportedGraph, ImportedItem
@@ -11,7 +13,7 @@ from marey_motion.importing.plan import PlannedFile
 from marey_motion.warm_up import compile_kernels
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.encoding.codecs import JSON, MSGPACK, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.imports import Refusal
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
@@ -180,4 +182,5 @@ def _read_document(kind: Kind, tree: dict[str, Any]) -> ReadDocument:
     def read() -> ReadDocument:
         return ReadDocument.of(prepare_document(tree, schema=tree["schema"]))
 
-    return _READ_SKELETONS.get_or_make(encode_tree(tree, JSON), read) if kind is Kind.SKELETON else read()
+    # A hierarchy has no arrays, so that orjson alone writes it.
+    return _READ_SKELETONS.get_or_make(orjson.dumps(tree), read) if kind is Kind.SKELETON else read()

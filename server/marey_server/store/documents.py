@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -149,17 +149,29 @@ def _is_reference(value: Any) -> bool:
 _LEAVES = (str, float, int, bool, type(None))
 
 
-def _members(value: Any, pointer: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every member of a tree with its JSON Pointer, containers before their members."""
-    yield pointer, value
-    if type(value) in _LEAVES:  # most members; asking whether they are mappings takes far longer
-        return
-    if isinstance(value, Mapping):
-        for key, member in value.items():
-            yield from _members(member, f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}")
-    elif isinstance(value, list | tuple):
-        for index, member in enumerate(value):
-            yield from _members(member, f"{pointer}/{index}")
+def _members(tree: Any) -> list[tuple[str, Any]]:
+    """List the members of a tree with their JSON Pointers, containers before their members.
+
+    Numbers and text in lists are left out: they are neither references nor named.
+    """
+    found: list[tuple[str, Any]] = []
+
+    def visit(pointer: str, value: Any) -> None:
+        found.append((pointer, value))
+        if type(value) is dict or isinstance(value, Mapping):  # nearly all are; asking for mappings takes far longer
+            for key, member in value.items():
+                at = f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}"
+                if type(member) in _LEAVES:
+                    found.append((at, member))
+                else:
+                    visit(at, member)
+        elif isinstance(value, list | tuple):
+            for index, member in enumerate(value):
+                if type(member) not in _LEAVES:
+                    visit(f"{pointer}/{index}", member)
+
+    visit("", tree)
+    return found
 
 
 def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, str]]:
