@@ -119,7 +119,10 @@ def _type(schema: dict[str, Any]) -> str:
 
 def checks_page() -> str:
     """Every warning an import may give."""
-    text = "# Import checks\n\nWarnings never keep a file out. `marey show` lists a clip's with joints and frames.\n\n"
+    text = (
+        "# Import checks\n\nA file with warnings is imported nevertheless. `marey show` lists the warnings of a clip "
+        "with joints and frames.\n\n"
+    )
     return NOTE + text + _table(("code", "meaning"), [(f"`{code}`", meaning) for code, meaning in checks.CODES.items()])
 
 
