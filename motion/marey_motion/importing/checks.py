@@ -20,7 +20,7 @@ from marey_schemas.wording import counted
 # Every code a warning may carry, and what it means to the reader of an import report.
 CODES = {
     # What the file says, and what was made of it.
-    "frame-count-mismatch": "The header declares another number of frames than the file contains; all frames were imported.",
+    "frame-count-mismatch": "The file has more or fewer frames than its header declares; all were imported.",
     "frames-wrapped": "Frames are divided into several lines; the lines were joined by counting values.",
     "no-frames": "The file contains no motion; only its skeleton was imported.",
     "frame-time-snapped": "The frame time in the file is rounded; the nearest usual frame rate was used.",
@@ -30,7 +30,7 @@ CODES = {
     "mixed-rotation-orders": "The order of Euler angles differs between joints; each joint was read in its own order.",
     "duplicate-joint-names": "Several joints have the same name; the name of the parent was added to make them unique.",
     "position-channels": "Joints below the root move relative to their parents; their translations were kept.",
-    "bones-moved-by-translations": "Bones point to the positions of the source's joints, instead of having their rotations.",
+    "bones-moved-by-translations": "Bones follow the positions of the source's joints instead of their rotations.",
     "offsets-from-positions": "The file contains no bone lengths; they were computed from the position channels.",
     "position-channels-relative": "The position channels contain displacements from the offsets instead of positions.",
     "non-unit-quaternions": "Some quaternions did not have length 1; they were normalised.",
