@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 from tests.support.furnished_house import House, build_house
-from tests.support.hostile_client import fire_all, shots, some
+from tests.support.hostile_client import ATTACKED, fire_all, shots, some
 from tests.support.process_cost import ProcessCost
 from tests.support.rest_server import People
 from tests.support.server_process import ServerProcess
@@ -30,7 +30,6 @@ MOST_MB = 1_200
 """Twice what the server and its children may take, because this bound must hold on a busy machine."""
 OWN_BUSINESS = {"leader", "server_state", "event"}
 """Tables that the server changes by itself."""
-SETTINGS = {"MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5"}
 
 
 @dataclass
@@ -56,7 +55,7 @@ class Attacked:
 @pytest.fixture
 def attacked(tmp_path: Path, database_url: str) -> Iterator[Attacked]:
     """A furnished server in a process of its own, on SQLite and on Postgres."""
-    process = ServerProcess(tmp_path, database_url, **SETTINGS).start()
+    process = ServerProcess(tmp_path, database_url, **ATTACKED).start()
     database = Database(database_url)
     people = People(process.url, database)
     try:

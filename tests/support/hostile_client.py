@@ -28,6 +28,8 @@ from marey_server.http.routes import Route
 
 SMALL_BYTES = 10_000
 """Size of the requests whose cost is bounded."""
+ATTACKED = {"MAREY_LEASE_TTL_S": "3600", "MAREY_BODY_TIMEOUT_S": "5", "MAREY_HEADER_TIMEOUT_S": "5"}
+"""Variables of a server under attack: short timeouts, so that refused connections soon end, and leases that last."""
 HANGS_S = 120.0
 """Time without an answer after which a test says that the server hangs; much longer than any busy machine takes."""
 ENDS_CREDENTIALS = ("/logout", "/complete", "/fail", "/leases/completions")

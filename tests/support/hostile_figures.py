@@ -23,6 +23,7 @@ from pathlib import Path
 import httpx
 from tests.support.furnished_house import House, build_house
 from tests.support.hostile_client import (
+    ATTACKED,
     ENDS_CREDENTIALS,
     SMALL_BYTES,
     Manner,
@@ -43,6 +44,8 @@ from marey_server.store.database.connections import Database
 CONNECTIONS = 200
 SEED = 20261123
 WORST = 12
+STARTING_S = 120.0
+"""Time in seconds in which the children of a new server have loaded their modules."""
 _EVERY_S = 0.05
 Row = tuple[float, float, Outcome]
 """Processor time in milliseconds and memory in MB that a shot cost, and its outcome."""
@@ -169,7 +172,7 @@ def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float) -> 
                 crowd.start()
                 crowd.join()
         busy = (cost.processor_s() - processor) / (time.monotonic() - start)
-        print(f"{name}: peak {cost.peak_mb():.0f} MB, {busy:.2f} processors")
+        print(f"{name}: peak {cost.own_peak_mb():.0f} MB, with children {cost.peak_mb():.0f} MB; {busy:.2f} processors")
         for companion in companions:
             print(companion.line(), flush=True)
 
@@ -182,11 +185,12 @@ def main() -> None:
     parser.add_argument("--database", help="address of an empty Postgres database with the newest schema")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        process = ServerProcess(Path(folder), given.database, MAREY_LEASE_TTL_S="3600").start()
+        process = ServerProcess(Path(folder), given.database, **ATTACKED).start()
         assert process.process is not None
         database = Database(given.database or f"sqlite:///{process.data / 'marey.db'}")
         try:
             house, cost = build_house(People(process.url, database)), ProcessCost(process.process.pid)
+            cost.wait_until_idle(STARTING_S)
             if given.seconds:
                 measure_crowd(process.url, house, cost, given.seconds)
             measure_costs(process.url, some(shots(house), given.shots, SEED), cost)

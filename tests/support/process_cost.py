@@ -10,7 +10,6 @@ from pathlib import Path
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 _QUIET_S = 0.0005
 """Processor time within two hundredths of a second below which a process is idle."""
-_LONGEST_WAIT_S = 1.0
 
 
 class ProcessCost:
@@ -36,15 +35,19 @@ class ProcessCost:
         """Return the resident memory in MB."""
         return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
 
+    def own_peak_mb(self) -> float:
+        """Return the greatest resident memory of the process without its children since `reset_peak`, in MB."""
+        return self._status_kb(self.pid, "VmHWM") / 1e3
+
     def reset_peak(self) -> None:
         """Start to measure the peak of memory again."""
         for pid in self._family():
             with contextlib.suppress(OSError):
                 Path(f"/proc/{pid}/clear_refs").write_text("5")
 
-    def wait_until_idle(self) -> None:
+    def wait_until_idle(self, longest_s: float = 1.0) -> None:
         """Wait until the process does nothing, so that work after an answer is measured with it."""
-        deadline = time.monotonic() + _LONGEST_WAIT_S
+        deadline = time.monotonic() + longest_s
         before = self.processor_s()
         while time.monotonic() < deadline:
             time.sleep(0.02)
