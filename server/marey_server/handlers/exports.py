@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 from pydantic import Field
@@ -24,6 +25,7 @@ from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.http.streaming import BlobSender, attachment
 from marey_server.motions import exporting
+from marey_server.motions.child import ComputedFile
 from marey_server.motions.exporting import ExportTime
 from marey_server.motions.predecessor_exports import PredecessorOptions
 
@@ -90,7 +92,8 @@ class Export(BlobSender):
             if unchanged is not None:
                 return await self.send_blob(unchanged.digest, disposition=attachment(unchanged.name))
         source = await self.look_up(exporting.read_source, *place)
-        file = await self.compute(exporting.write_file, source, query.format, query.unit, query.time, options)
+        order = partial(exporting.export_order, source, query.format, query.unit, query.time, options)
+        file = await self.compute_apart(exporting.EXPORT_ITEM, order, ComputedFile.unpack)
         headers = {"Content-Disposition": attachment(file.name), "Cache-Control": "private, no-cache"}
         return Reply(file.data, media_type=file.media_type, headers=headers)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field
@@ -175,7 +176,8 @@ class EvaluationWalkGraph(Resource):
         number; walks list the edges of each trial in order.
         """
         source = await self.look_up(walk_graphs.read_walks, project, kind_of(kind), item, query.revision)
-        data = await self.compute_long(walk_graphs.write_walk_graph, source, query.trial, query.format)
+        order = partial(walk_graphs.walk_order, source, query.trial, query.format)
+        data = await self.compute_apart(walk_graphs.MAKE_WALK_GRAPH, order, bytes)
         headers = {
             "Content-Disposition": attachment(f"{source.name}-walks.{query.format}"),
             "Cache-Control": IMMUTABLE if query.revision is not None else "private, no-cache",

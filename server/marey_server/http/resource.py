@@ -172,11 +172,6 @@ class Resource(Exchange):
         future = self.services.compute_threads.submit_for(self.client, function, *args, **kwargs)
         return await asyncio.wrap_future(future)
 
-    async def compute_long(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a computation that may take seconds, like `compute`; some threads are reserved for short ones."""
-        async with self.services.compute_threads.long_place():
-            return await self.compute(function, *args, **kwargs)
-
     @asynccontextmanager
     async def using_children(self) -> AsyncIterator[None]:
         """Count this request as one that uses children. Raises `UnavailableProblem` if there are too many."""

@@ -17,12 +17,12 @@ from typing import Any, Self
 import msgpack
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, decode_tree, encode_tree
+from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import FieldError
 from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
 from marey_schemas.processes.limits import allow_memory, allow_processor_time
 from marey_schemas.processes.memory import keep_freed_memory
-from marey_server.errors import ApiProblem
+from marey_server.errors import ApiProblem, TooLargeProblem
 
 
 class Message(BaseModel):
@@ -72,8 +72,11 @@ def pack_tree(tree: Any) -> bytes:
 
 
 def unpack_tree(packed: bytes) -> Any:
-    """Return a document of an order, with decoded arrays."""
-    return decode_tree(packed, MSGPACK)
+    """Return a document of an order, with decoded arrays. Raises `TooLargeProblem`."""
+    try:
+        return decode_tree(packed, MSGPACK)
+    except CodecError as error:
+        raise TooLargeProblem(f"A document is too large to be answered at once: {error}; submit a job.") from error
 
 
 class ChildOrder(Message):

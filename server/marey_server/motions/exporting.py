@@ -1,32 +1,51 @@
-"""Export of items as files: the sources are read in one transaction, and the file is written in a thread."""
+"""Export of items as files: the sources are read in one transaction, and the file is written in a child process."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 from marey_schemas.encoding import codecs
-from marey_schemas.formats import ExportFormat
+from marey_schemas.formats import ExportFormat, WrittenUnit
 from marey_schemas.item_files import ItemToExport, OriginalFile, item_as_json, original_of_clip
 from marey_schemas.kinds import Kind
 from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.motions.child import ComputedFile, Message, pack_tree, unpack_tree
 from marey_server.motions.predecessor_exports import PredecessorOptions, unchanged_original, write_predecessor
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
+EXPORT_ITEM = "marey_server.motions.exporting:export_item"
+"""Function that child processes run."""
 WITH_MOTION = (Kind.CLIP, Kind.PROCESSED)
 """Kinds with a part `motion` that can be written as a motion file."""
 
 ExportTime = Literal["canonical", "source"]
 
 
-@dataclass(frozen=True, slots=True)
-class ServedFile:
-    """File to send: its name, media type, and content."""
+class ExportOrder(Message):
+    """Order to write the file of an item, whose documents are given as bytes."""
 
+    item: str
+    kind: Kind
     name: str
-    media_type: str
-    data: bytes
+    collection: str
+    revision: int
+    parts: dict[str, bytes]
+    hierarchy: bytes | None
+    tags: tuple[str, ...] | None
+    format: ExportFormat
+    unit: WrittenUnit
+    time: ExportTime
+    options: PredecessorOptions
+
+    def source(self) -> ItemToExport:
+        """Return the item with its documents."""
+        return ItemToExport(
+            self.item, self.kind, self.name, self.collection, self.revision,
+            {part: unpack_tree(packed) for part, packed in self.parts.items()},
+            None if self.hierarchy is None else unpack_tree(self.hierarchy),
+            self.tags,
+        )  # fmt: skip
 
 
 def read_source(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> ItemToExport:
@@ -84,9 +103,38 @@ def find_original(
     )
 
 
+def export_order(
+    source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
+) -> bytes:
+    """Return the order to write the file of an item."""
+    return ExportOrder(
+        item=source.item,
+        kind=source.kind,
+        name=source.name,
+        collection=source.collection,
+        revision=source.revision,
+        parts={part: pack_tree(tree) for part, tree in source.parts.items()},
+        hierarchy=None if source.hierarchy is None else pack_tree(source.hierarchy),
+        tags=None if source.tags is None else tuple(source.tags),
+        format=file_format,
+        unit=unit,
+        time=time,
+        options=options,
+    ).pack()
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def export_item(packed: bytes) -> bytes:
+    """Carry out an `ExportOrder` and return a `ComputedFile`."""
+    order = ExportOrder.unpack(packed)
+    return write_file(order.source(), order.format, order.unit, order.time, order.options).pack()
+
+
 def write_file(
-    source: ItemToExport, file_format: ExportFormat, unit: str, time: ExportTime, options: PredecessorOptions
-) -> ServedFile:
+    source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
+) -> ComputedFile:
     """Write the file of an item. Raises `InvalidProblem` if the format cannot represent it."""
     if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem(
@@ -96,9 +144,9 @@ def write_file(
     beside = source.kind is Kind.PROCESSED and options.part == "alignment"
     if file_format == "predecessor" and (beside or source.kind not in WITH_MOTION):
         name, data = write_predecessor(source.kind, source.name, source.parts, source.hierarchy, options)
-        return ServedFile(name, codecs.JSON, data)
+        return ComputedFile(name=name, media_type=codecs.JSON, data=data)
     if file_format == "json":
-        return ServedFile(f"{source.name}.json", codecs.JSON, item_as_json(source))
+        return ComputedFile(name=f"{source.name}.json", media_type=codecs.JSON, data=item_as_json(source))
     if source.kind not in WITH_MOTION or source.hierarchy is None:
         raise InvalidProblem(f"An item of the kind {source.kind} can only be exported as json.", code="no-such-export")
     from marey_motion.errors import MotionError
@@ -108,4 +156,4 @@ def write_file(
         written = write_motion_file(source, file_format, unit=unit, time=time)
     except MotionError as error:
         raise InvalidProblem(str(error), code="cannot-be-exported") from error
-    return ServedFile(source.name + written.suffix, written.media_type, written.data)
+    return ComputedFile(name=source.name + written.suffix, media_type=written.media_type, data=written.data)

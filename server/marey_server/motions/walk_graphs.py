@@ -1,4 +1,4 @@
-"""Walk graph of an evaluation: the frames that its trials displayed and the jumps between them."""
+"""Walk graph of an evaluation, computed in a child process: the displayed frames and the jumps between them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import NAMES_SHOWN
 from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.store import items
 from marey_server.store.transaction import Transaction
 
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 WalkGraphFormat = Literal["json", "graphml"]
 MEDIA_TYPES: Mapping[WalkGraphFormat, str] = {"json": "application/json", "graphml": "application/graphml+xml"}
+MAKE_WALK_GRAPH = "marey_server.motions.walk_graphs:make_walk_graph"
+"""Function that child processes run."""
 SCHEMA = "marey/walk-graph@1"
 
 
@@ -31,6 +34,16 @@ class WalkSource:
     records: Mapping[str, Any]
 
 
+class WalkOrder(Message):
+    """Order to write the walk graph of one trial, or of all trials together."""
+
+    name: str
+    evaluation: bytes
+    records: bytes
+    trial: str | None
+    format: WalkGraphFormat
+
+
 def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision: int | None) -> WalkSource:
     """Read an evaluation and the displayed frames of its trials. Raises `NotFoundProblem`."""
     if kind is not Kind.EVALUATION:
@@ -39,10 +52,30 @@ def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision
         )
     name = items.read_item(tx, project, kind, item_id).name
     evaluation, records = (
-        items.read_part(tx, project, kind, item_id, part, revision=revision, arrays="decoded").tree
-        for part in ("evaluation", "records")
+        items.read_part(tx, project, kind, item_id, part, revision=revision).tree for part in ("evaluation", "records")
     )
     return WalkSource(name, evaluation, records)
+
+
+def walk_order(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> bytes:
+    """Return the order to write a walk graph."""
+    return WalkOrder(
+        name=source.name,
+        evaluation=pack_tree(source.evaluation),
+        records=pack_tree(source.records),
+        trial=trial,
+        format=form,
+    ).pack()
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def make_walk_graph(packed: bytes) -> bytes:
+    """Carry out a `WalkOrder` and return the graph."""
+    order = WalkOrder.unpack(packed)
+    source = WalkSource(order.name, unpack_tree(order.evaluation), unpack_tree(order.records))
+    return write_walk_graph(source, order.trial, order.format)
 
 
 def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> bytes:

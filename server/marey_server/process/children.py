@@ -19,7 +19,6 @@ from typing import Any, Generic, TypeVar
 from marey_schemas.processes.child_process import BadMessage, ChildBroken, ChildProcess
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
-from marey_server.process.computing import ASK_AGAIN_S
 
 T = TypeVar("T")
 
@@ -31,6 +30,8 @@ ORDERS_PER_CHILD = 1000
 ABANDONED_S = 1.0
 """Time in seconds in which an order may end by itself after its client has gone; a new child takes longer to start."""
 CLOSING_S = 10.0
+ASK_AGAIN_S = 5
+"""Time in seconds after which a refused client is asked to try again."""
 MIB = 1 << 20
 JOB_ADVICE = "split it, or submit a job, which may have more"
 _PROBLEMS = {one.status: one for one in (InvalidProblem, NotFoundProblem, TooLargeProblem)}

@@ -1,21 +1,18 @@
-"""Threads for computations, and a limit on long computations.
+"""Threads for what the server computes itself: decoding and checking of documents, packing, files, and rendering.
 
-Long computations must leave a thread for short ones: exports, documents, passwords.
+Long computations and those that need numeric modules run in child processes.
 """
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import asynccontextmanager
 from typing import ParamSpec, TypeVar
 
-from marey_server.errors import UnavailableProblem
 from marey_server.store.database.lanes import SERVER, Client, Lane
 
 P = ParamSpec("P")
@@ -24,19 +21,15 @@ T = TypeVar("T")
 THREAD_NAME = "marey-compute"
 RENDERING_THREADS = 3
 """Number of threads that render documents; one client, and all strangers together, may use all but one."""
-LONGEST_WAIT_FOR_PLACE_S = 20.0
-"""Longest wait in seconds for a free place among the long computations; then the request is answered with 503."""
-ASK_AGAIN_S = 5
 BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
-    """Lane with a thread for each processor, of which all but one may run long computations, and one for rendering."""
+    """Lane with a thread for each processor, and one for rendering."""
 
     def __init__(self, threads: int | None = None) -> None:
         count = max(2, threads or os.cpu_count() or 2)
         self._lane = Lane(THREAD_NAME, count)
-        self._long_places = asyncio.Semaphore(count - 1)
         self.rendering = Lane(f"{THREAD_NAME}-rendering", RENDERING_THREADS, most_each=RENDERING_THREADS - 1)
 
     @property
@@ -51,25 +44,6 @@ class ComputeThreads:
     def submit_for(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Run a computation for a client in a thread. Raises `UnavailableProblem` if too many wait."""
         return self._lane.submit(client, function, *args, **kwargs)
-
-    @asynccontextmanager
-    async def long_place(self) -> AsyncIterator[None]:
-        """Reserve a thread for a long computation inside the block.
-
-        Raises `UnavailableProblem` if none becomes free in time.
-        """
-        try:
-            await asyncio.wait_for(self._long_places.acquire(), LONGEST_WAIT_FOR_PLACE_S)
-        except TimeoutError:
-            raise UnavailableProblem(
-                "All computing threads of the server are used by other requests; try again in a few seconds.",
-                code="computing",
-                headers={"Retry-After": str(ASK_AGAIN_S)},
-            ) from None
-        try:
-            yield
-        finally:
-            self._long_places.release()
 
     def close(self) -> None:
         """Start no more computations; running ones are not awaited, because their clients are gone."""

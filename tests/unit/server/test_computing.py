@@ -1,53 +1,11 @@
-"""Threads that compute: long computations leave some to others, and none keeps a server from ending."""
+"""Threads that compute do not keep a server from ending."""
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
-
-import pytest
-
-from marey_server.errors import UnavailableProblem
-from marey_server.process import computing
-from marey_server.process.computing import ComputeThreads
-
-
-def test_long_computations_leave_a_thread_to_others() -> None:
-    async def main() -> None:
-        threads, end = ComputeThreads(2), threading.Event()
-
-        async def compute_long() -> bool:
-            async with threads.long_place():
-                return await asyncio.wrap_future(threads.submit(end.wait, 30))
-
-        long = [asyncio.create_task(compute_long()) for _ in range(3)]
-        await asyncio.sleep(0.05)
-        assert await asyncio.wait_for(asyncio.wrap_future(threads.submit(lambda: "quick")), 10) == "quick"
-        end.set()
-        assert await asyncio.gather(*long) == [True] * 3
-
-    asyncio.run(main())
-
-
-def test_who_waits_too_long_is_told_to_ask_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(computing, "LONGEST_WAIT_FOR_PLACE_S", 0.01)
-
-    async def main() -> None:
-        threads = ComputeThreads(2)
-        async with threads.long_place():
-            with pytest.raises(UnavailableProblem) as refused:
-                async with threads.long_place():
-                    pass
-        assert int(refused.value.headers["Retry-After"]) > 0
-        async with threads.long_place():
-            pass
-
-    asyncio.run(main())
-
 
 ENDLESS = """
 import sys, time
