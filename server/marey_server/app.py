@@ -110,7 +110,7 @@ def _fields(handler: Resource, route: str, status: int, duration_s: float) -> di
 
 
 def create_app(settings: Settings, database: Database, children: Children | None = None) -> Application:
-    """Return an application over a database whose schema is current; `children` may be shared by several."""
+    """Return an application that uses a database with the current schema; several applications may share `children`."""
     return Application(settings, database, children)
 
 
@@ -233,7 +233,7 @@ async def serve(settings: Settings) -> None:
 
 @asynccontextmanager
 async def warming(children: Children) -> AsyncIterator[None]:
-    """Compile all kernels in a separate process, then start the children, while the server already answers."""
+    """Compile all kernels in a separate process, then start the child processes, while the server answers requests."""
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "marey_motion.warm_up", env=clean_environment()
     )
@@ -287,7 +287,7 @@ def _replace_worker_token(tx: Transaction, name: str) -> str:
 
 
 def greeting(settings: Settings, address: str, database: Database) -> Iterator[str]:
-    """Return the lines that a new server prints, without any secret."""
+    """Return the lines that a server prints when it has started; they contain no secret."""
     yield f"listening on {address}"
     data = settings.data.absolute()
     yield f"data: {data}; database: {database.shown}"
@@ -301,7 +301,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
 
 
 def next_command(settings: Settings, address: str) -> str:
-    """Return the first command to run, with server and token if the command would not find them by itself."""
+    """Return the first command that a user should run, with the options for server and token if it needs them."""
     reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     defaults = Settings.model_fields
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"

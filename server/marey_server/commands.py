@@ -1,6 +1,6 @@
 """Commands of `marey` for the server's own machine: serve, and maintenance of the database.
 
-Functions print their results, and raise `CommandFailed` with a sentence if they fail.
+Functions print their results, and raise `CommandFailed` with an explanation if they fail.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from marey_server.process.settings import Settings
 
 
 class CommandFailed(Exception):
-    """A command that failed; the text says why and what to do."""
+    """Error of a command that failed; its text gives the reason and what to do."""
 
 
 def serve(**settings: Any) -> None:
-    """Run a server, and as many workers as asked for, until SIGTERM or SIGINT."""
+    """Run a server and the requested number of workers until SIGTERM or SIGINT."""
     from marey_server.app import CannotListen
     from marey_server.app import serve as serve_until_stopped
     from marey_server.process.computing import leave
@@ -51,7 +51,7 @@ def serve(**settings: Any) -> None:
 
 
 def _new_event_loop() -> asyncio.AbstractEventLoop:
-    """Make an event loop of uvloop, which is not available for Windows; there and without it, one of asyncio."""
+    """Make an event loop of uvloop, or of asyncio if uvloop is not installed or not available, as on Windows."""
     try:
         uvloop = import_module("uvloop")
     except ModuleNotFoundError:
@@ -141,7 +141,9 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
 
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
-    """Compare the clock that an SQLite database keeps with that of this machine; with `set_now`, set it to this one."""
+    """Compare the clock that an SQLite database stores with the clock of this machine; with `set_now`, set the stored
+    clock.
+    """
     from marey_server.store.clock_setting import read_clock, set_clock
     from marey_server.store.database.opening import alone
 
@@ -155,7 +157,7 @@ def clock(*, set_now: bool = False, **settings: Any) -> None:
 
 
 def purge(**settings: Any) -> None:
-    """Delete what is older than the settings keep it and what nothing refers to, then return free pages of SQLite."""
+    """Delete data that is older than the settings allow or that nothing refers to; then shrink the SQLite file."""
     from marey_server.app import connect_database
     from marey_server.store.garbage import collect_garbage
     from marey_server.store.retention import retire
@@ -173,7 +175,7 @@ def purge(**settings: Any) -> None:
 
 
 def _shrink(file: Path) -> None:
-    """Give the free pages of an SQLite database back to the disk, unless a server is running."""
+    """Shrink the file of an SQLite database by its free pages, unless a server is running."""
     from marey_server.store.database.opening import DatabaseUnusable, vacuum
 
     before = file.stat().st_size
@@ -185,7 +187,7 @@ def _shrink(file: Path) -> None:
 
 
 def admin_token(*, user: str | None = None, **settings: Any) -> None:
-    """Create an administrator's token, and write it to `admin.token` in the data folder in place of a lost one."""
+    """Create a new administrator's token, and write it to `admin.token` in the data folder."""
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem

@@ -1,4 +1,4 @@
-"""Errors that the server answers with, grouped by status. The docstring of a class is its default `title`.
+"""Errors that the server sends as answers, grouped by HTTP status. The docstring of a class is its default `title`.
 
 Raise them anywhere; the handlers turn them into problem documents. `code` is stable and documented.
 """
@@ -122,26 +122,26 @@ class ConflictProblem(ApiProblem):
 
 
 class LeaseLostProblem(ConflictProblem):
-    """The lease is held by somebody else or has ended; stop working on the job."""
+    """The lease of the job has ended, or another worker has it now; stop working on the job."""
 
     code = "lease-lost"
 
 
 class QuotaExceededProblem(ConflictProblem):
-    """A quota leaves no room for this; nothing was changed."""
+    """The request would exceed a quota of the user; nothing was changed."""
 
     code = "quota-exceeded"
 
 
 class GoneProblem(ApiProblem):
-    """It existed, and was deleted."""
+    """The requested resource existed, but was deleted."""
 
     status = 410
     code = "gone"
 
 
 class AuthorLostProblem(LeaseLostProblem):
-    """The author of the job may no longer run jobs in its project; stop working on it."""
+    """The user who submitted the job may no longer run jobs in the project; stop working on the job."""
 
     def __init__(self, job_id: str, fence: int) -> None:
         super().__init__(
@@ -205,7 +205,7 @@ class UnavailableProblem(ApiProblem):
 
 
 class StorageFullProblem(ApiProblem):
-    """There is no room left to store this."""
+    """The server has no space left to store this."""
 
     status = 507
     code = "storage-full"

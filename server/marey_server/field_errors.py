@@ -1,4 +1,6 @@
-"""Conversion of pydantic's validation errors to field errors: JSON Pointer into the request, code and sentence."""
+"""Conversion of pydantic's validation errors to field errors, which consist of a JSON Pointer into the request, a code
+and a text.
+"""
 
 from __future__ import annotations
 

@@ -57,7 +57,9 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """Return a hash that no password matches, to check for unknown users, so that all checks take the same time."""
+    """Return a hash that no password matches; it is checked for unknown users, so that their checks take as long as
+    others.
+    """
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

@@ -1,4 +1,4 @@
-"""Principal on whose behalf a service function runs."""
+"""Principal: the user, worker or anonymous client on whose behalf a service function runs."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from marey_schemas.access import Scope
 class Principal:
     """Caller, with the scopes of its credential.
 
-    `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. It is no
-    user, not even the author of the job: it reads the inputs of the job and what they name, and writes only what
-    belongs to its attempt. After its end (`ended`), it may only repeat the request that ended it.
+    `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. Such a
+    worker does not have the rights of a user, not even those of the job's author: it may read the inputs of the job and
+    the documents that they refer to, and write only data of its attempt. After its end (`ended`), it may only repeat
+    the request that ended it.
     """
 
     kind: Literal["anonymous", "user", "attempt", "system"]

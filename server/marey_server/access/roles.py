@@ -22,7 +22,7 @@ class RequiredRole:
     """Role and scope that an operation requires in a project.
 
     Handlers declare it, the transaction of a request contains it, and `store.projects.require` enforces them.
-    `guests`: whether callers without a role may perform a reader's operation in a public project.
+    `guests` is true if callers without a role may perform the operation of a reader in a public project.
     """
 
     role: Role
@@ -35,12 +35,14 @@ STRICTEST = RequiredRole(Role.OWNER, "write", guests=False)
 
 
 def is_administrator(principal: Principal) -> bool:
-    """Return whether the caller is an administrator and the credential has the scope for it."""
+    """Return whether the caller is an administrator and the caller's token has the scope `admin`."""
     return principal.administrator and scopes.allows(principal.scopes, "admin")
 
 
 def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
-    """Raise `ForbiddenProblem` (or `hidden`) unless the caller is an administrator with the scope for it."""
+    """Raise `ForbiddenProblem`, or the error `hidden`, unless the caller is an administrator whose token has the scope
+    `admin`.
+    """
     if is_administrator(principal):
         return
     if principal.kind == "anonymous":

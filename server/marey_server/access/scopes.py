@@ -1,4 +1,4 @@
-"""Scopes of credentials: `read`, `write`, `jobs`, `work` and `admin`, for every project or bound to one as in
+"""Scopes of tokens: `read`, `write`, `jobs`, `work` and `admin`, for all projects, or for one as in
 `write!project=walk`.
 """
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 
 def allows(scopes: Iterable[str], need: str, project: str | None = None) -> bool:
-    """Return whether `scopes` include `need` in `project`; without a project, only unbound scopes count."""
+    """Return whether `scopes` include `need` in `project`; without a project, only scopes for all projects count."""
     wanted = {need} if project is None else {need, f"{need}!project={project}"}
     return not wanted.isdisjoint(scopes)
 
@@ -25,5 +25,7 @@ def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
 
 
 def projects_of(scopes: Iterable[str], *needs: str) -> set[str]:
-    """Return the names of the projects to which `needs` are bound; the empty name if one of them is unbound."""
+    """Return the names of the projects for which `needs` are; the list contains an empty name if one of them is for all
+    projects.
+    """
     return {name for need, _, name in (scope.partition("!project=") for scope in scopes) if need in needs}

@@ -1,7 +1,7 @@
-"""Bearer tokens as text: their creation, their parts, and the hashes of their secrets.
+"""Bearer tokens as text: functions that create them, split them, and hash their secrets.
 
 `marey_<prefix>_<secret>` belongs to a user; the prefix identifies its row. `mareyjob_<secret>` belongs to an attempt of
-a job. Rows hold the SHA-256 of the secret, which has 256 random bits, so that no slow hash is needed.
+a job. The database stores the SHA-256 of the secret. A secret has 256 random bits, so a slow hash is not needed.
 """
 
 from __future__ import annotations

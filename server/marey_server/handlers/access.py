@@ -66,7 +66,7 @@ class MeResource(Resource):
 
 
 class PasswordResource(Resource):
-    """Resource that checks passwords."""
+    """Base class of resources that check passwords."""
 
     async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
         """Count a try and check its password; return the stored hash that it matches, or None.
@@ -177,7 +177,7 @@ class TokenResource(Resource):
 
     @writes(access=Access.USER, query=RevokeQuery)
     async def delete(self, token: str, query: RevokeQuery) -> Rendered:
-        """Revoke a token, for administrators of any user; it stops working at once."""
+        """Revoke a token, which stops working at once; administrators may revoke the tokens of all users."""
         return await self.answer(tokens.revoke_token, token, with_created=query.with_created)
 
 

@@ -32,7 +32,7 @@ class Blob(BlobSender):
     tag = "Blobs"
 
     async def begin(self, digest: str) -> None:
-        """Check the digest before the bytes are received."""
+        """Check that the address contains a valid digest before the bytes are received."""
         require_digest(digest)
         self.receiver = Receiver(self.services)
 

@@ -90,7 +90,8 @@ class CoverageStreamFrames(Resource):
         answer=CoverageProgress,
     )
     async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
-        """Send the next frames, as poses of the stream's skeleton or as roots; the answer lists what is still missing.
+        """Send the next frames, as poses of the stream's skeleton or as root positions; the answer lists the speeds and
+        turn rates that are still missing.
 
         If the last frames are sent again at the same offset, the answer is repeated. If the offset is not that of the
         stream, the answer is 409 with the current offset in the context.

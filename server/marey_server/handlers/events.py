@@ -45,7 +45,7 @@ class Events(Resource):
         """Return events in the order of their commits; as text/event-stream, also future events.
 
         If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and its context
-        has the number after which the kept ones begin.
+        contains the number after which the remaining events begin.
         """
         after = self._last_received(query)
         await self.services.number_events()

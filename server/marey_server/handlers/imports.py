@@ -48,7 +48,7 @@ class ProjectImports(Resource):
     tag = "ProjectImports"
 
     async def begin(self, **_path: str) -> None:
-        """Look at the type of the body before the files are received."""
+        """Check the media type of the body before the files are received."""
         content_type = self.request.headers.get("Content-Type", "")
         self.fields: dict[str, bytearray] = {}
         self.files: list[SourceFile] = []
@@ -100,7 +100,7 @@ class ProjectImports(Resource):
         self.files.append(file)
 
     async def _keep(self, spool: blobs.Spool) -> None:
-        """Store a file as a blob that the caller possesses in the project of the import."""
+        """Store a file as a blob that the caller may use in the project of the import."""
         await self.change(_keep, self.path_kwargs["project"], spool)
 
     def _is_large(self, files: Sequence[SourceFile]) -> bool:

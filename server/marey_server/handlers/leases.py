@@ -114,7 +114,9 @@ class AttemptLog(Resource):
         headers=("Upload-Offset",),
     )
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
-        """Append to the attempt's log at `Upload-Offset`; if this is not its end, the answer is 409 with the end."""
+        """Append to the attempt's log at the offset `Upload-Offset`; if this is not the end of the log, the answer is
+        409 with the right offset.
+        """
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequestProblem(
@@ -137,7 +139,9 @@ class AttemptOutputs(Resource):
         answer=StageAnswer,
     )
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
-        """Stage outputs, which become visible when the attempt completes; an output replaces one of the same name."""
+        """Upload outputs, which become visible when the attempt completes; an output replaces an earlier one of the
+        same name.
+        """
         prepared = await self.compute(partial(_prepare, body))
         return await self.answer_with(
             lambda staged: Reply(StageAnswer(staged=staged)), staging.stage, job, fence, prepared

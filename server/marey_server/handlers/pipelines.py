@@ -27,7 +27,7 @@ class ProjectPipelines(Resource):
     async def post(self, project: str, body: PipelineCreate) -> Rendered:
         """Submit several jobs, all or none; jobs can read the outputs of others.
 
-        An input `{"step": name}` stands for all outputs of that step that have the input's kind, at the revisions that
+        An input `{"step": name}` means all outputs of that step that have the input's kind, at the revisions that
         the step creates. Cached results are used: if a pipeline is submitted again, only the jobs that a change affects
         are computed.
         """

@@ -113,7 +113,9 @@ class Figure(StoredFileSender):
 
 
 def _scripts(report: ReportDocument) -> str:
-    """Return the part of the content security policy that allows only the page's own scripts, by digest."""
+    """Return the part of the content security policy that allows only the scripts of the page, which it lists by
+    digest.
+    """
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"

@@ -99,7 +99,7 @@ class UploadResource(Resource):
         return upload_reply(found)
 
     async def _finish(self, upload: uploads.StoredUpload) -> uploads.StoredUpload:
-        """Hash what is not hashed yet, then store the upload as a blob."""
+        """Hash the bytes that are not hashed yet, then store the upload as a blob."""
         hashes = self.services.upload_hashes
         while (content := await self.compute(hashes.finish, self.caller.principal or ANONYMOUS, upload)) is None:
             upload = await self.look_up(uploads.read_upload, upload.id)

@@ -1,6 +1,6 @@
-"""Accepted connections: bounded in number, in total and for each address, and closed if a client takes no bytes.
-
-When all places are taken, idle connections make room for new ones. Without file descriptors, new connections wait.
+"""Connections of clients: their number is limited, in total and for each address, and a connection is closed if its
+client does not read the answer. When the limit is reached, idle connections are closed in favour of new ones. If no
+file descriptor is free, new connections wait.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def raise_descriptor_limit() -> None:
 
 
 def default_connections() -> int:
-    """Return the number of connections for which there are descriptors beside those that are reserved."""
+    """Return the number of connections for which there are file descriptors, apart from the reserved descriptors."""
     if sys.platform == "win32":
         return MOST_CONNECTIONS
     import resource
@@ -62,7 +62,7 @@ def default_connections() -> int:
 
 
 class _Connection(IOStream):
-    """Connection that notes how many bytes its client has taken since when."""
+    """Connection that counts the bytes that its client has received since a given time."""
 
     def __init__(
         self, accepted: socket.socket, address: str, forget: Callable[[_Connection], None], server: HTTPServer
@@ -73,24 +73,24 @@ class _Connection(IOStream):
         self._forget = forget
 
     def close_fd(self) -> None:
-        """Close the socket, and give its place to another connection."""
+        """Close the socket, so that another connection can be opened."""
         super().close_fd()
         self._forget(self)
 
     def write(self, data: bytes | memoryview) -> asyncio.Future[None]:
-        """Write bytes; from now on, the client must take some."""
+        """Write bytes, and start the time limit in which the client must receive some of them."""
         if not self.writing():
             self.start_count(time.monotonic())
         return super().write(data)
 
     def write_to_fd(self, data: memoryview) -> int:
-        """Pass bytes to the operating system, and count those that it took."""
+        """Pass bytes to the operating system, and count those that it accepted."""
         taken = super().write_to_fd(data)
         self.taken_bytes += taken
         return taken
 
     def start_count(self, now_s: float) -> None:
-        """Count the bytes that the client takes from now on."""
+        """Start a new count of the bytes that the client receives."""
         self.taken_bytes, self.since_s = 0, now_s
 
 
@@ -102,7 +102,7 @@ class Connections:
     server : server that handles the connections
     most : greatest number of connections
     most_each : greatest number of connections of one address
-    write_timeout_s : time in seconds in which a client must take `LEAST_TAKEN_BYTES`, or all that waits for it
+    write_timeout_s : time in seconds in which a client must receive `LEAST_TAKEN_BYTES`, or all bytes that wait for it
     busy : returns the streams on which a request is being answered; others are idle
     count_closed : counts a refused or closed connection by its reason
     """
@@ -167,7 +167,7 @@ class Connections:
             self._begin(accepted, address)
 
     def _begin(self, accepted: socket.socket, address: Any) -> None:
-        """Serve a connection, or close it if there is no room for it."""
+        """Serve a connection, or close it if there are too many."""
         host = str(address[0]) if isinstance(address, tuple) else ""
         if self._by_address[host] >= self._most_each:
             self._evict(host)
@@ -202,7 +202,9 @@ class Connections:
             del self._by_address[one.address]
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Accept nothing for a moment: a failed `accept` would be repeated at once, without end."""
+        """Stop accepting connections for a moment: otherwise a failed `accept` would be repeated at once and without
+        end.
+        """
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
         loop.call_later(PAUSE_S, self._resume, listening)
@@ -223,7 +225,7 @@ class Connections:
         self.close_slow(time.monotonic())
 
     def close_slow(self, now_s: float) -> None:
-        """Close connections whose clients have not taken enough of what waits for them until `now_s`."""
+        """Close connections whose clients have not received enough of the waiting bytes until `now_s`."""
         for one in [one for one in self._open if one.writing() and now_s - one.since_s >= self._write_timeout_s]:
             if one.taken_bytes < LEAST_TAKEN_BYTES:
                 self._log("slow", "closed a connection of %s, which took %d bytes in %.0f s",
@@ -233,7 +235,9 @@ class Connections:
                 one.start_count(now_s)
 
     def _log(self, kind: str, text: str, *args: object) -> None:
-        """Count what happened, and log a warning, at most one of each kind in `LOG_EVERY_S`."""
+        """Count a refused or closed connection, and log a warning: at most one for each reason in `LOG_EVERY_S`
+        seconds.
+        """
         self._count_closed(kind)
         now_s = time.monotonic()
         if now_s - self._logged_s.get(kind, -LOG_EVERY_S) >= LOG_EVERY_S:

@@ -62,7 +62,7 @@ Admission = tuple[str, Access, str | None, bool, bool, bool, BodyTarget]
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:
-    """Return what the admission of a caller's body depends on."""
+    """Return the properties of a request by which the server decides whether the caller may send the body."""
     operation = caller.operation
     declared = (operation.access, operation.scope, operation.public, operation.attempts, operation.replays)
     return hash_secret(caller.token or ""), *declared, target
@@ -95,7 +95,9 @@ def require_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_attempt_access(operation: Operation, principal: Principal) -> None:
-    """Refuse an attempt all but its own endpoints, its inputs, its files, and, after its end, all but a repetition."""
+    """Refuse all requests of an attempt except those to its own endpoints, for its inputs and for its files; after its
+    end, all except the repetition of its last request.
+    """
     if operation.access is Access.ANYONE:
         return
     if principal.ended and not operation.replays:
@@ -108,7 +110,7 @@ def _require_attempt_access(operation: Operation, principal: Principal) -> None:
 
 @dataclass(frozen=True)
 class Call:
-    """Function of a request to be run in a transaction, and the form of its answer."""
+    """Function that a request runs in a transaction, and the form of its answer."""
 
     caller: Caller
     form: AnswerForm
@@ -124,7 +126,9 @@ class Call:
 
 
 def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
-    """Run the function of a request, once per idempotency key, and render the answer, unless it is a document."""
+    """Run the function of a request, only once for each idempotency key, and encode the answer, unless it is a
+    document.
+    """
     call.caller.identify(tx)
     if call.idempotency_key is not None:
         stored = idempotency.begin(tx, call.idempotency_key, call.fingerprint)
@@ -173,7 +177,7 @@ def idempotency_key(headers: HTTPHeaders) -> str | None:
 
 
 def fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
-    """Return a digest by which a request with a key is compared with an earlier one that had the same key."""
+    """Return a digest of a request, which shows whether an earlier request with the same key was equal."""
     digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
     digest.update(request.headers.get("Content-Type", "").encode() + b"\n")
     digest.update(body)

@@ -28,7 +28,10 @@ Declared = Callable[..., Coroutine[Any, Any, None]]
 
 
 class Access(StrEnum):
-    """Minimum access that an operation requires. A role is one in the project of the path; higher roles include it."""
+    """Minimum access that an operation requires.
+
+    Members that are roles mean the role in the project of the path; higher roles include it.
+    """
 
     ANYONE = "anyone"
     SIGNED_IN = "signed_in"
@@ -67,7 +70,7 @@ class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
     `streamed` bodies are passed to the resource piece by piece while they are received. `results` of a job may contain
-    arrays up to `max_bytes`, however few bytes encode them, and are stored as they are encoded.
+    arrays of up to `max_bytes` when decoded; they are stored in the encoding in which they arrive.
     """
 
     content: Content | type[Files]

@@ -84,14 +84,18 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the received part of a refused request's body; if it is too long, close the connection."""
+        """Discard the part of a refused request's body that was received; if the body is too long, close the
+        connection.
+        """
         if self.received_bytes > LINGER_BYTES:
             self.request.connection.close()  # type: ignore[union-attr]
 
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
     def send(self, rendered: Rendered, *, whole_bytes: int | None = None) -> None:
-        """Set status, headers and body of the response, or only the start of a body of `whole_bytes` bytes."""
+        """Set status, headers and body of the response; `body` is only the beginning if the whole body has
+        `whole_bytes` bytes.
+        """
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
             self.set_header(name, value)
@@ -100,7 +104,7 @@ class Exchange(RequestHandler):
             self.write(rendered.body)
 
     async def send_in_pieces(self, rendered: Rendered) -> None:
-        """Send a long body in pieces, and wait until the client took it."""
+        """Send a long body in pieces, and wait until the client has received it."""
         self.send(replace(rendered, body=b""), whole_bytes=len(rendered.body))
         for start in range(0, len(rendered.body), PIECE_BYTES):
             await self.flush()
@@ -123,7 +127,7 @@ class Exchange(RequestHandler):
 
     @property
     def stream(self) -> object:
-        """The connection of the request, as `Connections` knows it."""
+        """The stream of the request's connection, by which `Connections` identifies it."""
         return self.request.connection.stream  # type: ignore[union-attr]
 
     def is_gone(self) -> bool:
@@ -191,7 +195,9 @@ class Exchange(RequestHandler):
 
 
 def forwarded_address(header: str, hops: int) -> str | None:
-    """Return the address that the outermost of `hops` trusted proxies appended to a header, or None without one."""
+    """Return the address that the outermost of `hops` trusted proxies appended to a header; None if the header has too
+    few addresses.
+    """
     entries = [entry.strip() for entry in header.split(",")]
     try:
         return str(ipaddress.ip_address(entries[-hops]))

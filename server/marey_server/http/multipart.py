@@ -17,7 +17,7 @@ MAX_BOUNDARY_BYTES = 70
 
 @dataclass(frozen=True, slots=True)
 class PartHead:
-    """Head of a part: the form field, and the file name if it is a file."""
+    """Headers of a part: the name of the form field, and the file name if the part is a file."""
 
     field: str
     file_name: str | None

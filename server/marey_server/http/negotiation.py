@@ -26,7 +26,7 @@ class MediaType:
 
     @property
     def encoding(self) -> AnswerEncoding:
-        """This media type in the form in which a child process is asked to answer in it."""
+        """This media type as an `AnswerEncoding`, which a child process gets with its task."""
         return AnswerEncoding(media_type=self.name, arrays=self.arrays)
 
 

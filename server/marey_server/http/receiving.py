@@ -14,7 +14,7 @@ WRITTEN_AT_ONCE_BYTES = 64 * 1024
 
 
 class Receiver:
-    """Sink that writes a stream of bytes to a `Spool` in a thread, with at most `BATCH_BYTES` of it in memory."""
+    """Receiver that writes a stream of bytes to a `Spool` in a thread; at most `BATCH_BYTES` wait in memory."""
 
     def __init__(self, services: Services) -> None:
         self.spool = Spool()

@@ -1,7 +1,8 @@
-"""Answers of handlers, and their rendering to bytes, which needs no request and can run in any thread.
+"""Answers of handlers, and functions that encode them as bytes; these need no request and can run in any thread.
 
-A reply is settled in its transaction, which loads the document, and rendered after it: rendering a long document takes
-longer than loading it, and others need the transaction's thread and connection.
+A reply is *settled* in its transaction, which loads the document, and *rendered*, which means encoded, after the
+transaction: encoding a long document takes longer than loading it, and other requests need the thread and the
+connection of the transaction.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Lasting:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """Document that was loaded and must still be made and encoded; one with a digest never changes."""
+    """Document that was loaded and must still be encoded; one with a digest never changes."""
 
     make: MakeTree
     digest: str | None = None
@@ -85,7 +86,9 @@ class AnswerForm:
 
 
 def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
-    """Load the content of a lasting reply, unless the client has it or it is cached; call it in the transaction."""
+    """Load the content of a reply with a `Lasting` document, unless the client or the cache has it; must be called in
+    the transaction.
+    """
     content = reply.content
     if not isinstance(content, Lasting):
         return reply
@@ -102,7 +105,9 @@ def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Return the bytes of a settled reply; if the client has this state in this form already, 304 without a body."""
+    """Return the bytes of a settled reply; if the client already has this state in this form, return status 304 without
+    a body.
+    """
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:
         headers["Location"] = API + reply.location

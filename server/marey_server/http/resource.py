@@ -1,4 +1,4 @@
-"""Base of every handler: checks requests against the declaration, runs the method, and sends its answer.
+"""Base class of all handlers: checks requests against the declaration, runs the method, and sends its answer.
 
 A resource names its `path` and declares its methods:
 
@@ -161,7 +161,7 @@ class Resource(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client whose turn it is when this request is served: a known token, or an address."""
+        """Client to which this request counts when clients take turns: a known token, or an address."""
         token = self.caller.token
         if token is not None and self.services.knows(token):
             return Client(hash_secret(token), is_gone=self.is_gone)
@@ -183,7 +183,7 @@ class Resource(Exchange):
     async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
         """Call `function` (`module:name`) in a child process, with `make()` as argument, and return `read(result)`.
 
-        Raises `ClientGoneProblem` if the client goes away; the child is killed then.
+        If the client closes the connection, the child is killed and `ClientGoneProblem` is raised.
         """
         if self._gone:
             raise ClientGoneProblem(CLIENT_GONE)
@@ -212,7 +212,7 @@ class Resource(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """The user among whom children are shared; for guests, their address."""
+        """The user to whose share of the child processes this request counts; for anonymous callers, their address."""
         user = self.principal.user_id if self.principal is not None else None
         return user or f"address {limited_address(self.client_address)}"
 
@@ -237,7 +237,7 @@ class Resource(Exchange):
 
     @property
     def answer_form(self) -> AnswerForm:
-        """Requested form of the answer."""
+        """The form in which the client requested the answer."""
         reading = self.request.method in ("GET", "HEAD")
         return AnswerForm(
             self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status
@@ -284,10 +284,10 @@ class Resource(Exchange):
             await self.refuse(error)
 
     async def _admit(self) -> None:
-        """Refuse callers who may not send the body, so that nothing of it is received or decoded for them.
+        """Refuse callers who may not send the body before any of it is received or decoded.
 
-        The transaction of the request decides again; here, a decision may be `ADMISSION_S` old, except for results of
-        jobs, whose bodies may be the largest.
+        The transaction of the request checks the caller again. Here, an earlier check of the same caller may be reused
+        for `ADMISSION_S` seconds, except for results of jobs, whose bodies may be the largest.
         """
         operation = self.operation
         project = self.path_kwargs.get("project") if operation.access.role is not None else None
@@ -409,7 +409,9 @@ class Resource(Exchange):
             self.send(outcome)
 
     def on_connection_close(self) -> None:
-        """Release the received part of a body whose client has gone, unless a method runs; give up work of children."""
+        """Release the received part of the body when the client has closed the connection, unless a method runs; stop
+        work of child processes.
+        """
         super().on_connection_close()
         for task in list(self._in_children):
             task.abandon()
@@ -445,4 +447,4 @@ def _read_tree(decode: Callable[[], Any], content: Any) -> Any:
 
 
 def _identify(_tx: Transaction) -> None:
-    """Do nothing: identifying the caller is part of every transaction."""
+    """Do nothing; every transaction identifies the caller, so this function only starts one."""

@@ -24,7 +24,7 @@ IMMUTABLE = "private, max-age=31536000, immutable"
 
 @dataclass(frozen=True, slots=True)
 class ByteRange:
-    """Range of bytes: from `first` to `last`, or with `first` None the `last` bytes at the end."""
+    """Range of bytes: from `first` to `last`; if `first` is None, the final `last` bytes."""
 
     first: int | None
     last: int | None

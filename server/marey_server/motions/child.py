@@ -1,9 +1,12 @@
-"""Child process of the server that reads untrusted files and computes: it runs one order after another, within limits.
+"""Child process of the server that reads untrusted files and computes.
+
+It carries out one order after another, within limits; an order is the call of a function.
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
 Arguments: the pipe's file descriptor, the memory in bytes that orders may use, and functions to call before the first
-order, which load modules. The parent kills this process if an order takes too long, or if its client has gone away.
+order, which load modules. The parent kills this process if an order takes too long, or if its client has closed the
+connection.
 """
 
 from __future__ import annotations
@@ -80,7 +83,7 @@ def unpack_tree(packed: bytes) -> Any:
 
 
 class ChildOrder(Message):
-    """Order to call a function, named `module:function`, which takes and returns bytes."""
+    """Order to call a function that takes and returns bytes; its name has the form `module:function`."""
 
     function: str
     payload: bytes
@@ -97,7 +100,7 @@ class ChildRefusal(Message):
 
 
 class ChildAnswer(Message):
-    """End of an order: its result, or one reason why there is none."""
+    """Answer to an order: its result, or one reason why there is none."""
 
     payload: bytes = b""
     refusal: ChildRefusal | None = None
@@ -106,7 +109,7 @@ class ChildAnswer(Message):
 
 
 def main() -> None:
-    """Run orders until the pipe closes."""
+    """Carry out orders until the pipe closes."""
     pipe = connect_to_parent()
     keep_freed_memory()
     for name in sys.argv[3:]:

@@ -77,7 +77,7 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 
 
 def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
-    """Start a stream; return it with the computed members of `CoverageStreamState`."""
+    """Start a coverage stream, and return its computed state."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
 
@@ -107,7 +107,7 @@ def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]
 
 
 def look(stream: Stream) -> CoverageStreamState:
-    """Return a stream with the coverage of each cell."""
+    """Return the state of a coverage stream, with the coverage of each cell."""
     from marey_motion.evaluation.online import OnlineCoverage
 
     online = OnlineCoverage.from_tree(decode_tree(stream.state, MSGPACK))

@@ -85,7 +85,7 @@ def planned_entry(planned: PlannedFile) -> PreparedImport | None:
 def file_order(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> bytes:
-    """Return the order to read a file with its companion."""
+    """Return the order by which a child process reads a file with its companion."""
     from marey_server.motions.reading import FileOrder, packed_skeleton
 
     file, companion = sources[0], sources[1] if len(sources) > 1 else None
@@ -141,7 +141,7 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 
 
 def mapping_order(file: PreparedImport) -> bytes:
-    """Return the order to derive the joint mapping and axes of a file's skeleton."""
+    """Return the order by which a child process derives the joint mapping and axes of a file's skeleton."""
     from marey_server.motions.reading import MappingOrder, ReadDocument
 
     motion = next((_part(draft, "motion") for draft in file.drafts if draft.kind is Kind.CLIP), None)

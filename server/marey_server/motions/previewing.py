@@ -77,7 +77,10 @@ class PreviewOrder(Message):
 
 
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
-    """Read the inputs of a preview. Raises `NotFoundProblem`, and `TooLargeProblem` for work that needs a job."""
+    """Read the inputs of a preview.
+
+    Raises `NotFoundProblem`, and `TooLargeProblem` if only a job may do so much work.
+    """
     if kind is not Kind.CLIP:
         raise NotFoundProblem(f"Only clips can be edited, not an item of the kind {kind}.", code="not-a-clip")
     edit = EditDocument(commands=request.commands) if request.edit is None else _read_edit(tx, project, request)
@@ -175,7 +178,10 @@ def make_preview(packed: bytes) -> bytes:
 
 
 def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
-    """Return the clips that the edit makes. Raises `TooLargeProblem` for work that needs a job, `InvalidProblem`."""
+    """Return the clips that the edit creates.
+
+    Raises `TooLargeProblem` if only a job may do so much work, and `InvalidProblem`.
+    """
     from marey_motion.editing.registry import edit_clip
     from marey_motion.errors import MotionError
 

@@ -1,4 +1,4 @@
-"""Reading of uploaded files in a child process: orders of imports, and the documents that answer them."""
+"""Reading of uploaded files in a child process: the orders to read them, and the documents that the child returns."""
 
 from __future__ import annotations
 
@@ -144,7 +144,9 @@ class MappingOrder(Message):
 
 
 def load() -> None:
-    """Load what children need; kernels are compiled where necessary, which takes far longer than reading a file."""
+    """Load the modules and kernels that child processes need; compiling missing kernels takes far longer than reading a
+    file.
+    """
     compile_kernels(["files", "editing", "searches", "coverage"])
 
 

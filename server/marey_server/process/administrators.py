@@ -1,4 +1,4 @@
-"""Administrator tokens for the owner of the server's machine: at the first start, and to replace a lost one."""
+"""Administrator tokens for the owner of the machine, created at the first start and to replace a lost token."""
 
 from __future__ import annotations
 

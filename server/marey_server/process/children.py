@@ -1,7 +1,8 @@
-"""Child processes in which the server reads untrusted files and computes: a bounded number, shared fairly, with limits.
+"""Child processes in which the server reads untrusted files and computes; their number is limited, and users share them
+fairly.
 
-Each child has a thread, which starts it, sends it one order after another, and replaces it. Of the waiting orders, the
-next is one of the caller who uses the fewest children, and nobody uses all of them.
+Each child has a thread, which starts it, sends it one order after another, and replaces it. When a child is free, it
+gets an order of the caller who uses the fewest children; no caller can use all of them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ChildLimits:
-    """Limits of all children together, and of each order."""
+    """Limits of the child processes: of all together, and of each order."""
 
     children: int
     requests: int
@@ -89,7 +90,9 @@ class ChildTask(Generic[T]):
                 self._child.abort()
 
     def abandon(self) -> None:
-        """Give the task up, because its client has gone away; a child that works on it is killed after a moment."""
+        """Cancel the task, because its client has closed the connection; if a child works on it, it is killed after a
+        moment.
+        """
         if self.future.cancel():
             _after(ABANDONED_S, self.stop, "client-gone")
 
@@ -163,7 +166,9 @@ class Children:
         read: Callable[[bytes], T],
         count_stop: Callable[[str, str], None],
     ) -> ChildTask[T]:
-        """Call `function` (`module:name`) in a child with what `make` returns; the task's future gets `read` of it."""
+        """Call `function` (`module:name`) in a child with the result of `make`; `read` converts the answer to the
+        result of the task.
+        """
         task = ChildTask(caller, function, make, read, count_stop)
         with self._changed:
             if self._closed:
@@ -176,13 +181,13 @@ class Children:
         return task
 
     def warm(self) -> None:
-        """Start as many children as one caller uses; the others are started when several need them."""
+        """Start as many children as one caller may use; the others are started when several callers need them."""
         with self._changed:
             while not self._closed and len(self._threads) < self.limits.children_each:
                 self._start_thread()
 
     def close(self) -> None:
-        """Kill all children; what they work on and what waits fails."""
+        """Kill all children; their tasks and all waiting tasks fail."""
         with self._changed:
             self._closed = True
             left, self._waiting = self._waiting, []
@@ -205,7 +210,7 @@ class Children:
         thread.start()
 
     def _eligible(self) -> list[ChildTask[Any]]:
-        """Return the waiting tasks whose callers may use one more child; given up tasks are removed."""
+        """Return the waiting tasks whose callers may use one more child; cancelled tasks are removed."""
         self._waiting = [task for task in self._waiting if not task.future.cancelled()]
         using = Counter(task.caller for task in self._running)
         return [task for task in self._waiting if using[task.caller] < self.limits.children_each]

@@ -25,7 +25,7 @@ BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ComputeThreads:
-    """Lane with a thread for each processor, and one for rendering."""
+    """Two lanes (threads with a queue): one with a thread for each processor, and one for encoding answers."""
 
     def __init__(self, threads: int | None = None) -> None:
         count = max(2, threads or os.cpu_count() or 2)

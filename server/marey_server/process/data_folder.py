@@ -1,4 +1,4 @@
-"""Data folder of a server: created if it is missing, and closed to other users of the machine."""
+"""Data folder of a server: it is created if it is missing, and other users of the machine have no access to it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ log = logging.getLogger(__name__)
 
 
 def prepare_data_folder(settings: Settings) -> None:
-    """Create the data folder, and take the rights of other users to the server's own files and folders in it.
+    """Create the data folder, and remove the rights of other users to the server's files and folders in it.
 
-    The folder itself is closed, too, unless it contains anything else. An SQLite file is created here, because SQLite
-    would let everybody read it; SQLite gives its log files the rights of the database.
+    Rights to the folder itself are removed as well, unless it contains files that do not belong to the server. An
+    SQLite file is created here, because SQLite would let everybody read it; SQLite gives its log files the rights of
+    the database.
     """
     settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
     folder = settings.data.resolve()

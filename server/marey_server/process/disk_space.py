@@ -1,4 +1,4 @@
-"""Free space of the disk with the data folder: a floor below which nothing is stored, and a reserve to start with.
+"""Free space of the disk with the data folder: a minimum below which nothing is stored, and a reserve for starting.
 
 On a disk without any space, a server can neither start nor delete, because SQLite needs some for its log. So a file
 keeps space in reserve. It is removed when space runs out, and made again at the next start with enough space.
@@ -32,7 +32,7 @@ class DiskSpace:
         self._looked_s = -LOOK_AGAIN_S
 
     def fault(self) -> str | None:
-        """Return why nothing can be stored, for an operator, or None."""
+        """Return the reason why nothing can be stored, as a text for operators, or None."""
         if not self._is_low():
             return None
         floor = self._floor_bytes // MIB

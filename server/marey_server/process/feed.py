@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def following_feed(services: Services) -> AsyncIterator[None]:
-    """Announce to this process's waiting requests what any process changes, inside the block."""
+    """Wake this process's waiting requests after changes of any server process, inside the block."""
     tasks = [asyncio.create_task(_follow(services))]
     if not services.database.is_sqlite:
         tasks.append(asyncio.create_task(_listen(services)))
@@ -74,7 +74,9 @@ class _FeedPosition:
         self._look_for_due_at_s = 0.0
 
     async def announce_news(self) -> None:
-        """Announce what the events since the last call concern, and kinds of which a retry has become due."""
+        """Wake the requests that the events since the last call concern, and workers for job kinds of which a retry has
+        become due.
+        """
         await self._services.number_events()
         if self._last is None:
             self._last = await self._read(events.newest_number)
@@ -86,7 +88,10 @@ class _FeedPosition:
         await self._announce_due()
 
     async def _announce_due(self) -> None:
-        """Announce the kinds of which a retry has become due; not after each commit, as it reads the whole queue."""
+        """Wake workers for job kinds of which a retry has become due.
+
+        This reads the whole queue, so it is not done after each commit.
+        """
         if time.monotonic() < self._look_for_due_at_s:
             return
         self._look_for_due_at_s = time.monotonic() + LOOK_EVERY_S
@@ -101,7 +106,7 @@ class _FeedPosition:
 
 
 async def _listen(services: Services) -> None:
-    """Announce commits of other processes, as Postgres notifies of them; reconnect if the connection breaks."""
+    """Listen to notifications of Postgres about commits of other processes; reconnect if the connection breaks."""
     failures = 0
     while True:
         try:

@@ -1,7 +1,8 @@
-"""Housekeeping of the server: reclaims leases, serves waiting results, deletes what is old or unreferenced.
+"""Periodic work of the server: reclaims expired leases, shares cached results with waiting jobs, and deletes old or
+unreferenced data.
 
 Only the leading process does it, but concurrent housekeeping would be safe, because every statement repeats its
-conditions. Each chore is a task of its own, so that a failing chore does not affect the others.
+conditions. Each kind of work runs in a separate task, so that a failure does not affect the others.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ FIRST_GARBAGE_S = 60.0
 
 @asynccontextmanager
 async def keeping_house(services: Services) -> AsyncIterator[None]:
-    """Run the periodic chores inside the block; at its end, give up the leadership."""
+    """Run the periodic work inside the block; at its end, give up the leadership."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     chores = (
@@ -69,7 +70,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
-    """Run a chore periodically. A failure is logged and does not stop it."""
+    """Run a function periodically. A failure is logged and does not stop the repetition."""
     await asyncio.sleep(first_s)
     while True:
         try:
@@ -133,7 +134,10 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete limits of sign-ins that have ended; each try has three, and passwords are hashed one by one."""
+    """Delete the rows of sign-in limits that have ended.
+
+    Each try adds three rows, and passwords are hashed one by one, so few rows are added per minute.
+    """
     if await _write(services, _leads, holder):
         while await _write(services, sign_ins.forget_ended) == sign_ins.FORGOTTEN_AT_ONCE:
             pass

@@ -1,4 +1,6 @@
-"""Memory that all requests together may hold: bodies while they are received and decoded, and answers until sent."""
+"""Limit on the memory of all requests together: bodies while they are received and decoded, and answers until they are
+sent.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ STRANGERS = "strangers"
 class RequestMemory:
     """Count of the bytes that requests hold. It is thread-safe.
 
-    A request that is the only one to hold bytes may exceed the total; its own limits bound it.
+    If only one request holds bytes, it may exceed the total; the limits of a single request still apply.
     """
 
     def __init__(self, total_bytes: int) -> None:
@@ -47,7 +49,7 @@ class RequestMemory:
             self._by_owner[owner] += more
 
     def give_back(self, owner: str, held: int) -> None:
-        """Remove bytes of a request from the count."""
+        """Subtract bytes that a request no longer holds."""
         with self._lock:
             self.held_bytes -= held
             self._by_owner[owner] -= held
@@ -70,7 +72,7 @@ class Holding:
         self._bytes += more
 
     def release(self) -> None:
-        """Hold nothing any more; may be called again."""
+        """Release all held bytes; may be called more than once."""
         held, self._bytes = self._bytes, 0
         if held:
             self._memory.give_back(self._owner, held)

@@ -1,7 +1,7 @@
 """Logs, request ids and metrics.
 
-Metrics are labelled with route templates, methods and codes that the server knows, never with anything that a client
-sent, so that they reveal no names, and their number grows neither with the data nor under attack.
+Labels of metrics are route templates, methods and codes that the server defines, never values that a client sent. So
+metrics reveal no names, and their number grows neither with the data nor in an attack.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def request_id(given: str | None) -> str:
 
 
 def configure_logging(form: LogForm, level: str) -> None:
-    """Send every log record of the process to standard error, in one form."""
+    """Write every log record of the process to standard error, all in the same form."""
     log_to_standard_error(form, level)
     logging.getLogger("tornado.access").setLevel("ERROR")  # requests are logged by log_request
     logging.getLogger("tornado.general").addFilter(without_received_text)
@@ -115,7 +115,7 @@ class Metrics:
             self.received.inc(bytes_in)
 
     def count_stopped_child(self, reason: str, work: str) -> None:
-        """Count a child that ended before its work did; both labels are names in the server's code."""
+        """Count a child process that ended before its work was done; both labels are names in the server's code."""
         self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:

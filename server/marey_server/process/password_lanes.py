@@ -1,8 +1,8 @@
-"""Threads that hash passwords, and the part of a client's address that limits of sign-ins count.
+"""Threads that hash passwords, and the part of a client's address for which sign-ins are limited.
 
 A hash takes 0.1 s and 32 MiB, so few run at once, and none in the threads of the database or of other computations.
-Users at addresses from which they have signed in before have a lane of their own: sign-ins of strangers never delay
-them, and together never use more than one processor.
+There is one thread for users at addresses from which they have signed in before, and one for all others. So sign-ins of
+strangers do not delay these users, and use at most one processor.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REFUSALS_REMEMBERED = 10_000
 
 
 def limited_address(text: str) -> str:
-    """Return what limits count instead of an address: the address itself, but of IPv6 the network of 64 bits."""
+    """Return the address to which a sign-in counts: the address of the client, or its network of 64 bits for IPv6."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:  # a Unix socket has none
@@ -58,9 +58,10 @@ class PasswordLane:
 
     @contextmanager
     def place(self, address: str) -> Iterator[None]:
-        """Take a place inside the block.
+        """Count a request inside the block.
 
-        Raises `TooManyRequestsProblem` if the address has too many, `UnavailableProblem` if the lane is full.
+        Raises `TooManyRequestsProblem` if the address already has too many requests here, and `UnavailableProblem` if
+        there are too many in total.
         """
         if self._places[address] >= PLACES_PER_ADDRESS:
             raise TooManyRequestsProblem(
@@ -88,7 +89,7 @@ class PasswordLane:
         return await asyncio.wrap_future(self._thread.submit(function, *args, **kwargs))
 
     def close(self) -> None:
-        """Start no more hashes."""
+        """Close the thread after the hashes that it has begun."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
 

@@ -103,7 +103,7 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log why the server is not ready, once for the same reasons, and when it is ready again."""
+        """Log the reasons why the server is not ready, once until they change, and log when it is ready again."""
         if list(faults) != self._faults:
             self._faults = list(faults)
             if faults:
@@ -112,7 +112,7 @@ class Services:
                 log.info("ready again")
 
     def knows(self, token: str) -> bool:
-        """Return whether a request with this token was accepted before, so that its caller has lines of its own."""
+        """Return whether a request with this token was accepted before; then the caller counts as a known client."""
         return self._tokens_known.get(hash_secret(token)) is not None
 
     def note_use(self, token: str, principal: Principal) -> None:
@@ -129,13 +129,13 @@ class Services:
             self.database.submit_write(SYSTEM, tokens.note_use, token_id)
 
     async def number_events(self) -> None:
-        """Make all events that are committed by now visible in the feed; SQLite does so by itself."""
+        """Number all committed events, so that they can be read; on SQLite they are numbered already."""
         numbered = 0 if self.database.is_sqlite else events.NUMBERED_AT_ONCE
         while numbered == events.NUMBERED_AT_ONCE:
             numbered = await asyncio.wrap_future(self.database.submit_write(SYSTEM, events.number_events))
 
     def end_attempt(self, lost: AuthorLostProblem) -> None:
-        """End a job whose author may no longer run it; if that fails, the reaper does it."""
+        """End a job whose author may no longer run it; if that fails, the job ends when its lease expires."""
         with suppress(UnavailableProblem):
             self.database.submit_write(SYSTEM, end_for_lost_author, lost.job_id, lost.fence)
 

@@ -218,7 +218,7 @@ class Settings(BaseSettings):
 
     @property
     def retention(self) -> Retention:
-        """Return for how long events, logs and jobs are kept."""
+        """Return the numbers of days for which events, logs and jobs are kept."""
         return Retention(self.events_days, self.logs_days, self.jobs_days)
 
     @property
@@ -244,7 +244,7 @@ class Settings(BaseSettings):
 
 
 def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return variables that look like a setting but are none, each with the most similar setting."""
+    """Return environment variables that begin like a setting but are not one, each with the most similar setting."""
     known = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
     unknown = [name for name in environment if name.startswith(PREFIX) and name.upper() not in known]
     own = [name for name in unknown if not name.startswith(f"{PREFIX}TEST_")]

@@ -49,7 +49,8 @@ class _RunningHash:
 class UploadHashes:
     """Hashes of the uploads that this process receives. Methods block, and may be called by several threads.
 
-    The stored pieces are the truth. After a restart, or if another server received a part, the hash starts again.
+    After a restart, or if another server received some of the pieces, the hash is computed again from the stored
+    pieces.
     """
 
     def __init__(self, database: Database) -> None:
@@ -65,7 +66,10 @@ class UploadHashes:
                 running.add(data)
 
     def finish(self, principal: Principal, upload: uploads.StoredUpload) -> tuple[str, Path | None] | None:
-        """Return the digest of a complete upload, and its copy; None after one step of hashing what is lacking."""
+        """Return the digest of a complete upload, and its copy.
+
+        If bytes are not hashed yet, hash some of them and return None.
+        """
         running = self._running(upload.id)
         with running.lock:
             target = min(upload.length, running.offset + STEP_BYTES)

@@ -36,7 +36,7 @@ class BlobBacking(Protocol):
         ...
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Free the bytes of a blob whose row is deleted in this transaction, which may still roll back."""
+        """Free the bytes of a blob whose row this transaction deletes; it may still be rolled back."""
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
@@ -48,11 +48,13 @@ class BlobBacking(Protocol):
         ...
 
     def new_copy(self) -> Path | None:
-        """Return a new file to which an upload is copied as it arrives; None if its pieces stay where they are."""
+        """Return a new file to which an upload is copied as it arrives, or None if the backing needs no copy."""
         ...
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Make a complete copy of an upload the bytes of a blob, in the transaction that inserts the blob's row."""
+        """Turn the complete copy of an upload into the stored bytes of a blob, in the transaction that inserts the
+        blob's row.
+        """
         ...
 
     def check_writable(self) -> None:
@@ -138,7 +140,7 @@ class DatabaseBlobs:
         """Return None: the pieces of an upload become the blob."""
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Refuse: there are no copies."""
+        """Raise `AssertionError`: this backing makes no copies."""
         raise AssertionError(f"the database keeps no copies of files, but was given the copy {copy} for {digest}")
 
     def check_writable(self) -> None:
@@ -193,7 +195,7 @@ class DirectoryBlobs:
                 yield chunk
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Do nothing: the next sweep removes the file, because a transaction that rolls back still needs it."""
+        """Do nothing, because the transaction may still be rolled back; garbage collection removes the file later."""
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
         """Yield the digests of old files, and remove half-written files that a dead process left."""
@@ -208,13 +210,15 @@ class DirectoryBlobs:
                             yield f"sha256:{folder.name}{path.name}"
 
     def new_copy(self) -> Path:
-        """Create a file for the copy of an upload; the sweep removes it if nobody adopts it."""
+        """Create a file for the copy of an upload; garbage collection removes it if `adopt` is not called."""
         handle, name = tempfile.mkstemp(dir=self._incoming)
         os.close(handle)
         return Path(name)
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Rename a synced copy; do nothing if an earlier try of the same transaction did so."""
+        """Sync a copy and rename it to the file of the blob; do nothing if an earlier try of the same transaction did
+        so.
+        """
         path = self._path(digest)
         path.parent.mkdir(exist_ok=True)
         try:

@@ -97,7 +97,7 @@ def digest_of(data: bytes) -> str:
 def put_blob(
     tx: Transaction, content: bytes | Spool, *, expected: str | None = None, project_id: str | None = None
 ) -> str:
-    """Store bytes that the caller sent, and let the caller refer to them by their digest.
+    """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest.
 
     The bytes are for `project_id`; without it, for the projects of the caller's token. Raises `InvalidProblem` if their
     digest is not `expected`.
@@ -118,7 +118,7 @@ def put_blob(
 
 
 def require_sender(principal: Principal) -> None:
-    """Check that the caller may send bytes: users with the scope `write`, for any project, and attempts."""
+    """Check that the caller may upload bytes: users with the scope `write` for any project, and attempts of jobs."""
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to upload data.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
@@ -132,9 +132,9 @@ EVERY_PROJECT = ""
 
 
 def places_of_sender(tx: Transaction) -> tuple[str, ...]:
-    """Return the ids of the projects for which the caller sends bytes, or `EVERY_PROJECT`.
+    """Return the ids of the projects in which bytes that the caller uploads can be used, or `EVERY_PROJECT`.
 
-    Raises `ForbiddenProblem` if the user of a bound token may write in none of its projects.
+    Raises `ForbiddenProblem` if the caller's token is limited to projects, and its user may write in none of them.
     """
     names = scopes.projects_of(tx.principal.scopes, "write")
     if tx.principal.kind != "user" or EVERY_PROJECT in names:
@@ -200,7 +200,9 @@ def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
 
 
 def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
-    """Record that the caller possesses the bytes and may refer to them: an attempt for itself, a user in `places`."""
+    """Record that the caller has uploaded the bytes and may refer to them: an attempt only in its own requests, a user
+    in the projects `places`.
+    """
     caller = tx.principal
     if caller.kind == "attempt":
         row = {"digest": digest, "job_id": caller.job_id, "fence": caller.fence, "created_us": tx.now_us}
@@ -212,7 +214,9 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return the digests that the caller may refer to; their blobs are not deleted before the end of this write."""
+    """Return those of the digests that the caller may refer to, and keep their blobs from being deleted before the end
+    of this write.
+    """
     return _renew(tx, blob, readable(tx, digests))
 
 
@@ -228,7 +232,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def share_with_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> bool:
-    """Protect the blobs of a result that a job takes over from an equal one; return whether all are still stored."""
+    """Protect the blobs of a result that a job shares with an identical job; return whether all are still stored."""
     wanted = set(digests)
     if wanted - _renew(tx, blob, wanted):
         return False
@@ -284,7 +288,7 @@ def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, in
 
 
 def read_blob(tx: Transaction, digest: str, start: int = 0, stop: int | None = None) -> bytes:
-    """Return bytes `start` to `stop` of a blob. Access is not checked: the caller of this function has done so."""
+    """Return bytes `start` to `stop` of a blob. Access must have been checked before."""
     if stop is None:
         stop = int(tx.execute(select(blob.c.size_bytes).where(blob.c.digest == digest)).scalar_one())
     return b"".join(tx.blobs.read(tx.connection, digest, start, stop))
@@ -311,10 +315,11 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 
 
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
-    """Return the condition for rows of `blob_holder` in projects that a user's token reaches.
+    """Return the condition for rows of `blob_holder` whose bytes may be used with a user's token.
 
-    A token that may read everywhere reaches all; any other one reaches the projects to which it is bound, and with an
-    unbound scope what was sent for every project.
+    With a token that may read in all projects, all bytes of the user may be used; with another token, the bytes of the
+    projects to which it is limited, and, if one of its scopes is for all projects, bytes that were uploaded for every
+    project.
     """
     if scopes.allows(caller.scopes, "read"):
         return ()
@@ -324,7 +329,7 @@ def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
 
 
 def reaches(tx: Transaction, places: Collection[str]) -> bool:
-    """Return whether the token of a user reaches all projects for which bytes were sent."""
+    """Return whether the token of a user is valid for all the projects for which bytes were uploaded."""
     caller = tx.principal
     names = scopes.projects_of(caller.scopes, *_USES)
     return EVERY_PROJECT in names or set(places) <= set(tx.execute(_ids_of(names)).scalars())

@@ -1,7 +1,8 @@
-"""Setting of the clock that an SQLite database keeps, after a server ran while the clock of its machine was wrong.
+"""Correction of the clock that an SQLite database stores, after a server ran while the clock of its machine was wrong.
 
-The database never goes back in time by itself. After a start with a clock that was years ahead, leases, tokens and ages
-would count from then on; here the mark is set to the time of this machine, and with it every time that is stored.
+The stored clock never goes back by itself. If a server once started with a clock that was years ahead, all leases,
+tokens and ages would be compared with that time. This module sets the stored clock to the time of this machine, and
+corrects all stored times that are later.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.starte
 
 @dataclass(frozen=True)
 class StoredClock:
-    """The latest time that a database has used, 0 if none, and the time of this machine; microseconds of the epoch."""
+    """Latest time that a database has used (0 if none), and the time of this machine; microseconds since the epoch."""
 
     stored_us: int
     wall_us: int
@@ -44,10 +45,11 @@ def read_clock(connection: Connection) -> StoredClock:
 
 
 def set_clock(connection: Connection) -> int:
-    """Set the stored mark to the time of this machine, and move later times back; return how many were moved.
+    """Set the stored clock to the time of this machine, and move later times back; return how many were moved.
 
-    Later moments of the past become now. Leases end now, so that running jobs go on if their workers report, and wait
-    for a worker again if not. Tokens and time limits that were made in the future keep their duration.
+    Later times of past events are set to the new time. Leases end at the new time, so running jobs continue if their
+    workers report, and are queued again otherwise. Tokens and time limits that were created with the wrong clock keep
+    their duration.
     """
     now_us = wall_clock_us()
     moved = 0

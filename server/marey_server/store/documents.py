@@ -239,7 +239,7 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> No
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
-    """Store documents that have the arrays and files of stored documents, given by digest, but other text."""
+    """Store documents with the arrays and files of stored documents, given by digest, but with another body."""
     if not variants:
         return
     digests = [digest_of_body(body) for _, body in variants]
@@ -275,7 +275,9 @@ def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> Non
 
 
 def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
-    """Record references of documents to blobs: digest of the document, JSON Pointer, digest of the blob."""
+    """Record references of documents to blobs; each consists of the document's digest, a JSON Pointer, and the blob's
+    digest.
+    """
     columns = ("document_digest", "pointer", "blob_digest")
     rows = [dict(zip(columns, one, strict=True)) for one in references]
     if rows:

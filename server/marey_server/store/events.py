@@ -1,9 +1,10 @@
-"""Feed of events, in the order in which their transactions became visible.
+"""Events, in the order in which their transactions were committed.
 
 SQLite has one writer, so that `event.seq`, given at the insertion, already follows the order of commits. On Postgres
-transactions overlap, so that events get their number after the commit, in `number_events`: whoever numbers holds a lock
-until its own commit, sees only committed events, and continues after the last number. So no event gets a lower number
-than one that was already listed, writers do not wait for each other, and the order depends on nothing but the tables.
+transactions overlap, so events get their numbers after the commit, in `number_events`. A transaction that numbers
+events holds a lock until its own commit, sees only committed events, and continues after the last number. So no event
+gets a lower number than one that was already listed, writers do not wait for each other, and the order depends on
+nothing but the tables.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def list_events(
     """List the events after the one numbered `after`: of a project, or, for administrators, of the whole server.
 
     With `subject`, only events of that object are listed. On Postgres, call `number_events` before. Raises
-    `GoneProblem` if events after `after` were deleted, unless `after` is 0, the beginning of what is kept.
+    `GoneProblem` if events after `after` were deleted, unless `after` is 0, which means the oldest stored event.
     """
     require_kept(tx, after)
     number = _number(tx)
@@ -62,7 +63,10 @@ def list_events(
 
 
 def require_kept(tx: Transaction, after: int) -> None:
-    """Check that a follower who received the event numbered `after` has missed none. Raises `GoneProblem`."""
+    """Check that no event after the one numbered `after` was deleted, so that a client which received it misses none.
+
+    Raises `GoneProblem`.
+    """
     last = tx.execute(select(server_state.c.value).where(server_state.c.key == _LAST_DELETED)).scalar()
     if 0 < after < (last or 0):
         raise GoneProblem(
@@ -140,7 +144,7 @@ def number_events(tx: Transaction) -> int:
 
 
 class News(NamedTuple):
-    """Topics to announce, and the number of the last event that they result from."""
+    """Topics of wake-ups, and the number of the last event that was read for them."""
 
     topics: frozenset[str]
     last: int
@@ -154,7 +158,7 @@ def newest_number(tx: Transaction) -> int:
 
 
 def read_news(tx: Transaction, after: int) -> News:
-    """Return which waiting requests the events after the one numbered `after` concern."""
+    """Return the topics of the waiting requests that the events after the one numbered `after` concern."""
     number = _number(tx)
     rows = tx.execute(
         select(number.label("number"), event.c.project_id, event.c.subject)

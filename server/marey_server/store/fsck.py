@@ -39,7 +39,7 @@ PAGE = 100
 
 @dataclass(frozen=True, slots=True)
 class StoreDefect:
-    """Defect of the store: a stable code, the place, and a sentence."""
+    """Defect of the store: a stable code, the place, and a description."""
 
     code: str
     subject: str
@@ -210,7 +210,9 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def find_faults(tx: Transaction) -> list[str]:
-    """Return sentences for the operator about faults that keep the server from serving; empty if there are none."""
+    """Return descriptions, for the operator, of faults because of which the server cannot serve requests; empty if
+    there are none.
+    """
     faults = []
     if not schema_at_head(tx.connection):
         faults.append("the database's tables are not those of this version: run `marey db upgrade`")

@@ -57,7 +57,7 @@ class Collected:
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
-    """Delete data that has had no reference for `grace_us`; safe at any time and in several processes at once."""
+    """Delete data without references for `grace_us`; may run at any time and in several processes at once."""
     return Collected(
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
@@ -167,7 +167,7 @@ def _drop_old_keys(tx: Transaction) -> int:
 
 
 def _drop_ended_holdings(tx: Transaction) -> int:
-    """Forget which blobs the attempts sent that no longer hold their jobs."""
+    """Delete the records of uploads by attempts that have lost their jobs or have ended."""
     same_attempt = (job.c.id == attempt_blob.c.job_id, job.c.fence == attempt_blob.c.fence)
     held = exists().where(*same_attempt, job.c.state == RUNNING)
     return tx.execute(delete(attempt_blob).where(~held)).rowcount

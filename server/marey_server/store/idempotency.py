@@ -31,7 +31,7 @@ class StoredAnswer:
 
 
 def begin(tx: Transaction, key: str, fingerprint: str) -> StoredAnswer | None:
-    """Claim `key` for a request and return None, or return the stored answer of the same request.
+    """Reserve `key` for a request and return None, or return the stored answer to an earlier, equal request.
 
     `fingerprint` identifies the request and the scopes of the token, so that a token with fewer rights cannot get the
     answer given to one with more. Raises `InvalidProblem` if the key was used for another request. The caller must call

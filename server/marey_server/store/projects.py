@@ -87,8 +87,9 @@ def require(
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
     `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last. Raises `NotFoundProblem` if the caller may not know the project, `ForbiddenProblem` if the caller may
-    not do this in it, `UnauthenticatedProblem` if signing in could help.
+    deleted last. Raises `NotFoundProblem` if the caller may not know that the project exists, `ForbiddenProblem` if the
+    caller lacks the role or the scope, and `UnauthenticatedProblem` if an anonymous caller could get them by signing
+    in.
     """
     required = tx.required_role
     need = at_least if roles.includes(at_least, required.role) else required.role
@@ -112,7 +113,7 @@ def require(
 
 
 def find_by_id(tx: Transaction, project_id: str) -> ProjectRow:
-    """Return a project, even a deleted one, without a check of rights; for internal work of the server."""
+    """Return a project, even a deleted one, without checking rights; only for internal work of the server."""
     row = tx.execute(_with_role_of(tx.principal.user_id or "").where(project.c.id == project_id)).one()
     return _row(row, Role.READER, guest=False)
 
@@ -149,7 +150,9 @@ def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
 
 
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Return the condition for rows of `project`: not deleted, and readable by the caller, as none is by an attempt."""
+    """Return the condition for rows of `project` that are not deleted and that the caller may read; attempts may read
+    none.
+    """
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":
         return false()
@@ -163,7 +166,7 @@ def is_visible(principal: Principal) -> ColumnElement[bool]:
 
 
 def writable_projects(tx: Transaction, names: Iterable[str]) -> list[str]:
-    """Return the ids of those of the named projects in which the caller's user may write."""
+    """Return the ids of the named projects in which the user of the caller may write."""
     statement = select(project.c.id).where(project.c.name.in_(list(names)), project.c.deleted_us.is_(None))
     if not tx.principal.administrator:
         statement = statement.join(member, member.c.project_id == project.c.id)

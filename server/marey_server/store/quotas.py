@@ -1,4 +1,7 @@
-"""Quotas: how much one user may hold. Use is counted in the transaction that adds to it, so it cannot drift."""
+"""Quotas: limits on the uploads, tokens and projects of one user.
+
+The transaction that adds to them counts them, so the count is always exact.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from marey_server.store.transaction import Transaction
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Name of a quota in errors, and what a user does about it."""
+    """Text about a quota in errors: its name, and what the user can do."""
 
     noun: str
     remedy: str
@@ -30,7 +33,8 @@ _RULES = {
 
 
 def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
-    """Check that the caller may hold `more` of what a quota limits; concurrent checks of one user run in turn.
+    """Check that the caller can add `more` without exceeding a quota; concurrent checks of one user run one after
+    another.
 
     `quota` is a field of `Quotas`. The server and attempts of jobs have no quotas. Raises `QuotaExceededProblem`.
     """

@@ -1,7 +1,7 @@
-"""Retention: deletes events, logs and jobs that are older than the server keeps them.
+"""Retention: deletes events, logs and jobs that are older than the settings allow.
 
-Work is done in batches, each in a transaction of its own, so that no other write waits long. A process that dies
-between two batches leaves nothing behind that the next round does not find. Every revision keeps the job that made it.
+Work is done in batches, each in a transaction of its own, so that no other write waits long. If a process dies between
+two batches, the next round continues. A job that created a revision is never deleted.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DELETED_LOG = b"[This log was deleted because it was old.]\n"
 
 @dataclass(frozen=True)
 class Retention:
-    """Numbers of days for which things are kept after their end; 0: for ever."""
+    """Numbers of days for which events, logs and jobs are kept; 0 means for ever."""
 
     events_days: int = 365
     logs_days: int = 90
@@ -43,7 +43,7 @@ class Retention:
 
 @dataclass(frozen=True, slots=True)
 class Retired:
-    """Numbers of deleted things."""
+    """Numbers of deleted events, logs and jobs."""
 
     events: int = 0
     logs: int = 0
@@ -51,7 +51,7 @@ class Retired:
 
 
 def retire(database: Database, retention: Retention) -> Retired:
-    """Delete what is older than the server keeps it; safe at any time and in several processes at once."""
+    """Delete events, logs and jobs that are too old; may run at any time and in several processes at once."""
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,
         logs=_retire_logs(database, retention.logs_days) if retention.logs_days else 0,
@@ -93,7 +93,7 @@ def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tupl
 
 
 def _delete_logs(tx: Transaction, attempts: Sequence[tuple[str, int]]) -> int:
-    """Put `DELETED_LOG` in the place of logs. Logs of ended attempts do not grow any more."""
+    """Replace logs by the text `DELETED_LOG`. Logs of ended attempts do not grow any more."""
     chosen = tuple_(job_log.c.job_id, job_log.c.fence).in_(attempts)
     tx.execute(delete(job_log).where(chosen))
     notices = [{"job_id": job_id, "fence": fence, "offset": 0, "data": DELETED_LOG} for job_id, fence in attempts]
@@ -121,7 +121,9 @@ task = job.alias("task")
 
 
 def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
-    """Return the next jobs that ended long ago and, with their tasks, made no revision and have no job after them."""
+    """Return the next jobs that ended long ago, whose tasks and which themselves created no revision, and on which no
+    other job depends.
+    """
     tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))
     others = and_(job_dependency.c.job_id != job.c.id, job_dependency.c.job_id.not_in(tasks))
@@ -154,7 +156,7 @@ def _delete_tasks(tx: Transaction, parent: str) -> int:
 
 
 def _delete_if_unused(tx: Transaction, job_id: str) -> int:
-    """Delete an old job unless a job after it was submitted meanwhile."""
+    """Delete an old job, unless a job that depends on it was submitted in the meantime."""
     used = select(job_dependency.c.job_id).where(job_dependency.c.on_job_id == job_id).limit(1)
     return 0 if tx.execute(used).first() else _delete_jobs(tx, [job_id])
 

@@ -1,4 +1,6 @@
-"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count shows if it held."""
+"""Conditional changes of rows with a `rev`: the condition is part of the UPDATE, and the row count shows whether it was
+true.
+"""
 
 from __future__ import annotations
 

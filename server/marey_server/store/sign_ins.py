@@ -1,11 +1,12 @@
-"""Limits on wrong passwords, shared by all servers, which a stranger cannot turn against the owner of an account.
+"""Limits on wrong passwords, shared by all servers; a stranger cannot use them to lock out the owner of an account.
 
-Three limits count every try and forgive it if the password is right: of an account from one address, of an address, and
-of an account from all addresses at which nobody has signed in to it. The last one does not apply to known addresses, so
-that guesses from elsewhere never keep the owner out (docs/decisions).
+Every try counts in three limits until its password turns out to be right: a limit for the account from this address, a
+limit for the address, and a limit for the account from all addresses from which nobody has signed in to it. The last
+limit does not apply to known addresses, so guesses from other addresses never lock out the owner
+(docs/decisions/0020-sign-in-limits.md).
 
 A limit is a row with one time (the generic cell rate algorithm): each try moves it into the future by an interval, and
-a try that would move it too far is refused. Rows whose time has passed say nothing, and are deleted.
+a try that would move it too far is refused. Rows whose time has passed have no effect, and are deleted.
 """
 
 from __future__ import annotations
@@ -65,13 +66,16 @@ def is_known(tx: Transaction, attempt: SignInTry) -> bool:
 
 
 def count(tx: Transaction, attempt: SignInTry) -> None:
-    """Count a try before its password is checked. Raises `TooManyRequestsProblem`, and then counts nothing."""
+    """Count a try before its password is checked.
+
+    If a limit is exceeded, raises `TooManyRequestsProblem` and does not count the try.
+    """
     for limit in _limits(attempt, known=is_known(tx, attempt)):
         _count_one(tx, limit)
 
 
 def forgive(tx: Transaction, attempt: SignInTry) -> None:
-    """Take back a try whose password was right, and remember its address."""
+    """Remove a try with the right password from the counts, and remember its address as known."""
     for limit in _limits(attempt, known=is_known(tx, attempt)):
         values = {"until_us": sign_in_limit.c.until_us - limit.interval_us}
         tx.execute(update(sign_in_limit).where(sign_in_limit.c.key == limit.key).values(**values))
@@ -81,7 +85,7 @@ def forgive(tx: Transaction, attempt: SignInTry) -> None:
 
 
 def forget_ended(tx: Transaction) -> int:
-    """Delete rows that say nothing any more, at most `FORGOTTEN_AT_ONCE`; return their number."""
+    """Delete rows that no longer have an effect, at most `FORGOTTEN_AT_ONCE`; return their number."""
     ended = select(sign_in_limit.c.key).where(sign_in_limit.c.until_us <= tx.now_us).limit(FORGOTTEN_AT_ONCE)
     if tx.is_postgres:
         ended = ended.with_for_update(skip_locked=True)

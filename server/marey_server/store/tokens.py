@@ -60,7 +60,9 @@ _ATTEMPT_TOKEN = Prepared(
 
 
 class TokenFilter(NamedTuple):
-    """Tokens to list: the caller's, or those of a user or of everybody; with a prefix; that end within a time."""
+    """Filter of a list of tokens: those of the caller, of a user or of all users; with a prefix; tokens that end within
+    a given time.
+    """
 
     user: str | None = None
     everybody: bool = False
@@ -129,7 +131,8 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    Raises `ForbiddenProblem` if it would have a scope that the current credential lacks, or outlive it.
+    Raises `ForbiddenProblem` if it would have a scope that the caller's own token lacks, or would be valid longer than
+    that token.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -165,7 +168,7 @@ def _insert(
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
-    """Return when a token ends; a caller who asks for no time gets at most that of the current credential."""
+    """Return when a new token ends; without a requested time, at most the end of the caller's own token."""
     own_us, lifetime_s = tx.principal.expires_us, request.expires_in_s
     wanted_us = None if lifetime_s is None else tx.now_us + lifetime_s * 1_000_000
     if own_us is None or (wanted_us is not None and wanted_us <= own_us):
@@ -230,8 +233,9 @@ def _id_of(tx: Transaction, name: str) -> str:
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
-    With `with_created`, also revoke the tokens that its bearer created, and those created with them. Otherwise these
-    count as created by the bearer of the token that created this one. A token may always revoke itself.
+    With `with_created`, also revoke the tokens that were created with it, and so on recursively. Without it, the
+    tokens that were created with the revoked one are recorded as created with the token that created the revoked one. A
+    token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:

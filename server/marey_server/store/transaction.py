@@ -29,7 +29,7 @@ _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 
 @dataclass(frozen=True)
 class Quotas:
-    """Greatest numbers of things that one user may hold at a time; `quotas.require_room` checks them."""
+    """Greatest numbers of uploads, tokens and projects of one user; `quotas.require_room` checks them."""
 
     user_uploads: int = 1000
     user_upload_bytes: int = 128 * 2**30
@@ -69,7 +69,7 @@ class Transaction:
         return self._now_us
 
     def beside(self, principal: Principal) -> Transaction:
-        """Return a transaction on behalf of `principal` that is committed together with this one."""
+        """Return this transaction on behalf of another `principal`; both are committed together."""
         return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
 
     @property

@@ -1,4 +1,5 @@
-"""Resumable uploads: bytes sent in pieces, over several connections if necessary, that become a blob at the end.
+"""Resumable uploads: bytes that are sent in pieces, over several connections if necessary, and become a blob at the
+end.
 
 Pieces are stored in rows. The offset is updated by compare-and-swap, so that two senders cannot interleave. No
 transaction reads, hashes or copies all bytes: `UploadHashes` does so outside, and a finished upload keeps its pieces
@@ -40,7 +41,9 @@ _HAS_BLOB = exists().where(blob.c.upload_id == upload.c.id)
 
 @dataclass(frozen=True, slots=True)
 class StoredUpload:
-    """State of an upload; `digest` is set once it is a blob, `actual_digest` if it has not the announced one."""
+    """State of an upload; `digest` is set once the upload is a blob, `actual_digest` if its bytes do not have the
+    announced digest.
+    """
 
     id: str
     length: int
@@ -51,7 +54,7 @@ class StoredUpload:
 
     @property
     def is_received(self) -> bool:
-        """Return whether all bytes are there, but are no blob and were not refused yet."""
+        """Return whether all bytes were received, but were neither stored as a blob nor refused yet."""
         return self.offset == self.length and self.digest is None and self.actual_digest is None
 
 
@@ -113,7 +116,7 @@ def read_pieces(tx: Transaction, upload_id: str, start: int, size_bytes: int) ->
 def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> StoredUpload:
     """Store a complete upload, whose bytes have the given digest, as a blob; a repeated call changes nothing.
 
-    The bytes are not read: either the pieces become the blob's, or `copy`, a file that the backing made. If another
+    The bytes are not read: the blob uses either the stored pieces, or `copy`, a file that the backing made. If another
     digest was announced, no blob is made and the actual digest is recorded, see `require_intact`.
 
     Raises `ConflictProblem` if bytes are missing.
@@ -155,7 +158,7 @@ def abandon(tx: Transaction, upload_id: str) -> None:
 
 
 def drop_old(tx: Transaction, limit: int) -> int:
-    """Give up uploads that nobody has continued for `LIFETIME_US`; return their number."""
+    """Delete uploads that received no piece for `LIFETIME_US`; return their number."""
     old = select(upload.c.id).where(upload.c.updated_us < tx.now_us - LIFETIME_US, upload.c.dropped.is_(False))
     found = list(tx.execute(old.limit(limit).with_for_update(skip_locked=True)).scalars())
     tx.execute(update(upload).where(upload.c.id.in_(found)).values(dropped=True))

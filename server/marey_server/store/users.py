@@ -82,8 +82,8 @@ def change_user(
     """Change a user: administrators may change all fields, users their own display name and password.
 
     A new password ends the user's sessions, unless the request says which tokens end. `password_hash` is the hash of
-    `request.password`. `verified_hash` is the hash that `request.current_password` was checked against; it must still
-    be the user's when the change is written.
+    `request.password`. `verified_hash` is the hash against which `request.current_password` was checked; it must still
+    be the hash of the user when the change is written.
     """
     itself = _require_changes(tx.principal, name, request)
     which: tuple[ColumnElement[bool], ...] = (user.c.name == name,)
@@ -170,7 +170,7 @@ def authenticated(tx: Transaction, name: str, verified_hash: str) -> Principal:
 
 
 def wrong_password() -> UnauthenticatedProblem:
-    """Return the error for a sign-in that fails, which does not say whether the user exists."""
+    """Return the error for a failed sign-in; its text does not show whether the user exists."""
     return UnauthenticatedProblem("The name or the password is wrong.", code="wrong-password")
 
 

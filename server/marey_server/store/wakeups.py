@@ -30,7 +30,7 @@ def work_topic(kind: str) -> str:
 
 
 class Wakeups:
-    """Topics announced by threads and awaited by coroutines."""
+    """Wake-ups by topic: threads announce a topic, and coroutines wait for it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

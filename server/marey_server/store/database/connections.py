@@ -1,7 +1,8 @@
 """Connections and transactions for SQLite and Postgres.
 
-Threads run transactions for clients that take turns (`lanes`). Other threads are reserved for short transactions on
-which the server and its workers depend: heartbeats, claims, completions, readiness, sign-in and admission.
+Threads run transactions, and clients take turns to use them (see `lanes`). Other threads are reserved for short
+transactions on which the server and its workers depend: heartbeats, claims, completions, readiness, sign-in and
+admission.
 
 A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that the conditions of an UPDATE
 are checked against the current row once it is locked. SQLite has one writer lane: writes run one after another, each
@@ -190,9 +191,8 @@ class Database:
         return answer
 
     def _keep_wal_short(self, connection: Connection) -> None:
-        """Write a long log back to the database file; under steady reads SQLite never restarts it by itself.
-
-        If a reader takes too long, a later write tries again.
+        """Copy a long write-ahead log to the database file and restart the log; while there are always readers, SQLite
+        does not do so by itself. If a reader takes too long, a later write tries again.
         """
         now_s = time.monotonic()
         if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
@@ -212,7 +212,7 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """Run `write` in a thread, for the server itself."""
+        """Run `write` in a thread, on behalf of the server itself."""
         return self.queue_write(SERVER, principal, lambda tx: function(tx, *args, **kwargs))
 
     def queue_read(
@@ -227,7 +227,7 @@ class Database:
     ) -> Future[T]:
         """Run `write` for a client in a thread; on SQLite, reserved writes come before those that wait.
 
-        It also runs if the client has gone. Raises `UnavailableProblem` if too many wait.
+        It runs even if the client has closed the connection. Raises `UnavailableProblem` if too many wait.
         """
         client = Client(client.key, client.known)
         if self._write_lane is not None:
@@ -338,7 +338,9 @@ _TRY_AGAIN = ("40001", "40P01")
 
 
 def _translated(error: Exception) -> Exception:
-    """Return the server's own error for a failure of the database that the caller can act on, else the failure."""
+    """Return an error of the server for failures of the database to which the caller can react; return other failures
+    unchanged.
+    """
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         return StorageFullProblem("The disk has no room left; nothing was written.") if full else error

@@ -1,7 +1,7 @@
-"""Lanes: threads with a bounded line of waiting work, in which clients take turns.
+"""Lanes: groups of threads with a limited queue, in which clients take turns.
 
-Somebody who sends many requests waits longer, but nobody else does: known clients and strangers take turns, and within
-both groups each client does. A line has room for a limited number of calls, and for some of each client.
+A client that sends many requests delays only its own requests: the queue alternates between known clients and
+strangers, and between the clients within each group. A queue is limited in total and for each client.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ SERVER = Client("server")
 
 @dataclass(frozen=True, slots=True)
 class _QueuedCall:
-    """Function to be called for a client, and the future of its result."""
+    """Queued call of a function for a client, and the future of its result."""
 
     client: Client
     function: Callable[[], Any]
     future: Future[Any]
 
     def run(self) -> None:
-        """Call the function and set the future, unless it was cancelled or its client has gone."""
+        """Call the function and set the future, unless it was cancelled or its client has closed the connection."""
         if self.future.set_running_or_notify_cancel():
             finish(self.future, self._call)
 
@@ -62,7 +62,7 @@ class _QueuedCall:
 def finish(future: Future[Any], function: Callable[[], Any]) -> None:
     """Set a future to the result or the error of a function.
 
-    Event loops refuse `StopIteration` as an error of a future, so that its request would wait for ever.
+    A future cannot hold a `StopIteration`, so a request that waits for it would wait for ever.
     """
     try:
         result = function()
@@ -77,7 +77,7 @@ def finish(future: Future[Any], function: Callable[[], Any]) -> None:
 
 
 class FairLine(Generic[T]):
-    """Waiting line in which clients take turns. It is not thread-safe."""
+    """Queue in which clients take turns. It is not thread-safe."""
 
     def __init__(self, most_waiting: int = MOST_WAITING, most_each: int = MOST_WAITING_EACH) -> None:
         self._most_waiting = most_waiting
@@ -92,7 +92,7 @@ class FairLine(Generic[T]):
         return self._lengths.total()
 
     def put(self, client: Client, one: T) -> None:
-        """Add an element at the end of a client's own line. Raises `UnavailableProblem` if there is no room."""
+        """Add an element to the queue of a client. Raises `UnavailableProblem` if the queue is full."""
         own = self._groups[client.known].get(client.key, ())
         if self._lengths[client.known] >= self._most_waiting or len(own) >= self._most_each:
             raise UnavailableProblem(
@@ -139,7 +139,7 @@ class Lane:
         return len(self._line)
 
     def submit(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Queue a call for a client. Raises `UnavailableProblem` if the line is full."""
+        """Queue a call for a client. Raises `UnavailableProblem` if the queue is full."""
         future: Future[T] = Future()
         with self._lock:
             self._line.put(client, _QueuedCall(client, partial(function, *args, **kwargs), future))

@@ -1,4 +1,4 @@
-"""Place of a database, and errors of one that cannot be opened, described for the person who starts the server."""
+"""Opening of a database, with errors that are written for the person who starts the server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_server.store.database.clock import ClockFarAhead
 
 
 class DatabaseUnusable(Exception):
-    """The database cannot be opened; the text says why and what to do, and holds no password."""
+    """Error of a database that cannot be opened; its text gives the reason and what to do, and contains no password."""
 
 
 @contextmanager
@@ -44,7 +44,7 @@ def opening(url: str) -> Iterator[None]:
 
 
 def sqlite_file(url: str) -> Path | None:
-    """Return the file of an SQLite database, or None for other databases, in memory for example."""
+    """Return the file of an SQLite database, or None for other databases, such as SQLite in memory."""
     parsed = make_url(url)
     if (
         parsed.get_backend_name() != "sqlite"

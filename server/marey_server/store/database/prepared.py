@@ -174,7 +174,9 @@ def _run(connection: Connection, text: str, values: Any, *, gives_rows: bool = F
 
 
 def _failure(connection: Connection, text: str, error: Exception) -> Exception:
-    """Convert the driver's error to SQLAlchemy's; if the connection broke, discard the idle ones of the pool, too."""
+    """Convert an error of the driver to one of SQLAlchemy; if the connection broke, also discard the idle connections
+    of the pool.
+    """
     dialect = connection.dialect
     lost = dialect.is_disconnect(error, connection.connection, None)  # type: ignore[arg-type]
     if lost:

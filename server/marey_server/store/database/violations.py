@@ -1,4 +1,4 @@
-"""Recognition of database errors that mean that a name is taken."""
+"""Recognition of database errors which mean that a name exists already."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from marey_server.store.documents import PreparedDocument
 
 @dataclass(frozen=True, slots=True)
 class StoredDocument:
-    """Digest of a stored document. Only for digests from the server itself: the caller's access is not checked."""
+    """Digest of a stored document. It must come from the server itself, because the caller's access is not checked."""
 
     digest: str
 

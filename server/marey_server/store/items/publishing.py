@@ -135,7 +135,7 @@ class _Ready:
         return tuple(self.digests.get(part) for part in _required(self.draft.kind))
 
     def published(self, item_id: str, number: int, *, created: bool) -> Published:
-        """Return the revision that the draft has become."""
+        """Return the revision that was published from the draft."""
         return Published(self.draft.name_in_batch, item_id, self.draft.kind, number, created)
 
 
@@ -312,7 +312,7 @@ class _Publication:
         }  # fmt: skip
 
     def _reuse(self, one: _Ready, head: _Head) -> None:
-        """Use items that already have the content of their drafts; add a revision to the others."""
+        """Use the existing items for drafts with the same content; add a revision to the other items."""
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
             self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
             return

@@ -1,4 +1,4 @@
-"""Rows of revisions, and the reference of an item to its newest revision."""
+"""Writing of revisions, and of the reference from an item to its newest revision."""
 
 from __future__ import annotations
 

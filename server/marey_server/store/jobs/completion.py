@@ -1,4 +1,4 @@
-"""Ends attempts: publishes the results of those that succeeded, and records those that failed."""
+"""Ends attempts: publishes the results of successful attempts, and records failures."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ _WIN = Prepared(
 def _complete(
     tx: Transaction, requests: Mapping[_Place, CompleteRequest]
 ) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
-    """End the jobs that are still held, record their results and publish their outputs."""
+    """End the jobs whose attempts are still valid, record their results and publish their outputs."""
     if not requests:
         return {}
     won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
@@ -178,7 +178,7 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 
 def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
-    """End a job of which a cancellation was acknowledged before the worker had finished.
+    """End a job as cancelled if its cancellation was acknowledged before the worker had finished.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job.
     """
@@ -209,7 +209,7 @@ def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]
 
 
 def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
-    """Return the attempts that have staged something."""
+    """Return the attempts that have staged outputs."""
     columns = (staged_output.c.job_id, staged_output.c.fence)
     of_jobs = staged_output.c.job_id.in_([job_id for job_id, _ in places])
     rows = tx.execute(select(*columns).where(of_jobs, tuple_(*columns).in_(list(places))).distinct())

@@ -1,4 +1,4 @@
-"""Decision whether a job is retried, failed or cancelled after an attempt without success, and its application."""
+"""Decision whether a job is retried, fails or is cancelled after an unsuccessful attempt, and its application."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Fencing: the condition for writes of an attempt to be accepted.
+"""Fencing: the condition under which writes of an attempt are accepted.
 
-A claim increases the fence of the job. A worker with an older fence has lost the job, perhaps without having noticed.
-Every write of an attempt includes this condition in its own transaction: after a separate check, another worker could
-claim the job before the write.
+Every job has a number, its fence, which each claim increases. A worker with an older fence has lost the job, perhaps
+without having noticed. Every write of an attempt includes this condition in its own transaction: after a separate
+check, another worker could claim the job before the write.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WAITING: ColumnElement[str] = literal_column("'waiting'")
 
 
 def same_fence(fence: int) -> ColumnElement[bool]:
-    """Return the condition that nobody has claimed the job since this attempt did."""
+    """Return the condition that no other attempt has claimed the job since this one."""
     return job.c.fence == fence
 
 
@@ -55,7 +55,7 @@ HELD = and_(
 
 
 def held_parameters(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters of `HELD`."""
+    """Return the parameters of the condition `HELD` for attempts."""
     return {"held_ids": [job_id for job_id, _ in attempts], "held_attempts": list(attempts)}
 
 

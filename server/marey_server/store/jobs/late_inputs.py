@@ -112,7 +112,7 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
 
 
 class _Made(NamedTuple):
-    """Outputs of a job, and the collection they were written to."""
+    """Outputs of a job, and the collection to which they were written."""
 
     into: str
     pins: list[Pin]

@@ -121,8 +121,8 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 
 
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job and its tasks because `cause` did not succeed: as failed, or as cancelled if it is to be
-    skipped.
+    """End a waiting job and its tasks because the job `cause` did not succeed: as failed, or as cancelled if the job
+    should be skipped.
     """
     waits = and_(job.c.id == row.id, job.c.state == WAITING)
     tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
@@ -165,7 +165,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel tasks that have not started, if a worker would combine the results: after a failure it does not."""
+    """Cancel tasks that have not started after another task failed, if a worker would combine the results."""
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)
@@ -192,7 +192,9 @@ def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 
 
 def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
-    """Release jobs whose shared computation did not succeed; the first of them computes the result for all."""
+    """Queue one of the jobs that waited to share the result of an unsuccessful job; the others then wait for its
+    result.
+    """
     if rows:
         ids = [row.id for row in rows]
         tx.execute(update(job).where(job.c.id.in_(ids)).values(cached_from=None, dependencies_left=0))

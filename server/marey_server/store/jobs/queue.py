@@ -242,7 +242,7 @@ def _pick_order(row: Row[Any]) -> tuple[Any, ...]:
 
 
 def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElement[bool]:
-    """Return the condition that the caller may work for the job's project, whose data a worker reads and writes.
+    """Return the condition that the caller, as a worker, may read and write data of the job's project.
 
     It is evaluated for each row, so that no query plan starts with the projects instead of the order of the queue.
     """

@@ -1,7 +1,7 @@
-"""Inputs of an attempt: the revisions that are pinned to its job, and the items that these and its parameters name.
+"""Items that an attempt may read: the inputs of its job, and the items to which these and the parameters refer.
 
 A clip names its skeleton, an annotation its clip, an evaluation its clips. Jobs follow such references while they run,
-so an attempt may read what they lead to, in its project. It may read nothing else.
+so an attempt may read the items that the references lead to, in its project, and no others.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _named: LruCache[str, frozenset[str]] = LruCache(
 
 
 class Pins(NamedTuple):
-    """Inputs and parameters of a job: the pinned revisions, and the ids of items that it names."""
+    """Inputs and parameters of a job: the revisions of its inputs, and the ids of items that the parameters name."""
 
     places: frozenset[PinnedPlace]
     named: frozenset[str]
 
 
 def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
-    """Return the items that the caller may not read although they are in its project; none unless it is an attempt."""
+    """Return the items of the project that the caller may not read; none if the caller is not an attempt."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)
@@ -52,7 +52,7 @@ def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
 
 
 def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[PinnedPlace]:
-    """Return the revisions that the caller may not read although they belong to its project."""
+    """Return the revisions of the project that the caller may not read."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)
@@ -109,7 +109,7 @@ def _ids_in(text: str) -> list[str]:
 
 
 def _named_items(tx: Transaction, pins: Pins) -> frozenset[str]:
-    """Return the items that the documents of the pinned revisions name, and those that the named ones name."""
+    """Return the items to which the documents of the inputs refer, directly or through other items."""
     job_id = tx.principal.job_id or ""
     found = _named.get(job_id)
     if found is None:

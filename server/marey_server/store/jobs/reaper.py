@@ -29,7 +29,7 @@ class StartGrace:
     """Delay of the reaper by one lease after this process started or the database was unreachable.
 
     Leases expire while nobody can renew them; during the delay, live workers renew theirs. A jump of the clock has the
-    same effect as an interruption, and so has a long write that blocked all others and thus heartbeats.
+    same effect as an interruption; so has a long write that blocked all other writes, and therefore heartbeats.
     """
 
     def __init__(self, policy: QueuePolicy = DEFAULT_POLICY) -> None:
@@ -48,7 +48,7 @@ class StartGrace:
             return now_us - self._since_us >= self._ttl_us
 
     def restart(self) -> None:
-        """Note that the database could not be reached."""
+        """Start the delay again, because the database could not be reached."""
         with self._lock:
             self._since_us = None
 
@@ -68,8 +68,9 @@ def reap_page(
 ) -> ReapedPage:
     """Reclaim up to `limit` jobs after the position `after`, the longest overdue first.
 
-    Each job has its own UPDATE, conditional on fence and expired lease, so that a concurrent heartbeat or result either
-    is accepted or finds the lease lost. A job that cannot be reclaimed does not keep others from it.
+    Each job has its own UPDATE with the condition that the fence is unchanged and the lease has expired. So a heartbeat
+    or a result at the same time is either accepted, or refused because the lease is lost. A job that cannot be
+    reclaimed does not prevent the others from being reclaimed.
     """
     overdue = and_(job.c.state == RUNNING, job.c.lease_expires_us <= tx.now_us)
     statement = (

@@ -3,8 +3,8 @@
 Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. An input counts with its item,
 its name, its path and the content of the documents that the kind reads, because results are named after inputs and
 refer to them. A kind declares further conditions: the place of the results, or the newest revision of an item that the
-parameters name. Jobs whose result depends on data read while they run have no key. Results are published again for each
-job, into its own collection. The cache is limited to one project.
+parameters name. Jobs whose result depends on data that is read while they run have no cache key. For each job, shared
+results are published again, into the job's own collection. The cache is limited to one project.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
 
 
 def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
-    """Publish the shared result of a waiting job as its own; return None if the result is no longer stored.
+    """Publish the shared result as the result of a waiting job; return None if it is no longer stored.
 
     Raises the errors of `publish`.
     """

@@ -1,4 +1,4 @@
-"""Checks of the places of results before a job is queued, when its results are not known yet.
+"""Checks, before a job is queued, whether its results could be stored; the results are not known at that time.
 
 The worker checks again for each clip, but each task of a job knows only its own share of the inputs.
 """

@@ -104,7 +104,9 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that ended because one of these did, have no retry, and may be retried by the caller."""
+        """Return the jobs that ended only because one of these did not succeed, that have no retry, and that the caller
+        may retry.
+        """
         later = job.alias("later")
         statement = (
             select(job)

@@ -151,7 +151,7 @@ def staged_drafts(
 
 
 def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Protect the documents of an earlier job's drafts from garbage collection; return whether all exist."""
+    """Protect the documents that an earlier job staged from garbage collection; return whether all still exist."""
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
     for start in range(0, len(wanted), IN_LIST):
