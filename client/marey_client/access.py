@@ -49,11 +49,11 @@ class Users:
         )
 
     def disable(self, name: str) -> None:
-        """Disable a user; the user's data stays."""
+        """Disable a user; the data of the user is kept."""
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
-        """End the sessions of a user, or all tokens, except the one of this client."""
+        """End the sessions of a user, or all tokens; the token of this client stays valid."""
         return self.change(name, UserChange(end_tokens=which))
 
     def enable(self, name: str) -> User:

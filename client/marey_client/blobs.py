@@ -1,4 +1,4 @@
-"""Blobs, identified by digest: find those that the server lacks, send and download them."""
+"""Blobs (bytes identified by their digest): find those that the server does not have, upload and download them."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def digest_of_file(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Blobs:
-    """Blobs that the token's user may read or has sent."""
+    """Blobs that the user of the token may read or has uploaded."""
 
     transport: Transport
 
     def missing(self, digests: str | Iterable[str]) -> set[str]:
-        """Return those of `digests` that the server lacks."""
+        """Return those of `digests` that the server does not have."""
         wanted = list(dict.fromkeys(several(digests)))
         lacking: set[str] = set()
         for start in range(0, len(wanted), DIGESTS_PER_QUESTION):
@@ -52,7 +52,7 @@ class Blobs:
         return lacking
 
     def put(self, data: bytes, *, digest: str | None = None) -> str:
-        """Send bytes, even if the server already has them; return their digest."""
+        """Upload bytes, even if the server already has them; return their digest."""
         name = digest or digest_of(data)
         self.transport.send("PUT", f"/blobs/{name}", content=data, media_type=OCTETS)
         return name
@@ -60,7 +60,7 @@ class Blobs:
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` if its length changes meanwhile.
+        Raises `FileChanged` if its length changes in the meantime.
         """
         name = digest or digest_of_file(path)
         size_bytes = path.stat().st_size
@@ -76,7 +76,7 @@ class Blobs:
         return name
 
     def fetch(self, digest: str) -> bytes:
-        """Return the bytes of a blob. Raises `DigestMismatch` if other bytes arrived."""
+        """Return the bytes of a blob. Raises `DigestMismatch` if the received bytes have another digest."""
         data: bytes = self.transport.send("GET", f"/blobs/{digest}", headers={"Accept": "*/*"}).content
         if digest_of(data) != digest:
             raise DigestMismatch(

@@ -159,7 +159,7 @@ def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
 
 
 def _configured_data() -> str | None:
-    """Return the data folder in `marey.toml` of the working directory, as a server started here would."""
+    """Return the data folder in `marey.toml` of the working directory, which a server started here would use."""
     try:
         data = tomllib.loads(Path(SETTINGS_FILE).read_text(encoding="utf-8")).get("data")
     except (OSError, ValueError):  # a server would tell what is wrong with it

@@ -59,7 +59,9 @@ class TakenPaths:
         self._lock = threading.Lock()
 
     def take(self, target: Path) -> Path:
-        """Return `target`, or a free path like it; letter case is ignored, as on many file systems."""
+        """Return `target`, or a similar path that is not taken yet; upper and lower case count as equal, as on many
+        file systems.
+        """
         with self._lock:
             free, number = target, 1
             while (key := unicodedata.normalize("NFC", str(free)).casefold()) in self._taken:

@@ -20,7 +20,7 @@ from marey_client.errors import MareyError
 
 
 class NotInstalled(MareyError):
-    """A part of Marey that this command needs is not installed here."""
+    """A part of Marey that the command needs is not installed on this machine."""
 
 
 def serve(**settings: Any) -> None:

@@ -8,7 +8,7 @@ from marey_schemas.problems import FieldError, Problem
 
 
 class MareyError(Exception):
-    """Base of all errors of Marey's client; the text is written for people."""
+    """Base class of all errors of Marey's client; their texts are written for people."""
 
 
 # Nobody answered, or somebody else did
@@ -162,7 +162,7 @@ class Conflict(RequestFailed):
 
 
 class LeaseLost(Conflict):
-    """The lease is held by somebody else or has ended; stop working on the job."""
+    """The lease of the job has ended, or another worker has it now; stop working on the job."""
 
 
 class PreconditionFailed(RequestFailed):
@@ -196,7 +196,7 @@ class ServerFailed(RequestFailed):
 
 
 class Unavailable(ServerFailed):
-    """The server cannot answer just now."""
+    """The server cannot answer at the moment."""
 
     status = 503
 

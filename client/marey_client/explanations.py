@@ -1,4 +1,4 @@
-"""Explanations of the state of a job, in sentences."""
+"""Explanations of the state of a job, as sentences for people."""
 
 from __future__ import annotations
 

@@ -189,7 +189,7 @@ class Imports:
         return tuple(_with_item(entry, outputs) for entry in ImportAnswer.model_validate(job.result).entries)
 
     def send(self, files: Sequence[LocalFile], *, notice: Notice | None = None) -> tuple[ImportFile, ...]:
-        """Send the bytes that the server lacks; return the files in the form of an import request.
+        """Upload the bytes that the server does not have; return the files in the form of an import request.
 
         Raises `BadFileName` if a name cannot be sent.
         """
@@ -212,7 +212,7 @@ class Imports:
 
 
 def _may_travel(name: str) -> bool:
-    """Return whether a file name can be sent in a request; file systems allow more names."""
+    """Return whether a file name can be sent in a request; file systems also allow names that cannot."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:

@@ -71,7 +71,7 @@ class ItemHandle:
         return self._renewed(read_model(Item, response))
 
     def delete(self) -> None:
-        """Hide the item; `restore` brings it back."""
+        """Delete the item; `restore` restores it."""
         self.transport.send("DELETE", self.url, headers=self._if_match())
 
     def restore(self) -> Item:
@@ -154,8 +154,8 @@ class Items(Generic[Handle]):
         """Yield items in order, requested page by page.
 
         `collection` selects a folder and everything below it, `directly_in` a folder alone ("" is the root), `path` one
-        item, `deleted` the items that `restore` can bring back; `filters` are those of the API, such as `{"frames.gte":
-        120, "tag.in": "walk,run"}`.
+        item, `deleted` the deleted items, which `restore` can restore; `filters` are those of the API, such as
+        `{"frames.gte": 120, "tag.in": "walk,run"}`.
         """
         params = {
             "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort,

@@ -1,4 +1,4 @@
-"""Client of one server, for one token."""
+"""Client of one server, with one token."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Marey:
         from `marey login`, as on the command line
     token : a personal token; with a `url` and no token, only public projects can be read
     retries : limits of the retries of requests that are safe to repeat
-    timeout_s : how long the server may stay silent
+    timeout_s : longest time in seconds to wait for the next bytes of an answer
     http : replaces the network in tests
     """
 

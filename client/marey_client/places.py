@@ -1,4 +1,4 @@
-"""Inputs of jobs as callers give them: folders by path, items as handles, or several of these."""
+"""Inputs of jobs in the forms that callers can use: paths of folders, handles of items, or several of these."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[CollectionInput | ItemInput, ...]:
-    """Return one place or several as inputs of jobs; a handle refers to the revision that was read."""
+    """Return one or several folders or items as inputs of jobs; a handle means the revision that was read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items at one place or several; the newest revision is used if a place names none."""
+    """Yield the items for one or several inputs; if an input names no revision, its newest one is used."""
     for place in _as_list(places):
         if isinstance(place, ItemHandle):
             yield place.item

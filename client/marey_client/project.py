@@ -58,7 +58,7 @@ class ProjectHandle(ProjectItems):
         )
 
     def delete(self) -> None:
-        """Hide the project; `restore` brings it back."""
+        """Delete the project; `restore` restores it."""
         self.transport.send("DELETE", self.url, headers={"If-Match": "*"})
 
     def restore(self) -> Project:

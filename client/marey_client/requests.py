@@ -1,4 +1,4 @@
-"""Job requests of each kind: parameters, and inputs completed by queries to the server.
+"""Job requests for each kind of job. Their inputs are looked up on the server where necessary.
 
 Every request uses the newest joint mapping of each skeleton.
 """

@@ -20,7 +20,7 @@ BUSY_STATUSES = frozenset({429, 502, 503, 504})
 
 @dataclass(frozen=True)
 class Retries:
-    """Exponential backoff with jitter, bounded in number and time.
+    """Exponential backoff with jitter; the number of tries and the total time are limited.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class BearerToken(httpx.Auth):
-    """Authentication that adds the token to requests and shows it nowhere else."""
+    """Authentication that adds the token to requests; the token appears nowhere else, for example in logs."""
 
     def __init__(self, token: str) -> None:
         self._token = as_token(token)
@@ -199,7 +199,7 @@ class Transport:
         return read_tree(response), response.headers.get("ETag")
 
     def send_tree(self, method: str, path: str, tree: Any, **options: Any) -> httpx.Response:
-        """Send a document; numpy arrays in it travel as blocks."""
+        """Send a document; numpy arrays in it are encoded as blocks."""
         body = encode_tree(tree, "application/msgpack", arrays="blocks")
         return self.send(method, path, content=body, media_type=BLOCKS, **options)
 
@@ -226,7 +226,7 @@ def _quoted(path: str) -> str:
 
 
 def as_json(model: BaseModel | None) -> bytes | None:
-    """Return the fields of `model` that were given, as JSON; secrets included, which pydantic's own JSON hides."""
+    """Return the fields of `model` that were set, as JSON; it contains secrets, which pydantic's own JSON hides."""
     if model is None:
         return None
     return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)

@@ -11,7 +11,7 @@ from marey_schemas.names import ProjectName, UserName
 
 
 class Role(StrEnum):
-    """Permission of a member; each role includes the ones before it."""
+    """Role of a member in a project; each role includes the rights of the roles listed before it."""
 
     READER = "reader"
     CONTRIBUTOR = "contributor"
@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Tokens that end when a user is changed; the token of the request itself never does."""
+    """Choice of the tokens that end when a user is changed; the token of the request itself never ends."""
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -60,7 +60,10 @@ class UserCreate(Request):
 
 
 class UserChange(Request):
-    """Request to change a user; absent fields stay unchanged. A new password of one's own requires the current one."""
+    """Request to change a user; absent fields stay unchanged.
+
+    Users who change their own password must also send the current one.
+    """
 
     display_name: DisplayName | None = None
     password: Password | None = None

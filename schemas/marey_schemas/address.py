@@ -1,4 +1,4 @@
-"""Addresses of a server. Imports nothing, so that the command line starts quickly."""
+"""Default addresses of a server. This module imports nothing, so that the command line starts quickly."""
 
 API = "/api/v1"
 """Prefix of the paths of all resources but probes."""

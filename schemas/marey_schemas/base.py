@@ -14,7 +14,7 @@ class Request(BaseModel):
 
 
 class Answer(BaseModel):
-    """Base of answers. Unknown fields are ignored, so that older clients survive additions."""
+    """Base of answers. Unknown fields are ignored, so that older clients work with servers that add fields."""
 
     model_config = ConfigDict(
         extra="ignore", frozen=True, arbitrary_types_allowed=True, populate_by_name=True, serialize_by_alias=True
@@ -31,7 +31,7 @@ class Options(Request):
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Return an instance of this class with the values that a model with at least the same fields has for them."""
+        """Return an instance of this class with the values from a model that has at least the same fields."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:

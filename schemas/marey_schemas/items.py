@@ -162,7 +162,9 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Query which of the given blobs are missing on the server; blobs hidden from the caller count as missing."""
+    """Request for those of the given blobs that the server does not have; blobs that the caller may not read count as
+    missing.
+    """
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 
@@ -190,7 +192,7 @@ class Upload(Answer):
 
 
 class Event(Answer):
-    """Event in a project; events are ordered by when they became visible."""
+    """Event in a project; events are ordered by the time of their commit."""
 
     seq: int
     at: datetime

@@ -1,8 +1,8 @@
 """Kinds of jobs with their inputs, parameters and outputs, declared once for server, client and worker.
 
 The server checks submissions against these declarations and publishes their JSON Schema; only the worker imports the
-function behind one. Other distributions add kinds with an entry point of the group `marey.job_kinds` that names a
-`KindDeclaration`.
+function that computes a job. Other distributions add kinds with an entry point of the group `marey.job_kinds` that
+names a `KindDeclaration`.
 """
 
 from collections.abc import Callable, Mapping

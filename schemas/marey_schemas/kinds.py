@@ -5,7 +5,7 @@ from enum import StrEnum
 
 
 class Kind(StrEnum):
-    """Kind of an item. The value is used in ids and documents; `plural` in URLs."""
+    """Kind of an item. The value is used in ids and documents, `plural` in URLs."""
 
     SKELETON = "skeleton"
     CLIP = "clip"

@@ -10,7 +10,9 @@ from marey_schemas.base import Request
 
 
 def in_centimetres(name: str) -> Any:
-    """Declare the field of release 0.1 that gives in centimetres the value that `name` gives in metres."""
+    """Declare a field of release 0.1 that contains, in centimetres, the value that the field `name` now contains in
+    metres.
+    """
     return Field(
         None,
         exclude=True,

@@ -1,4 +1,4 @@
-"""Numbers with nouns, lists of names, and messages of validation, for sentences."""
+"""Parts of sentences: numbers with nouns, lists of names, and messages of validation errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Execution of one attempt of a job: a child process computes; this process supervises it and answers its requests."""
+"""Execution of one attempt of a job: a child process computes, and this process supervises the child and answers its
+requests.
+"""
 
 from __future__ import annotations
 
@@ -143,7 +145,7 @@ class Watch:
         return None
 
     def explain(self, stop: Stop) -> str:
-        """Return the reason to stop as a sentence with its numbers."""
+        """Return the reason for stopping as a sentence, with the limit and the measured value."""
         resources = self.lease.resources
         return {
             Stop.LEASE_LOST: "the lease was lost",
@@ -156,7 +158,7 @@ class Watch:
 
 
 class RunningAttempt:
-    """Execution of one lease from claim to end."""
+    """Execution of one job from the claim to the end of the attempt."""
 
     def __init__(
         self,

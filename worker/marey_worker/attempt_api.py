@@ -131,7 +131,9 @@ class AttemptApi:
 
 @contextmanager
 def _dead_token_is_lost_lease() -> Iterator[None]:
-    """Turn a refused token into `LeaseLost`: the token of an attempt expires with its fence."""
+    """Raise `LeaseLost` if the token is refused: the token of an attempt becomes invalid when the attempt loses the
+    job.
+    """
     try:
         yield
     except Unauthenticated as error:

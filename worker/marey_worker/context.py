@@ -42,7 +42,7 @@ STAGED_AT_ONCE = 2
 
 
 class JobRefused(Exception):
-    """The job cannot succeed, however often it is tried. `code` is a stable slug."""
+    """The job cannot succeed, even if it is retried. `code` is a stable identifier of the reason."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -148,8 +148,8 @@ class Context:
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
         """Stage results. All of them become visible together when the job completes.
 
-        Raises `RequestRefused` if earlier results could not be stored. Nobody waits here for the last ones: the
-        supervisor does, while this process runs the next job.
+        Raises `RequestRefused` if earlier results could not be stored. The method does not wait until results are
+        stored: the supervisor waits for the last ones, while this process runs the next job.
         """
         tree = StageRequest(outputs=tuple(outputs)).model_dump(by_alias=True)
         body = encode_tree(tree, MSGPACK, arrays="blocks")

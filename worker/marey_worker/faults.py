@@ -1,4 +1,4 @@
-"""Fault injection for tests: places where a worker can be made to die or stop.
+"""Fault injection for tests: named points in the code where a test can kill or stop a worker.
 
 `MAREY_FAULT=worker.after_claim:kill` kills the process (SIGKILL) when it passes that point, `:stop` stops it (SIGSTOP);
 `worker.after_blob@3:kill` acts on the third pass. Several are separated by commas; points of other programs are

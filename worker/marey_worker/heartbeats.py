@@ -30,8 +30,9 @@ JITTER = 0.2
 class LeaseKeeper:
     """Thread that sends the heartbeats of one attempt.
 
-    `lost` and `cancelled` are set when the server says so. If the server does not answer, heartbeats are retried and
-    the job goes on; `confirm` checks the lease before results are published.
+    `lost` and `cancelled` are set when the server reports that the lease is lost or the job was cancelled. If the
+    server does not answer, heartbeats are retried and the job continues; `confirm` checks the lease before results are
+    published.
     """
 
     def __init__(self, api: AttemptApi, lease: Lease) -> None:

@@ -1,4 +1,6 @@
-"""Messages between supervisor and child over their pipe. The child never gets a token or an address.
+"""Messages that a worker's supervisor process and its child process exchange through a pipe.
+
+The child never gets a token or an address.
 
 A message is MessagePack: the name of its class and its fields, which the receiver validates.
 """

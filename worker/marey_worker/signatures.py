@@ -1,4 +1,6 @@
-"""Signatures of failures; a job is not retried after two attempts with the same signature."""
+"""Signatures of failures, by which equal failures are recognised: after two attempts with the same signature, a job is
+not retried.
+"""
 
 from __future__ import annotations
 

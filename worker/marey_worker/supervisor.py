@@ -140,7 +140,10 @@ class Supervisor:
                 finishing.result()
 
     def _claim(self, claim_id: str) -> tuple[Lease, ...]:
-        """Claim a job; after a failure, the same `claim_id` gets the job that a lost answer named."""
+        """Claim a job.
+
+        If the answer to an earlier claim was lost, its `claim_id` is sent again, and the server returns the same job.
+        """
         wanted = ClaimRequest(
             worker=self._options.name,
             kinds=self._options.kinds,
@@ -179,7 +182,7 @@ class Supervisor:
 
 
 class _Bench:
-    """Child process of a slot; it is replaced after it died or has run a certain number of jobs."""
+    """Child process of a slot; it is replaced after it has died, and after a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:
         self._options = options

@@ -1,4 +1,4 @@
-"""The `marey` command. Modules here import nothing heavy before a command runs."""
+"""The `marey` command. Modules of this package import large libraries only when a command runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _run() -> None:
 
 
 def _take_any_text() -> None:
-    """Escape characters that the encoding of an output stream lacks, and ignore output to a closed stream."""
+    """Make output streams escape characters that their encoding lacks, and ignore output after they are closed."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open to the end

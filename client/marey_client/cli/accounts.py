@@ -64,7 +64,7 @@ def login(
 
 
 def logout(context: typer.Context) -> None:
-    """Forget the token for a server."""
+    """Delete the stored token for a server."""
     from marey_client.credentials import forget_login, logins_path
 
     with connect(context, anonymous=True) as marey:
@@ -139,7 +139,7 @@ def list_tokens(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show your tokens, without their secrets. Scopes show to which projects a token is bound."""
+    """Show your tokens, without their secrets. Scopes show to which projects a token is limited."""
     within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
         tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))
@@ -279,7 +279,7 @@ def change_password(
 
 @user.command("disable")
 def disable_user(context: typer.Context, name: UserName) -> None:
-    """Disable a user; the user's data stays."""
+    """Disable a user; the data of the user is kept."""
     with connect(context) as marey:
         marey.users.disable(name)
     print_message(f"{name} is disabled; marey user enable {name} undoes it")

@@ -79,7 +79,9 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
 
 
 def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
-    """Return the error for an address without a wanted item, with the command that lists the folder there or above."""
+    """Return the error for an address without an item of the wanted kind; it names the command that lists the folder or
+    the project.
+    """
     if address.path and marey.project(address.project).collections.at(address.path) is not None:
         return WrongUsage(f"{address} is a folder; marey ls {address} lists it")
     return WrongUsage(f"there is {what} at {address}; `marey ls {address.project}` lists the project")

@@ -72,7 +72,7 @@ def sentence(error: BaseException) -> str:
 
 
 def _told(error: BaseException) -> str:
-    """Return the text of an error; for errors about files, the file name and the reason."""
+    """Return the text of an error; for errors about files, the name of the file and the reason."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"
     return str(error)

@@ -83,7 +83,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the refused inputs of a job, and its result by `show`, or its counts if `show` is None.
+    """Print the refused inputs of a job, and its result with the function `show`, or its counts if `show` is None.
 
     Raises `Refused` if inputs were refused."""
     result = ended.result or {}

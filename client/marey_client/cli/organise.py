@@ -76,7 +76,7 @@ def rm(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove items, and folders with their contents; `marey restore` brings them back."""
+    """Remove items, and folders with their contents; `marey restore` restores them."""
     with connect(context) as marey:
         things = [the_thing(marey, place, kind) for place in places]
         require_apart(things)

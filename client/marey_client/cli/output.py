@@ -86,7 +86,7 @@ Advance = Callable[[str, float, float | None], None]
 
 @contextmanager
 def progress() -> Iterator[Advance]:
-    """Show a progress bar on standard error inside the block; nothing if that is not a terminal."""
+    """Show a progress bar on standard error inside the block, if standard error is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _what, _done, _total: None
         return

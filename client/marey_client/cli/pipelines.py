@@ -88,7 +88,7 @@ def build_model(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Make a model from takes: import, retarget, annotate, cut, align, train, make a tree.
+    """Make a model from takes: import, retarget, annotate, cut and align them, train the model, make its tree.
 
     Existing results are used again: if a take has changed, only the results that depend on it are computed.
     """

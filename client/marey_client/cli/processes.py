@@ -143,9 +143,9 @@ def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as
 
 @db.command("purge")
 def purge_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
-    """Delete what is older than the settings keep it and what nothing refers to, and make an SQLite file smaller.
+    """Delete data that is older than the settings allow or that nothing refers to, and make an SQLite file smaller.
 
-    A server does the first two every hour by itself. To make the file smaller, stop the server before.
+    A server deletes such data every hour by itself. Stop the server before you make the file smaller.
     """
     _database("purge", data, database_url)
 
@@ -158,11 +158,12 @@ def set_clock(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the clock is set.")] = False,
     data: DataFolder = None,
 ) -> None:
-    """Compare the clock that an SQLite database keeps with that of this machine. The server must be stopped.
+    """Compare the clock that an SQLite database stores with the clock of this machine. The server must be stopped.
 
-    A database never goes back in time by itself. If a server has run with a clock that was wrong by years, its tokens
-    have expired and no lease ever ends: --set mends that. It moves every stored time that is later than now back to
-    now, ends all leases, and lets tokens and time limits that were made in that future keep their duration.
+    The stored clock never goes back by itself. If a server has run with a clock that was years ahead, its tokens have
+    expired and its leases do not end for a long time. --set corrects this: it sets every stored time that is later than
+    now to the present time, ends all leases, and keeps the duration of tokens and time limits that were created with
+    the wrong clock.
     """
     if set_now and not yes:
         _database("clock", data, None)
@@ -178,7 +179,7 @@ def make_admin_token(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Write a new token of an administrator to admin.token in the data folder, for example after its loss."""
+    """Write a new administrator's token to admin.token in the data folder, for example if the old one is lost."""
     _database("admin_token", data, database_url, user=user)
 
 

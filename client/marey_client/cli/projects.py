@@ -89,7 +89,7 @@ def change_project(
 
 @project.command("delete")
 def delete_project(context: typer.Context, name: ProjectName) -> None:
-    """Hide a project; `marey project restore` brings it back."""
+    """Delete a project; `marey project restore` restores it."""
     with connect(context) as marey:
         marey.project(name).delete()
     print_message(f"project {name} is deleted; marey project restore {name} brings it back")
@@ -97,7 +97,7 @@ def delete_project(context: typer.Context, name: ProjectName) -> None:
 
 @project.command("restore")
 def restore_project(context: typer.Context, name: ProjectName) -> None:
-    """Bring a deleted project back."""
+    """Restore a deleted project."""
     with connect(context) as marey:
         marey.project(name).restore()
     print_message(f"project {name} is back")

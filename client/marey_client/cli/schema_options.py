@@ -68,7 +68,7 @@ class OptionsOf:
         return tuple(self._made(parameters_of(self._model), ()))
 
     def read(self, typed: Mapping[str, Any]) -> Chosen:
-        """Return the options given as fields of the model. Raises `WrongUsage` if the model refuses them."""
+        """Return the given options as fields of the model. Raises `WrongUsage` if the model refuses them."""
         from pydantic import ValidationError
 
         chosen: Chosen = {}
@@ -226,7 +226,7 @@ def add_command(app: typer.Typer, function: Callable[..., Any], name: str | None
 
 
 def _expanded(function: Callable[..., Any], groups: Mapping[str, OptionsOf]) -> Callable[..., Any]:
-    """Return a function with each option as a parameter, which calls `function` with the options given."""
+    """Return a function that has each option as a parameter, and calls `function` with the given options."""
 
     def run(**typed: Any) -> Any:
         for name, group in groups.items():

@@ -23,7 +23,7 @@ class AnnotationHandle(ItemHandle):
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
         """Apply commands in order, all or none, as one new revision.
 
-        A command is a dict as in its documentation, such as `{"command": "split_segment", "at": 120}`. Raises
+        A command is a dict, such as `{"command": "split_segment", "at": 120}`. Raises
         `PreconditionFailed` if the annotation was changed since it was read, and `RequestFailed`, which names the
         command, if one cannot be applied.
         """

@@ -55,7 +55,7 @@ class ClipHandle(ItemHandle):
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self) -> ClipInfo:
-        """Return the description of the clip by people and importers."""
+        """Return the part `info`: descriptions of the clip by users and importers."""
         return ClipInfo.model_validate(self.part("info"))
 
     def put_info(self, info: ClipInfo) -> Item:
@@ -74,7 +74,7 @@ class ClipHandle(ItemHandle):
     def annotate(self, layer: str, *, name: str | None = None, **said: Any) -> AnnotationHandle:
         """Create an annotation of this revision of the clip, in the clip's folder.
 
-        `said` are the fields `segments` and `keyframes` of `Annotation`; without them the annotation is empty.
+        `said` contains the fields `segments` and `keyframes` of `Annotation`; without these, the annotation is empty.
         """
         document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **said})
         return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(

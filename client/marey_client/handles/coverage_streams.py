@@ -86,8 +86,8 @@ class CoverageStreamHandle:
 
         `translations` (n, k, 3) are local translations of k joints in metres that replace the joints' offsets.
 
-        At most 4096 frames at a time; 0.1 s to 1 s is usual. Frames whose answer was lost are sent again and count
-        once. Raises `Conflict` if another sender uses the stream, too.
+        At most 4096 frames at a time; 0.1 s to 1 s is usual. If an answer is lost, the frames are sent again, but
+        counted only once. Raises `Conflict` if another program sends to the same stream.
         """
         said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:

@@ -26,7 +26,7 @@ class EvaluationHandle(ReportedHandle):
 
     @property
     def verdict(self) -> str:
-        """The verdict: the quality of the clips, in a sentence."""
+        """The quality of the clips, as a sentence."""
         return str(self.item.summary["verdict"])
 
     def summary(self) -> dict[str, Any]:
@@ -49,7 +49,7 @@ class EvaluationHandle(ReportedHandle):
         return list(clip_rows(self.document()))
 
     def records(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Return every tick of every trial, by the trial's name; `record_arrays` describes the arrays."""
+        """Return every tick of every trial, by the name of the trial; `record_arrays` describes the arrays."""
         return record_arrays(self.part("records"))
 
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:

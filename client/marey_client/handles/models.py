@@ -43,7 +43,7 @@ class ModelHandle(SearchableHandle):
 
     @property
     def verdict(self) -> str:
-        """The verdict: the quality of the model, in a sentence or two."""
+        """The quality of the model, as one or two sentences."""
         return str(self.item.summary["verdict"])
 
     def summary(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ SHORTEST_PAUSE_S = 0.2
 
 
 class PipelineRun:
-    """Jobs of a pipeline by the names of its steps, in their states at the last request."""
+    """Jobs of a pipeline by the names of its steps, in the states that the last request returned."""
 
     def __init__(self, transport: Transport, jobs: Mapping[str, Job]) -> None:
         self._jobs = Jobs(transport)
@@ -47,8 +47,8 @@ class PipelineRun:
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
         """Wait until every job has ended; `on_progress` is called with all of them about once a second.
 
-        Raises `JobUnsuccessful` for the first step that failed by itself, not only because of another one, and
-        `WaitedTooLong` after `timeout_s`; the jobs continue in both cases.
+        Raises `JobUnsuccessful` for the first step that failed for a reason of its own, not because of another step,
+        and `WaitedTooLong` after `timeout_s`; the other jobs continue in both cases.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -80,7 +80,7 @@ class PipelineRun:
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:
-        """Request the state of every unfinished job, after waiting up to `wait_s` for the end of the first."""
+        """Request the state of every unfinished job; the server waits up to `wait_s` for the end of the first one."""
         for name, known in self._steps.items():
             if not known.state.terminal:
                 self._steps[name] = self._jobs.get(known.id, wait_s=wait_s)

@@ -1,4 +1,4 @@
-"""Figures ready for use: two pictures each, and the numbers that were drawn."""
+"""Drawn figures: each as two pictures (PNG and SVG), with the numbers that were drawn."""
 
 from __future__ import annotations
 

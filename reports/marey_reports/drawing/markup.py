@@ -1,4 +1,4 @@
-"""HTML that is escaped by construction: MarkupSafe escapes every text that is not `Html` already."""
+"""Creation of HTML in which MarkupSafe escapes every text that is not of the type `Html`."""
 
 from __future__ import annotations
 

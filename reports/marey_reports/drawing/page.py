@@ -1,4 +1,4 @@
-"""Page of every report: one file that contains its style and script and loads nothing else."""
+"""HTML page of a report: one file that contains its style and script, and loads no other file."""
 
 from __future__ import annotations
 

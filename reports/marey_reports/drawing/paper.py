@@ -1,7 +1,7 @@
 """Style that all figures share, and writing of figures as PNG and SVG.
 
-Only matplotlib's object interface is used, so threads may draw at once. Its global settings are changed for the SVG
-writer alone, which takes some of them in no other form; one figure is written at a time.
+Only matplotlib's object interface is used, so threads may draw at once. Global settings of matplotlib are changed only
+while an SVG is written, because its SVG writer reads some settings from there; one figure is written at a time.
 """
 
 from __future__ import annotations
@@ -187,7 +187,9 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis of magnitudes: all values, unless a few lie beyond twice the range of interest."""
+    """Choose the end of an axis so that it contains all values, unless a few of them lie beyond twice the range of
+    interest.
+    """
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))
@@ -211,7 +213,7 @@ def warm_colours() -> Colormap:
 
 
 def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
-    """Return ticks for a colour bar whose colours follow the square root of the value, from 0 to `ceiling`."""
+    """Return ticks, from 0 to `ceiling`, for a colour bar whose colours depend on the square root of the value."""
     return ceiling * np.array((0.0, 0.05, 0.25, 0.5, 1.0))
 
 

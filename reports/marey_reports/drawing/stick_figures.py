@@ -100,7 +100,7 @@ def body_of(skeleton: Skeleton) -> StickFigure:
 
 
 def runs_of(bones: Indices) -> list[Indices]:
-    """Join bones (n, 2) to as few runs of points as possible, each from an outer end inwards."""
+    """Join bones (n, 2) to as few lines as possible; each line is a sequence of points, from an outer end inwards."""
     inner = {int(outer): int(inner) for outer, inner in bones}
     ends = sorted(set(inner) - set(inner.values()))
     runs, drawn = [], set()

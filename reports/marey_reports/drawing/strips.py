@@ -153,7 +153,9 @@ def _draw_label(axes: Axes, row: StripRow, middle: float) -> None:
 
 
 class _Look(NamedTuple):
-    """Style of a body: without a colour, its sides have their own; a rim separates it from the background."""
+    """Style of a body: its colour, or None for the colours of the left and right sides, and the rim that separates it
+    from the background.
+    """
 
     width: float
     alpha: float = 1.0

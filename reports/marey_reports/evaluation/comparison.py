@@ -109,7 +109,7 @@ def metric_chapter(
 def trial_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
 ) -> Section:
-    """Write the chapter on changed trials: gained and lost, the largest changes first."""
+    """Write the chapter on changed trials, better and worse ones, the largest changes first."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
@@ -129,7 +129,7 @@ def trial_chapter(
 
 
 def clip_chapter(before: EvaluationResult, after: EvaluationResult, figures: Figures) -> Section:
-    """Write the chapter on clips that were added, removed, or lost or found use."""
+    """Write the chapter on clips that were added or removed, or that are used in only one of the evaluations."""
     names = {clip.uid: clip.name for result in (after, before) for clip in result.clips}
     held = [{clip.uid for clip in result.clips} for result in (before, after)]
     used = [{result.clips[usage.clip].uid for usage in result.usage if usage.ticks} for result in (before, after)]

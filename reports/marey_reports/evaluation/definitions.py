@@ -95,7 +95,7 @@ _READINGS = (
 
 
 def definitions() -> Html:
-    """Write the definitions of metrics, the rules of the verdict, and the reading of every ambiguous formula."""
+    """Write the definitions of metrics, the rules of the verdict, and our interpretation of every ambiguous formula."""
     metrics = [
         (metric.label, metric.unit, metric.meaning, element("code", name, class_="name"))
         for name, metric in METRICS.items()

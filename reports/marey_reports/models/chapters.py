@@ -71,7 +71,7 @@ def warning_chapter(trained: TrainedPrimitive) -> Section:
 
 
 def motion_chapter(subject: ModelSubject, figures: Figures) -> Section:
-    """Write the chapter on the samples of the model and their reach."""
+    """Write the chapter on the samples of the model and the space that they reach."""
     text = element(
         "p",
         "Left and right are those of the body: blue is its left side, orange its right. All motions begin where the "

@@ -61,7 +61,7 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """Finding about a motion: a stable code, its place, and a sentence."""
+    """Finding about a motion: a stable code, the place, and a description."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
     message: str

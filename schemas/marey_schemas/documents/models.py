@@ -90,7 +90,9 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Base of records of the training of a model; members that the record does not declare are allowed and ignored."""
+    """Base class of records about the training of a model; members that a record does not declare are allowed and
+    ignored.
+    """
 
     model_config = ConfigDict(extra="allow")
 

@@ -17,12 +17,14 @@ class RevisionRef(Request):
 
 
 class OutputRef(Request):
-    """A reference to another output of the same write; the store replaces it by a reference to the stored item."""
+    """Reference to another output of the same request; the store replaces it by a reference to the stored item."""
 
     output: str
 
 
 class PartDigestRef(Request):
-    """The digest of the part `model` of the same item and the same write; the store replaces it by that digest."""
+    """Placeholder for the digest of the part `model` that the same write stores for the same item; the store replaces
+    it by the digest.
+    """
 
     digest_of: Literal["model"]

@@ -41,7 +41,7 @@ _ELEMENT_TYPES: dict[str, set[type]] = {"f": {int, float}, "i": {int}, "u": {int
 
 @dataclass(frozen=True, slots=True)
 class EncodedArray:
-    """Block-encoded array that is passed on as it is."""
+    """Block-encoded array that is passed on without decoding it."""
 
     dtype: str
     shape: tuple[int, ...]

@@ -90,7 +90,7 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 
 
 def is_well_packed(data: bytes) -> bool:
-    """Return whether valid bytes may be kept in place of those that `encode` would make of the same array.
+    """Return whether valid bytes may be stored instead of the bytes that `encode` would produce for the same array.
 
     Their layout is the one of `encode`, every tile is predicted, and all together are not larger than the plain array.
     """

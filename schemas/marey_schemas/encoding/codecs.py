@@ -96,10 +96,10 @@ def decode_tree(
 ) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
-    With `keep_blocks`, arrays whose bytes are such as `encode_tree` writes become `EncodedArray` that are also decoded.
-    `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without it, they
-    have the same limit as the input. `take_bytes` is called with the size of each array before it is decoded, and may
-    raise an error of its own. The number of values is limited, too. Raises `CodecError`.
+    With `keep_blocks`, arrays that are encoded as by `encode_tree` become `EncodedArray`, after a check that they can
+    be decoded. `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without
+    it, they have the same limit as the input. `take_bytes` is called with the size of each array before it is decoded,
+    and may raise an error of its own. The number of values is limited, too. Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
@@ -234,7 +234,7 @@ def _parse_bson(data: bytes) -> Any:
     count = _Count(data)
 
     class Counted(dict[str, Any]):
-        """Object that is counted before its members are read."""
+        """BSON object that is counted before its members are read."""
 
         def __init__(self) -> None:
             count.add()

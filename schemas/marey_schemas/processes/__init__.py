@@ -1,1 +1,4 @@
-"""Child processes: a clean environment, messages as bytes, limits, and the end by force. Messages are never pickled."""
+"""Child processes: their environment without secrets, their messages, their limits, and their termination.
+
+Messages are bytes, and `pickle` is never used.
+"""

@@ -1,7 +1,7 @@
-"""Child process: its start in a clean environment, messages as bytes, and its end by force.
+"""Child process: its start in an environment without secrets, its messages, and its termination.
 
-A message is a sequence of bytes with its length in front; what the bytes mean is agreed between parent and child.
-Nothing is pickled, because a child that reads untrusted files may send anything.
+A message is a sequence of bytes after its length; parent and child define the meaning of the bytes. `pickle` is not
+used, because a child that reads untrusted files may have been taken over and could send anything.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Environment of child processes: the variables that they need, and no secrets.
 
 The environment of a server or worker may contain the address of the database with its password, and tokens. A child
-gets only the variables listed here, and those that its caller adds.
+gets only the variables that this module lists, and those that its parent adds.
 """
 
 from __future__ import annotations

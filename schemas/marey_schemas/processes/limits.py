@@ -1,4 +1,6 @@
-"""Limits that a child process sets for itself, its termination together with its parent, and its memory."""
+"""Limits that a child process sets for itself, termination of the child when its parent ends, and measurement of its
+memory.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ def die_with_parent() -> None:
 
 
 def allow_memory(limit_bytes: int | None) -> None:
-    """Let this process map at most `limit_bytes` more than now; without a limit, remove the restriction.
+    """Limit the memory that this process may allocate to `limit_bytes` more than now; without a number, remove the
+    limit.
 
     An allocation beyond that raises `MemoryError` at once, before the machine runs out of memory.
     """

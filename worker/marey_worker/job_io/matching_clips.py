@@ -107,7 +107,7 @@ def read_clips(context: Context, params: EvaluateParams, options: DatabaseOption
 def read_evaluated_clips(
     context: Context, evaluation: PinnedInput, document: Mapping[str, Any], options: DatabaseOptions
 ) -> MatchingClips:
-    """Return the clips of an evaluation at their revisions, under its normaliser.
+    """Return the clips of an evaluation at the revisions that it used, with features scaled by its normaliser.
 
     Raises `JobRefused` if the evaluation does not list its clips.
     """

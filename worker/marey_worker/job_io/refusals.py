@@ -15,7 +15,10 @@ UNUSABLE = (MotionError, ValidationError, NoSuchThing)
 
 
 def present(pin: PinnedInput, document: Any) -> Any:
-    """Return a document of an input. Raises `NoSuchThing` for None: the input was deleted while the job waited."""
+    """Return a document of an input.
+
+    Raises `NoSuchThing` if it is None because the input was deleted while the job waited.
+    """
     if document is None:
         raise NoSuchThing(f"revision {pin.revision} of the item {pin.item} no longer exists", f"no-{pin.kind}")
     return document

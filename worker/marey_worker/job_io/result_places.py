@@ -1,4 +1,4 @@
-"""Places of a job's results: unique, and different from the places of its inputs."""
+"""Folders and names of a job's results, which must be unique and different from those of its inputs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_worker.context import Context, JobRefused
 
 
 class ResultPlaces:
-    """Places taken by the results of one job, and by its inputs."""
+    """Folders and names that the results and inputs of one job already have."""
 
     def __init__(self, context: Context) -> None:
         self._into = context.into

@@ -28,7 +28,9 @@ def store_report(
 
 
 def _scripts(page: str) -> tuple[str, ...]:
-    """Return the script of the page, which is the last one; earlier text that looks like a script is a name."""
+    """Return the script of the page: the last element that looks like a script, because earlier ones can be names of
+    clips.
+    """
     _, found, rest = page.rpartition("<script>")
     digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()
     return (f"sha256-{base64.b64encode(digest).decode()}",) if found else ()

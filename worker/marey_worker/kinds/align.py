@@ -52,7 +52,8 @@ class _ClipAnnotation(NamedTuple):
 
 
 def run(context: Context, params: AlignParams) -> dict[str, Any]:
-    """Align the clips of the job; unsuitable clips are listed as refusals in the result, with code and reason.
+    """Align the clips of the job; clips that cannot be aligned are listed as refusals in the result, with code and
+    reason.
 
     Raises `JobRefused` if fewer than two clips are left, or if two results would have the same name.
     """

@@ -17,7 +17,7 @@ SWEEP_SCHEMA = "marey/sweep@1"
 
 
 def run(context: Context, params: SweepParams) -> dict[str, Any]:
-    """Evaluate under this task's share of the settings."""
+    """Evaluate the clips with the settings of the weights that belong to this task."""
     evaluated = read_evaluated_set(context)
     settings = vary_each_group(evaluated.result.options.database, params.factors)
     with refusing_motion_errors():

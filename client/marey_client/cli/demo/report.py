@@ -26,7 +26,10 @@ REASONS_SHOWN = 12
 
 @dataclass
 class DemoReport:
-    """Results of the demonstration and places of its files. `seconds` is by step: import, retarget, files, evaluate."""
+    """Results of the demonstration and places of its files.
+
+    `seconds` is the time of each step: import, retarget, files, evaluate.
+    """
 
     entries: Sequence[ImportEntry]
     left_out: int

@@ -150,7 +150,7 @@ class Story:
 
 
 def _generated_takes(folder: Path) -> FoundFiles:
-    """Return walks, runs and turns as BVH files; the same on every machine."""
+    """Return generated walks, runs and turns as BVH files; they are the same on every machine."""
     folder.mkdir(parents=True, exist_ok=True)
     write_bvh = embedded.room("marey_motion.formats", "all").write_bvh
     files = []

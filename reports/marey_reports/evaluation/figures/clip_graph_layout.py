@@ -69,7 +69,9 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
 
 
 def _neighbours(uids: Sequence[str], links: Mapping[tuple[str, str], int]) -> list[str]:
-    """Order clips: first the first one, then each time the clip with most transitions to or from the one before."""
+    """Order clips: begin with the first one, and continue each time with the clip that has most transitions to or from
+    the previous one.
+    """
     left, order = list(uids), list[str]()
     while left:
         last = order[-1] if order else None

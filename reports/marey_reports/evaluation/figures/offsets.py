@@ -68,7 +68,7 @@ def _field(subject: Subject, family: str) -> _Field:
 
 
 def _largest(field: _Field) -> float:
-    """Compute the largest absolute offset or change of it; 0 if none is known."""
+    """Compute the largest absolute offset, or change of an offset; 0 if none is known."""
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 
