@@ -1,7 +1,7 @@
 """The mathematics of motion: arrays in, arrays out.
 
 `__init__.pyi` lists the exported names with their modules. A module is loaded when one of its names is first used, so
-that importing the package costs next to nothing and compiled kernels load only where something is computed.
+importing the package takes hardly any time, and compiled kernels are loaded only when they are needed.
 """
 
 import lazy_loader

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 
 class MotionError(ValueError):
-    """The motion data cannot be used as asked.
+    """The motion data cannot be used for the requested operation.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class EditError(MotionError):
 
 
 class ModelError(MotionError):
-    """The examples allow no model, or the numbers describe none."""
+    """No model can be trained on the examples, or the numbers are not a valid model."""
 
     default_code = "model-invalid"
 

@@ -1,4 +1,4 @@
-"""Clips written as files for other programs."""
+"""Writing of clips as files for other programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clips in double precision, as used between the steps of a computation."""
+"""Motions in double precision, which are used between the steps of a computation."""
 
 from __future__ import annotations
 

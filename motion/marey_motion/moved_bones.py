@@ -1,8 +1,8 @@
 """Directions of bones in poses whose joints move relative to their parents.
 
 Some takes keep the shape of the body in position channels: a shoulder blade that slides, a rig whose offsets are not
-those of its performer. There a bone does not point where its joint's rotation says, but from the joint's position to
-the next one's.
+those of its performer. In such a take, the direction of a bone does not follow from its joint's rotation, but from the
+positions of the joint and the next one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHORTEST_BONE_M = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class FollowedBones:
-    """Rotations of a clip that point its bones where its positions say.
+    """Rotations of a clip whose bones point in the directions given by its joint positions.
 
     Parameters
     ----------

@@ -1,14 +1,14 @@
-"""Retargeting: motion of one skeleton on another, whatever their rest poses, proportions and local axes.
+"""Retargeting: transfer of the motion of one skeleton to another, with any rest poses, proportions and local axes.
 
 Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
 A target joint takes the global orientation in which its two axes coincide with those of the source joint with the same
 standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
 
-The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, that
-comes to one constant rotation per joint: with the axes of source and target as the columns of orthonormal matrices S
-and T, the target's global orientation is G·S·Tᵀ for the source's G. Two things differ from the print: the swing turns
-purely about the twist axis, so that the first alignment survives the second, and it acts after it (line 12 prints the
-product the other way round).
+The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
+is the same as one constant rotation per joint: with the axes of source and target as the columns of orthonormal
+matrices S and T, the target's global orientation is G·S·Tᵀ for the source's G. There are two differences from the
+printed algorithm: the second rotation turns only about the twist axis, so it does not undo the first one, and it is
+applied after the first one (line 12 prints the product in the opposite order).
 """
 
 from __future__ import annotations
@@ -171,9 +171,10 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
     """Retarget a clip to the plan's target skeleton.
 
     Mapped joints take the source's orientation; all others keep their rest rotation, or their source rotation between
-    copies of one rig. Bones keep the target's lengths, but point where `translations` of the source point its own; on
-    its own skeleton a clip keeps them. The pelvis travels as in the source, times the plan's scale; a root above the
-    pelvis moves along without turning.
+    copies of one rig. Bones keep the lengths of the target. If the source has translations, the target's bones point in
+    the directions of the source's translated bones; if the target is the source skeleton itself, the clip keeps its
+    translations. The pelvis travels as in the source, times the plan's scale; a root above the pelvis moves along
+    without turning.
 
     Parameters
     ----------
@@ -254,7 +255,8 @@ def _paired(
 ) -> tuple[JointPair, ...]:
     """Pair the joints of both skeletons with the same standard joint, each target joint once.
 
-    The root is left out unless it is also the pelvis: it is a handle on the floor, whose direction no bone gives.
+    The root is left out unless it is also the pelvis: otherwise it is a point on the floor, and no bone defines its
+    direction.
     """
     for skeleton, mapping in ((source, source_mapping), (target, target_mapping)):
         for name in mapping.joints.values():

@@ -1,8 +1,9 @@
-"""Joints above the one that carries the body: a static reference on the floor, or a root that moves with the body.
+"""Handling of joints above the joint that carries the body, such as a static reference on the floor or a root that
+moves with the body.
 
 Joints above the carrier only move the whole body, and the carrier may undo their motion. If both are blended
 separately, their motions no longer cancel and the body leaves its path. These functions therefore exchange the two: the
-body takes the root's place, and the root follows it.
+carrier becomes the first joint, and the root follows it.
 """
 
 from __future__ import annotations

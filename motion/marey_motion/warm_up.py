@@ -70,8 +70,8 @@ def discard_outdated_kernels() -> None:
     """Remove all compiled code if it was compiled from other sources or by another compiler than those installed.
 
     The cache of the compiler compares each kernel with its own file only, but a kernel holds a copy of those that it
-    calls, and names the types of its arguments. Times of change do not help: an installed package keeps those of the
-    archive, which are the same for every version.
+    calls, and names the types of its arguments. Modification times cannot be used: files of an installed package have
+    the times of the archive, which are the same for every version.
     """
     if _origin() == _recorded_origin() or not os.access(STAMP.parent, os.W_OK):
         return
@@ -162,7 +162,7 @@ def _edit(clip: Clip) -> None:
 
 
 def _match(clip: Clip) -> None:
-    """Build a database of a clip, search it, play it, show and explain what was played."""
+    """Build a database of a clip, search it, simulate a trial, and display and explain the trial."""
     from marey_motion.evaluation.scenario import Trial, reference
     from marey_motion.matching.body import MatchingBody
     from marey_motion.matching.building import build_database
@@ -187,7 +187,7 @@ def _match(clip: Clip) -> None:
 
 
 def _compare(points: NDArray[np.float32]) -> None:
-    """Align a motion with itself in every way, and look for its poses among themselves."""
+    """Align a motion with itself by every method, and search for its own poses."""
     from marey_motion.alignment.dtw import RangeBounds, align, distances, warped_distance
     from marey_motion.evaluation.similarity import nearest_poses
 

@@ -1,4 +1,6 @@
-"""Results of an alignment: motions in one canonical frame and time, with the data to undo it."""
+"""Results of an alignment: motions that start at the same place and share one canonical time, with the data to undo the
+alignment.
+"""
 
 from __future__ import annotations
 

@@ -197,14 +197,14 @@ class _Aligning:
             )
 
     def _attempt(self, work: Callable[..., Any], *arguments: Any) -> Any:
-        """Run the work, and return its result or the `MotionError` that it raises."""
+        """Call a function, and return its result or the `MotionError` that it raises."""
         try:
             return work(*arguments)
         except MotionError as error:
             return error
 
     def _kept(self, examples: Sequence[SourceExample], tries: Sequence[Any]) -> list[Any]:
-        """Keep the results, and report the errors of the others."""
+        """Return the results that are not errors, and report the errors."""
         for example, made in zip(examples, tries, strict=True):
             if isinstance(made, MotionError):
                 if self.on_refusal is None or example.uid == self._options.reference:

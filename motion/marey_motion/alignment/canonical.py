@@ -1,4 +1,6 @@
-"""The canonical frame of a motion: it begins at the origin of the ground and faces +z."""
+"""Conversion of motions to the canonical frame of reference, in which they begin at the origin of the ground and face
++z.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Limit of the work of an edit: computed in advance, so that the same edit is always made or always refused.
+"""Limit on the computing work of an edit.
+
+The work is estimated in advance, so the same edit is always accepted or always refused.
 
 Work is estimated in nanoseconds of one thread, with measured weights.
 """
@@ -23,7 +25,7 @@ PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 
 @dataclass
 class ComputeBudget:
-    """Remaining work that an edit may take.
+    """Remaining computing work that an edit may do.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The last step after a model's sample or a search: removes the remaining errors of constraints."""
+"""Last step after drawing a motion from a model or searching for one: removes the remaining errors of constraints."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def finish(
     freedom: Freedom | None = None,
     options: SolverOptions | None = None,
 ) -> FinishedMotion:
-    """Bring constrained joints exactly to their targets, blended over a window with a cubic spline (S2 4.1.1).
+    """Move constrained joints exactly to their targets, blended over a window with a cubic spline.
 
     Parameters
     ----------

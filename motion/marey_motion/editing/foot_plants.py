@@ -1,4 +1,4 @@
-"""Foot plants: planted feet are fixed to the ground.
+"""Foot plants: feet that are on the ground are kept in place, so that they do not slide.
 
 A toe contact fixes the position of the toe, and a heel contact fixes the ankle: a foot with both contacts is still, a
 foot with only a toe contact rolls about the toe. The corrections are blended in and out with B-splines. Legs are solved

@@ -121,7 +121,9 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """Find the turn and shift on the ground that attach one clip to the other; overlaps are matched at the middle."""
+    """Find the rotation and shift on the ground that attach one clip to the end of the other; overlapping clips are
+    matched at the middle of the overlap.
+    """
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2
         (target,), (wanted,) = body_track(before, there, there + 1)

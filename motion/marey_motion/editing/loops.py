@@ -69,7 +69,7 @@ def _in_place(motion: Motion, places: Floats, seam: LoopSeam) -> Motion:
 
 
 def _closed(motion: Motion, seam: LoopSeam, life: float, velocity_life: float) -> Motion:
-    """Remove the difference at the seam, half of it at each end."""
+    """Remove the difference between the last and the first pose, half of it at each end."""
     frames = motion.frame_count
     following = moved_over(motion.sliced(0, 2), seam)
     arrival = step_of(motion, frames - 2)

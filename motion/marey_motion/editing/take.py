@@ -86,7 +86,7 @@ class EditFinding:
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A motion on its way through the commands of an edit, in double precision.
+    """Motion between two commands of an edit, in double precision.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ A trial counts as followed if the character meets three limits, on average over 
 * its turn rate differs from the desired one by at most 10 degrees a second.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
-poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade is within reach.
+poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade can be reached.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Strain(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement:
-    """The facts behind the verdict.
+    """Grade of a data set, and the numbers that it is based on.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Coverage during a recording: the data so far, the missing data, and paths that provide it.
+"""Coverage during a recording: the data recorded so far, the missing data, and paths to walk in order to record it.
 
 A performance arrives as frames, in groups of any size. For a whole clip, the counted windows are the same as those of
 `coverage.measure_coverage` at the same frame rate.

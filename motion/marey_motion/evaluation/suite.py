@@ -297,7 +297,7 @@ def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[s
     Returns
     -------
     clips : list of SourceClip    the gaits
-    notes : list of str    pairs that nobody can walk
+    notes : list of str    pairs of speed and turn rate at which no gait can be generated
     """
     speeds = set(options.speeds_m_s)
     if "switching" in options.families:
@@ -328,7 +328,7 @@ def baseline_database(options: EvaluationOptions) -> tuple[MatchingDatabase, lis
     Returns
     -------
     database : MatchingDatabase    the gaits
-    notes : list of str    pairs that nobody can walk
+    notes : list of str    pairs of speed and turn rate at which no gait can be generated
     """
     clips, notes = baseline_clips(options)
     if not clips:

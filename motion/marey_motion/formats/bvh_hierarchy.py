@@ -1,7 +1,8 @@
 """The HIERARCHY of a BVH file and the header of its MOTION section.
 
-Strict about what the data mean, tolerant of how exporters lay them out: any indentation, braces on the line of the
-joint or on their own, keywords in any case, end sites left out or named, channels in any number and order.
+The reader is strict about the meaning of the data, but accepts the layouts of all exporters: any indentation, braces on
+the line of the joint or on a separate line, keywords in upper or lower case, end sites without or with names, and
+channels in any number and order.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
 
 def _read_hierarchy(lines: TextLines) -> BvhHeader:
-    """Read up to the line MOTION; files with equal hierarchies share the parsed hierarchy of the first one."""
+    """Read the hierarchy, up to the line MOTION; files with equal hierarchies share one parsed hierarchy."""
     motion = _MOTION_LINE.search(lines.data, 0, _LONGEST_KEPT)
     key = None if motion is None else hashlib.sha256(lines.data[: motion.end()]).digest()
     kept = None if key is None else _KNOWN.get(key)

@@ -156,7 +156,7 @@ def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real
 
 
 def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
-    """List the changes by reader and conversion that a user should know."""
+    """List the changes that the reader and the conversion made and that a user should know."""
     notices = []
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"

@@ -205,7 +205,8 @@ def _bend_leg(
     freedom: AnyFloats,
     rotations: dict[str, AnyFloats],
 ) -> None:
-    """Solve a leg by two-bone inverse kinematics; knees bend towards `facing` (n,), radians, of pelvis and foot.
+    """Solve a leg by two-bone inverse kinematics; knees bend towards the heading `facing` (n,), in radians, which is
+    between those of pelvis and foot.
 
     A swinging foot that trails out of reach is drawn along by the leg, the more softly the higher `freedom` (n,).
     """

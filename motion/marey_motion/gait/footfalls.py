@@ -1,8 +1,9 @@
 """Footholds of each foot, and its motion from one to the next.
 
-A foot is its ball, the joint that the toes turn about. While the foot is loaded, the heel or the ball is a fixed point
-of the floor: the foot rolls about the heel when it lands with the toes up, is flat, then rolls about the ball. Between,
-the ball follows a cubic in the frame of the root, whose ends move with the floor, so that nothing jumps.
+The position of a foot is that of its ball, the joint about which the toes turn. While the foot is loaded, the heel or
+the ball is a fixed point of the floor: the foot rolls about the heel when it lands with the toes up, is flat, then
+rolls about the ball. While the foot is in the air, the ball follows a cubic curve in the frame of the root; at both
+ends of the curve it moves with the floor, so the motion has no jumps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The two built-in human skeletons: one that gaits are generated on, and one unlike it in every respect."""
+"""The two built-in human skeletons: one for generated gaits, and one that differs from it in names, proportions, rest
+pose and axes.
+"""
 
 from __future__ import annotations
 

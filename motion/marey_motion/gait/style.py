@@ -1,4 +1,4 @@
-"""The look of a gait at each speed, and the differences between walkers.
+"""Style of generated gaits: how it depends on the speed, and how walkers differ.
 
 The curves are fits by eye to typical adult values (Winter, Biomechanics and Motor Control of Human Movement, 2009);
 they shape steps and swings and never change the root's path.
@@ -48,7 +48,7 @@ class GaitStyle:
 
     @classmethod
     def varied(cls, seed: int) -> GaitStyle:
-        """Draw the style of one walker out of a crowd.
+        """Draw the random style of one walker.
 
         Parameters
         ----------

@@ -52,7 +52,7 @@ def generate_gait(
     frame_rate_hz : float    frames per second
     travel_angle_rad : float    direction of travel relative to the heading: 0 forward, π/2 to the left, π backward
     stature_m : float    height of the `studio_skeleton` that moves, metres
-    style : GaitStyle, optional    `GaitStyle.varied(seed)` for one walker out of many, neutral when None
+    style : GaitStyle, optional    `GaitStyle.varied(seed)` for a random walker; neutral if None
 
     Returns
     -------
@@ -90,7 +90,7 @@ def generate_along(
     path : RootPath    the path of the root
     frame_rate_hz : float    frames per second
     stature_m : float    height of the `studio_skeleton` that moves, metres
-    style : GaitStyle, optional    `GaitStyle.varied(seed)` for one walker out of many, neutral when None
+    style : GaitStyle, optional    `GaitStyle.varied(seed)` for a random walker; neutral if None
 
     Returns
     -------

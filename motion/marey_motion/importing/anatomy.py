@@ -19,7 +19,7 @@ from marey_schemas.lru import LruCache
 
 
 class Anatomy:
-    """Properties that follow from a skeleton alone, computed on first use and cached."""
+    """Properties that depend only on a skeleton, computed on first use and cached."""
 
     def __init__(self, skeleton: Skeleton) -> None:
         self.skeleton = skeleton
@@ -60,9 +60,8 @@ class Anatomy:
     def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
         """Make the part `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
 
-        Parameters
-        ----------
-        clip : Clip or None    motion of this skeleton, whose poses show axes that the rest pose leaves open
+        Parameters ---------- clip : Clip or None    motion of this skeleton, from which axes are determined that the
+        rest pose does not define
 
         Returns
         -------

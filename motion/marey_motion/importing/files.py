@@ -1,8 +1,8 @@
-"""Import of one file: bytes and options in, items with their documents out.
+"""Import of one file: conversion of its bytes, with the user's options, to items with documents.
 
-`import_file` is the one boundary between whoever received a file and the readers. It needs no files, network or
-database, keeps nothing between calls that changes a result, and takes and returns plain values, bytes and arrays alone,
-so that a caller may run it in a process of its own.
+All callers import files through `import_file`. It needs no files, network or database, its results do not depend on
+earlier calls, and it takes and returns only plain values, bytes and arrays, so a caller can run it in a separate
+process.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _imported(file: FileToImport) -> ImportedFile:
 
 
 def mapping_part(found: ImportedFile) -> Tree:
-    """Make the part `mapping` of the skeleton that a file brings, with the axes that its clip shows.
+    """Make the part `mapping` of the skeleton in a file, with the axes that follow from its clip.
 
     `import_file` leaves this part out: it takes long, and only a skeleton that is new to the project needs it.
 

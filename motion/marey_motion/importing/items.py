@@ -80,7 +80,7 @@ class ImportedItem:
 
 @dataclass(frozen=True)
 class ImportedGraph:
-    """Graph whose models are not looked up yet, which requires the project: see `importing.graphs`."""
+    """Graph whose models are not looked up yet; looking them up requires the project (see `importing.graphs`)."""
 
     name: str
     collection: str
@@ -92,7 +92,7 @@ class ImportedGraph:
 
 @dataclass(frozen=True)
 class ImportedFile:
-    """The items of one file, or why it was refused.
+    """Items of one file, or the reason for its refusal.
 
     Parameters
     ----------

@@ -19,7 +19,8 @@ class Landmarks:
     """Indices of joints, None if none was found.
 
     `hips` is the last joint that both feet hang from; the pairs are (left, right), `feet` being the ankles and `hands`
-    the wrists. `by_names` is false where the joints were found by the skeleton's build alone, which fits animals too.
+    the wrists. `by_names` is false where the joints were found by the skeleton's build alone, which also finds joints
+    of animals.
     """
 
     hips: int | None = None

@@ -19,7 +19,7 @@ _Paths = list[tuple[PurePosixPath, str]]
 
 @dataclass(frozen=True)
 class PlannedFile:
-    """Plan for one file of a batch.
+    """Plan of the import of one file in a batch.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """The unit of length and the upward axis of a file, inferred from the body, with the evidence.
 
-Files rarely state either. A body shows both: an adult's leg is about 0.9 m long, heads are above feet, and feet on the
-ground keep their height. Every finding is kept as a sentence with its numbers; where the findings do not decide, the
-user is asked.
+Files rarely state either. Both can be inferred from the body: an adult's leg is about 0.9 m long, the head is above the
+feet, and feet on the ground stay at one height. Every finding is stored as a sentence with its numbers; if the findings
+are not conclusive, an error asks the user.
 """
 
 from __future__ import annotations

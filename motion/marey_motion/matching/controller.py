@@ -98,7 +98,7 @@ class _Arrays(NamedTuple):
 def run_trial(
     database: MatchingDatabase, index: SearchIndex, guide: Trajectory, options: ControllerOptions
 ) -> TrialRecord:
-    """Play motion matching along a trajectory from its first tick on.
+    """Simulate a character that follows a trajectory by motion matching, from the first tick on.
 
     The same arguments give the same record, to the last bit.
 

@@ -139,11 +139,11 @@ class DatabaseNote:
 class MatchingDatabase:
     """N rows, D feature dimensions, P pose joints, C clips in ascending order of uid: the lowest row wins a tie.
 
-    A row's pose hangs from its root: with p and theta the position and heading of the root, wherever it is put, and
-    R(theta) the turn about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7].
-    All other joints follow by their local rotations, offsets and translations. With the clip's own root that gives the
-    clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in clips may be left
-    behind at an origin, are at rest under the body and have the heading of the root.
+    The pose of a row is relative to its root: with p and theta the position and heading of the root, wherever it is
+    put, and R(theta) the turn about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation
+    R(theta)·poses[3:7]. All other joints follow by their local rotations, offsets and translations. With the clip's own
+    root that gives the clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in
+    clips may be left behind at an origin, are at rest under the body and have the heading of the root.
 
     Parameters
     ----------

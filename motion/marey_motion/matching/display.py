@@ -1,4 +1,6 @@
-"""The displayed motion of a trial: the chosen poses blended by inertialisation, on the recorded root."""
+"""Displayed motion of a trial: the chosen poses, blended by inertialisation and placed at the recorded positions of the
+root.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Inertialisation: at a switch the difference to the new motion is kept, and decays.
+"""Inertialisation: blending in which the difference between the old and the new motion is added to the new one, and
+decays.
 
 The offset is a critically damped spring with half-life h in closed form, so that the result does not depend on how time
 is cut into ticks: x(t) = e^(-y·t)·(x0 + (v0 + y·x0)·t) with y = 2·ln 2 / h.

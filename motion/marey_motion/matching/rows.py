@@ -110,7 +110,7 @@ def _poses(motion: Motion, carrier: Floats, root: SimulationRoot, body: Matching
 
 
 def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body: MatchingBody) -> None:
-    """Put the joints above the carrier at rest, so that they follow the root and the carrier is where it was."""
+    """Set the joints above the carrier to their rest pose, so that they follow the root, without moving the carrier."""
     skeleton = body.skeleton
     above = skeleton.path_to_root(body.carrier)[1:]
     turned: AnyFloats = quaternions.identity(motion.frame_count)

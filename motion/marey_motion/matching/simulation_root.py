@@ -85,7 +85,7 @@ def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
 
 
 def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
-    """Compute the motion of the root joint on the ground, for data whose root leads the character.
+    """Compute the motion of the root joint on the ground, for data in which the root joint guides the character.
 
     Its heading is that of the rest pose, rotated as the root is about the vertical.
 

@@ -1,4 +1,6 @@
-"""Errors of joint positions when motions are reconstructed from a few components, also for examples left out."""
+"""Errors of joint positions when motions are reconstructed from a few components, for training examples and for
+left-out examples.
+"""
 
 from __future__ import annotations
 

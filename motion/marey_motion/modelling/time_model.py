@@ -1,4 +1,6 @@
-"""Time functions of motions as logarithms of slopes, so that every sample of a model runs forward."""
+"""Time functions of motions, represented by the logarithms of their slopes, so that time increases in every sample of a
+model.
+"""
 
 from __future__ import annotations
 

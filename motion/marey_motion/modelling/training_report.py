@@ -36,7 +36,7 @@ class ExampleReport:
     log_likelihood : natural logarithm of its density
     held_out_log_likelihood : under a mixture fitted without it; None if that was not asked for
     left_out_error_cm : mean distance of its joints when the other examples' components reconstruct it, as many as kept
-    outlier : its likelihood stands out from the others'
+    outlier : whether its likelihood is much lower than those of the others
     """
 
     uid: str

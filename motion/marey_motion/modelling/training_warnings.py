@@ -21,7 +21,7 @@ LEAST_ERROR_CM = 0.5
 
 @dataclass(frozen=True)
 class Warned:
-    """Warning about a model: a stable code and a sentence."""
+    """Warning about a model: a stable code and a description."""
 
     code: str
     message: str

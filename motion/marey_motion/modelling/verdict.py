@@ -9,7 +9,7 @@ Headline = dict[str, float | int | str | None]
 
 
 def verdict_of(trained: TrainedPrimitive) -> str:
-    """Describe the quality of a model in a sentence or two.
+    """Describe the quality of a model in one or two sentences.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Rigs: standard joints, known rigs, and how a skeleton's joints and axes are recognised."""
+"""Rigs: standard joints, known rigs, and the recognition of a skeleton's joints and axes."""
 
 from marey_motion.rigs.axes import JointAxes, guess_axes, rest_pose_doubts
 from marey_motion.rigs.mapping import JointMapping, map_joints, require_trust, symmetric_joints

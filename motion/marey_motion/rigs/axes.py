@@ -1,11 +1,11 @@
-"""Anatomical axes of joints, each in the joint's own frame, so that the same motion means the same on every rig.
+"""Anatomical axes of joints, each in the joint's own frame, by which rotations of different rigs can be compared.
 
 `twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to it and points to the
 body's left when the limb hangs down or the trunk stands: the axis about which knees and elbows hinge. An arm that is
 raised sideways takes its swing axis along, so that in a T-pose with palms down it is up on the left, down on the right.
 
 The twist mostly follows from offsets alone. The swing of a limb follows from the rest pose only where that is the pose
-of a standing body; many files put all bones on one line at rest, and there it is read off a motion.
+of a standing body; many files put all bones on one line at rest, and then it is determined from a motion.
 """
 
 from __future__ import annotations

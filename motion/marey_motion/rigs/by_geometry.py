@@ -1,4 +1,4 @@
-"""The body in a skeleton whose joint names carry no information: two legs, two arms, a head.
+"""Recognition of legs, arms and head in a skeleton whose joint names contain no information.
 
 Only lengths and branching are used where possible, because the rest pose of many files is not the pose of a body.
 """

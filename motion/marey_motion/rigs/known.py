@@ -1,4 +1,4 @@
-"""The rigs that people use, by the names of their joints.
+"""Rigs that are in common use, with the names of their joints.
 
 Names are compared by side and base (see `names`), so that a template stands for every style of writing it; prefixes
 that all joints of a file share need not be written. "{}" is the place of the side.

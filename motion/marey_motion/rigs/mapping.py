@@ -129,13 +129,13 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 
 
 def require_trust(mapping: JointMapping) -> JointMapping:
-    """Refuse a mapping that recognised hardly anything.
+    """Refuse a mapping in which hardly any joint was recognised.
 
     A dog has legs and a head, too: such a guess is not used before a person has checked it.
 
     Parameters
     ----------
-    mapping : JointMapping    result of `map_joints` or a person's
+    mapping : JointMapping    result of `map_joints`, or a mapping made by a person
 
     Returns
     -------

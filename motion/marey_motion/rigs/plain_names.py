@@ -1,7 +1,8 @@
 """Joint names without prefixes and suffixes that an exporter added to all of them.
 
 Duplicating an armature, joining scenes and converting files leave marks on every joint: "Hips.001", "hero_Hips",
-"Hips_jnt", "Hips_07". None of them says anything of a body, but together they hide the names of every known rig.
+"Hips_jnt", "Hips_07". These marks contain no information about the body, but with them the names do not match those of
+any known rig.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _NUMBER_BEFORE = re.compile(r"^\d+[^A-Za-z0-9]")
 
 
 def readings(names: Sequence[str]) -> tuple[Names, ...]:
-    """List the names as they are, then each time with one more shared mark removed.
+    """List the original names, then versions of them with one more shared mark removed each time.
 
     Parameters
     ----------

@@ -20,14 +20,14 @@ SMOOTHING_S = 0.045
 
 
 class Stance(NamedTuple):
-    """The frames [start, end) for which a foot stands."""
+    """The frames [start, end) in which a foot is on the ground."""
 
     start: int
     end: int
 
 
 def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None = None) -> tuple[list[Stance], ...]:
-    """Find the stances of the left and the right foot of a clip.
+    """Find the stances of both feet of a clip: the times in which a foot is on the ground.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class OptimisationStep:
 
 @dataclass(frozen=True)
 class Optimisation:
-    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason why it ended."""
+    """Steps of an optimisation, beginning with the unchanged set ("start"), and the reason for its end."""
 
     steps: tuple[OptimisationStep, ...]
     ended: Literal["no gain", "steps", "evaluations"]

@@ -1,4 +1,4 @@
-"""Suggestions in sentences for the person who owns the clips."""
+"""Descriptions of suggestions in sentences, for the person who owns the clips."""
 
 from __future__ import annotations
 

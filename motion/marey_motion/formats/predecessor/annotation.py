@@ -104,7 +104,8 @@ def write_predecessor_annotation(
     """Write an annotation as JSON.
 
     The predecessor has no keyframes; they are written under `keyframes`, which other programs ignore. The form "list"
-    loses the labels. The form "frames" loses the boundary between adjacent segments with the same label.
+    does not contain the labels. The form "frames" does not contain the boundary between adjacent segments with the same
+    label.
 
     Parameters
     ----------

@@ -27,7 +27,8 @@ def read_predecessor(
     companion_name: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion | SourceDocument:
-    """Read a motion in its own unit and axes, or a document about something else; the file is decoded once.
+    """Read a file that contains a motion, which stays in its own unit and axes, or another document; the file is
+    decoded once.
 
     Parameters
     ----------

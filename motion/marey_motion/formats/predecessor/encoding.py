@@ -1,4 +1,4 @@
-"""The predecessor's blobs: a document as JSON, BSON, or BSON compressed with bz2."""
+"""Encodings of the predecessor's documents: JSON, BSON, or BSON compressed with bz2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The predecessor's graphs of models: nodes by action and by the model's id in its data base, and where they begin.
+"""The predecessor's graphs of models: nodes by action and by the id of the model in the predecessor's data base, and
+the node where sequences start.
 
 `{"nodes": {action: {model id: {"name", "type", "transitions": {"action:model": {"action_name", "model_name",
 "model_id"}}}}}, "start_node": [action, model]}`; some programs write `startNode`. A transition and the start name a

@@ -1,7 +1,7 @@
 """Motion primitives in the predecessor's layouts 3 and 2: centimetres, right-handed, frames of canonical time.
 
-Space is written as it is. Time is written in the predecessor's own form (see `predecessor_time`), which holds ours
-nearly, not exactly.
+The spatial part is written exactly. The time function is converted to the predecessor's own form (see
+`time_functions`), which represents it approximately.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The predecessor's skeleton documents: the form its data base holds, and the one inside its files and models.
+"""The predecessor's skeleton documents: the form in its data base, and the form inside its files and models.
 
 The data base form lists joints (`jointDescs`) and is mirrored in x like its clips; the file form nests nodes under
 `root` and is right-handed. Both are in centimetres. Nodes without children are tips of chains, not joints.

@@ -1,7 +1,8 @@
-"""The predecessor's cluster trees over samples of a model, as nested nodes, and their conversion to ours and back.
+"""The predecessor's cluster trees over samples of a model, as nested nodes, and their conversion from and to Marey's
+trees.
 
-A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Ours keeps
-the samples in the order of the tree and single precision; means follow from them.
+A document holds `data` (samples), `features`, `options` and `root`; a node is `{mean, indices, children}`. Marey's tree
+contains the samples in the order of the tree, in single precision; the means are computed from them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Removal of the remaining errors of a found motion by inverse kinematics."""
+"""Inverse kinematics that removes the remaining errors of a motion which a search found."""
 
 from __future__ import annotations
 

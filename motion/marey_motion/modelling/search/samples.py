@@ -20,7 +20,7 @@ NARROWING = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FoundSamples:
-    """The best samples that a search came upon, the best first.
+    """The best samples that a search found, the best first.
 
     Parameters
     ----------

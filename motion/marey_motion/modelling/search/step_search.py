@@ -1,4 +1,6 @@
-"""Search for motions of several steps: each in its tree, from the end of the one before it, then all together."""
+"""Search for motions of several steps: first each step in its tree, starting at the end of the previous step, then
+refinement of all steps together.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several motions one after the other, with constraints on all of them.
+"""Sequences of several motions, with constraints on each of them.
 
 Each step's canonical frame is placed so that its first root is where the step before it ended, with the same heading:
 root and heading are continuous whatever the latent vectors are. Continuity of hands, feet and the height of the root is
@@ -48,7 +48,9 @@ DEFAULT_TRANSITIONS = TransitionOptions()
 
 
 class CarriedOn(NamedTuple):
-    """Start of a step: its canonical frame, and the positions of the transition joints by standard name."""
+    """Start of a step that continues the previous one: its canonical frame, and the positions of the transition joints
+    by standard name.
+    """
 
     placement: Placement
     joints: Mapping[str, Floats]

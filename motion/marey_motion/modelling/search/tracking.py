@@ -1,4 +1,4 @@
-"""The few joints and moments of a primitive's motions that constraints need.
+"""Selection of the joints and moments of a primitive's motions that constraints need.
 
 A spline at a fixed moment is linear in the scores, so each channel of a joint costs one product with precomputed
 numbers.

@@ -1,7 +1,7 @@
-"""A tree over samples of a primitive: k-means in k-means, so that a search looks at few of many samples.
+"""A tree over samples of a primitive, made by recursive k-means, so that a search evaluates only a few of many samples.
 
-Herrmann et al. 2019, section 3. The samples themselves are kept, in single precision and in the order of the tree: a
-tree is valid whatever draws random numbers later, and each node's samples are a range.
+Herrmann et al. 2019, section 3. The tree contains the samples themselves, in single precision and in the order of the
+tree. So a tree stays valid even if the random generator changes, and the samples of each node are a contiguous range.
 """
 
 from __future__ import annotations
