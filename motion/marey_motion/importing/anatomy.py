@@ -60,8 +60,9 @@ class Anatomy:
     def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
         """Make the part `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
 
-        Parameters ---------- clip : Clip or None    motion of this skeleton, from which axes are determined that the
-        rest pose does not define
+        Parameters
+        ----------
+        clip : Clip or None    motion of this skeleton, which shows axes that the rest pose does not define
 
         Returns
         -------
