@@ -5,6 +5,7 @@ A stream is stored in a row, which is updated before each answer, so that nothin
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from marey_schemas.coverage_streams import (
@@ -19,8 +20,10 @@ from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.motions import coverage
+from marey_server.motions.child import unpack_tree
+from marey_server.motions.coverage import AdvancedStream, BegunStream, NextFrames
 from marey_server.store import coverage_streams
-from marey_server.store.coverage_streams import Stream, StreamStep
+from marey_server.store.coverage_streams import NewStream, Stream, StreamStep
 
 MOST_FRAMES_BYTES = 16 * MIB
 
@@ -50,12 +53,14 @@ class ProjectCoverageStreams(Resource):
         A stream that receives no frames for a day is deleted; the number of streams of a project is limited.
         """
         given = await self.look_up(coverage.read_given, project, body)
-        new, state = await self.compute(coverage.begin, body, given)
+        order = partial(coverage.begin_order, body, given)
+        begun = await self.compute_apart(coverage.BEGIN_COVERAGE, order, BegunStream.unpack)
 
         def created(stream: Stream) -> Reply:
             location = f"/projects/{project}/coverage-streams/{stream.id}"
-            return Reply(CoverageStreamState(**stream.shown(), **state), rev=stream.rev, location=location)
+            return Reply(CoverageStreamState(**stream.shown(), **begun.shown), rev=stream.rev, location=location)
 
+        new = NewStream(begun.settings, given.rig, begun.state)
         return await self.answer_with(created, coverage_streams.create_stream, project, new)
 
 
@@ -69,8 +74,8 @@ class CoverageStreamResource(Resource):
     async def get(self, project: str, stream: str) -> Reply:
         """Return a stream with its coverage map, the performer's state, and the motions to record next."""
         held = await self.look_up(coverage_streams.read_stream, project, stream)
-        state = await self.compute(coverage.look, held)
-        return Reply(state, rev=held.rev)
+        state = await self.compute_apart(coverage.LOOK_AT_COVERAGE, partial(coverage.look_order, held), unpack_tree)
+        return Reply(CoverageStreamState(**held.shown(), **state), rev=held.rev)
 
     @writes(access=Access.CONTRIBUTOR)
     async def delete(self, project: str, stream: str) -> Rendered:
@@ -97,9 +102,11 @@ class CoverageStreamFrames(Resource):
         stream, the answer is 409 with the current offset in the context.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
-        step = await self.compute(coverage.advance, held, body)
-        if not isinstance(step, StreamStep):
-            return _progress(step)
+        given = await self.compute(coverage.next_frames, held, body)
+        if not isinstance(given, NextFrames):
+            return _progress(given)
+        made = await self.compute_apart(coverage.ADVANCE_COVERAGE, lambda: given.order, AdvancedStream.unpack)
+        step = StreamStep(given.said, made.answer, made.offset, made.state)
         return await self.answer_with(_progress, coverage_streams.advance_stream, project, held, step)
 
 

@@ -1,4 +1,4 @@
-"""Coverage of streams of frames: the computation between reading and writing the row of a stream."""
+"""Coverage of streams of frames: computed in a child process between reading and writing the row of a stream."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from marey_schemas.coverage_streams import (
     CoverageFrames,
     CoverageProgress,
     CoverageStreamCreate,
-    CoverageStreamState,
     CoverageTarget,
     MeasuredCoverage,
     Performer,
@@ -31,16 +30,21 @@ from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
 from marey_schemas.wording import without_prefix
 from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.store import items, projects
-from marey_server.store.coverage_streams import NewStream, Stream, StreamStep, answered_before, require_offset
+from marey_server.store.coverage_streams import Stream, answered_before, require_offset
 from marey_server.store.transaction import Transaction
 
-if TYPE_CHECKING:  # numeric modules take a second to load: only who measures coverage pays for them
+if TYPE_CHECKING:  # numeric modules are loaded by children alone
     from marey_motion.evaluation.online import OnlineCoverage, Target
     from marey_motion.matching.body import MatchingBody
 
 Tree = dict[str, Any]
 CACHED_BODIES = 32
+BEGIN_COVERAGE = "marey_server.motions.coverage:begin_coverage"
+LOOK_AT_COVERAGE = "marey_server.motions.coverage:look_at_coverage"
+ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
+"""Functions that child processes run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,55 @@ class Given:
     rig: bytes | None = None
     evaluation: Tree | None = None
     measured: Tree | None = None
+
+
+class BeginOrder(Message):
+    """Order to start a stream; `measured` is the evaluation's part `evaluation` as bytes."""
+
+    request: CoverageStreamCreate
+    skeleton: Tree | None
+    rig: bytes | None
+    evaluation: Tree | None
+    measured: bytes | None
+
+    def given(self) -> Given:
+        """Return the documents that the stream refers to, decoded."""
+        return Given(
+            self.skeleton, self.rig, self.evaluation, None if self.measured is None else unpack_tree(self.measured)
+        )
+
+
+class StreamOrder(Message):
+    """Order about a stored stream: its settings, the skeleton of its poses, its state, and the next frames."""
+
+    settings: Tree
+    rig: bytes | None
+    state: bytes
+    frames: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NextFrames:
+    """Digest of the frames of a request, and the order to add them."""
+
+    said: str
+    order: bytes
+
+
+class BegunStream(Message):
+    """New stream, and the computed members of `CoverageStreamState`."""
+
+    settings: Tree
+    state: bytes
+    shown: Tree
+
+
+class AdvancedStream(Message):
+    """State of a stream after its next frames, and the answer to them."""
+
+    answer: Tree
+    offset: int
+    state: bytes
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
@@ -76,7 +129,73 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
         return None
 
 
-def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]:
+def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
+    """Return the order to start a stream."""
+    return BeginOrder(
+        request=request,
+        skeleton=given.skeleton,
+        rig=given.rig,
+        evaluation=given.evaluation,
+        measured=None if given.measured is None else pack_tree(given.measured),
+    ).pack()
+
+
+def look_order(stream: Stream) -> bytes:
+    """Return the order to compute the coverage of each cell of a stream."""
+    return StreamOrder(settings=stream.settings, rig=stream.rig, state=stream.state).pack()
+
+
+def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
+    """Return the frames of a request with the order to add them, or the stored answer to a repeated request.
+
+    Raises `CoverageOffset` if the frames do not start at the stream's offset.
+    """
+    said = _said(frames)
+    if (answer := answered_before(held, said)) is not None:
+        return answer
+    require_offset(held, frames.offset)
+    packed = encode_tree(frames.model_dump(), MSGPACK)
+    order = StreamOrder(settings=held.settings, rig=held.rig, state=held.state, frames=packed)
+    return NextFrames(said, order.pack())
+
+
+def _said(frames: CoverageFrames) -> str:
+    """Return the digest of a request's frames and offset, independent of the media type."""
+    hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
+    hashed.update("/".join(frames.translated_joints).encode())
+    for name in ("poses", "translations", "roots"):
+        given = getattr(frames, name)
+        if given is not None:
+            hashed.update(f" {name} {given.dtype.str} {given.shape} ".encode())
+            hashed.update(given.tobytes())
+    return f"sha256:{hashed.hexdigest()}"
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def begin_coverage(packed: bytes) -> bytes:
+    """Carry out a `BeginOrder` and return a `BegunStream`."""
+    order = BeginOrder.unpack(packed)
+    return begin(order.request, order.given()).pack()
+
+
+def look_at_coverage(packed: bytes) -> bytes:
+    """Carry out a `StreamOrder` and return the computed members of `CoverageStreamState` as MessagePack."""
+    order = StreamOrder.unpack(packed)
+    return encode_tree(_state(_online(order.state), order.settings), MSGPACK)
+
+
+def advance_coverage(packed: bytes) -> bytes:
+    """Carry out a `StreamOrder` with frames and return an `AdvancedStream`.
+
+    Raises `InvalidProblem` if the frames do not fit the stream.
+    """
+    order = StreamOrder.unpack(packed)
+    return advance(order, CoverageFrames.model_validate(unpack_tree(order.frames or b""))).pack()
+
+
+def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
     """Start a coverage stream, and return its computed state."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_schemas.options.evaluation import COVERAGE_LEAST_S, Grid
@@ -103,34 +222,16 @@ def begin(request: CoverageStreamCreate, given: Given) -> tuple[NewStream, Tree]
         "target_count": request.target_count,
         "path_s": request.path_s,
     }
-    return NewStream(settings, given.rig, _packed(online)), _state(online, settings)
+    return BegunStream(settings=settings, state=_packed(online), shown=_state(online, settings))
 
 
-def look(stream: Stream) -> CoverageStreamState:
-    """Return the state of a coverage stream, with the coverage of each cell."""
-    from marey_motion.evaluation.online import OnlineCoverage
-
-    online = OnlineCoverage.from_tree(decode_tree(stream.state, MSGPACK))
-    return CoverageStreamState(**stream.shown(), **_state(online, stream.settings))
-
-
-def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
-    """Return the stream's next state after the frames of a request, or the stored answer to a repeated request.
-
-    Raises `CoverageOffset` if the frames do not start at the stream's offset, and `InvalidProblem` if they do not fit
-    the stream.
-    """
-    said = _said(frames)
-    if (answer := answered_before(held, said)) is not None:
-        return answer
-    require_offset(held, frames.offset)
-    from marey_motion.evaluation.online import OnlineCoverage
-
-    online = OnlineCoverage.from_tree(decode_tree(held.state, MSGPACK))
+def advance(order: StreamOrder, frames: CoverageFrames) -> AdvancedStream:
+    """Add frames to a stream."""
+    online = _online(order.state)
     before = online.counts.copy()
     windows = 0
     if frames.poses is not None and frames.frame_count:
-        windows += _add_poses(online, held, frames)
+        windows += _add_poses(online, order, frames)
     if frames.roots is not None:
         roots = frames.roots.astype(np.float64)
         with refusing("roots"):
@@ -141,16 +242,22 @@ def advance(held: Stream, frames: CoverageFrames) -> StreamStep | Tree:
         offset=online.frame_count,
         windows=windows,
         changed=_cells(online, np.argwhere(online.counts != before)),
-        **_now(online, held.settings),
+        **_now(online, order.settings),
     )
-    return StreamStep(said, progress.model_dump(mode="json"), online.frame_count, _packed(online))
+    return AdvancedStream(answer=progress.model_dump(mode="json"), offset=online.frame_count, state=_packed(online))
 
 
-def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> int:
+def _online(state: bytes) -> OnlineCoverage:
+    from marey_motion.evaluation.online import OnlineCoverage
+
+    return OnlineCoverage.from_tree(decode_tree(state, MSGPACK))
+
+
+def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrames) -> int:
     """Add the poses of a request to the stream, and return the number of windows that they complete."""
     from marey_motion.documents import clip_from_document
 
-    if held.rig is None:
+    if order.rig is None:
         fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
         raise InvalidProblem(
             "Poses need a skeleton, but the stream was created without one; send root positions, or create a "
@@ -159,10 +266,10 @@ def _add_poses(online: OnlineCoverage, held: Stream, frames: CoverageFrames) -> 
             errors=[fault],
         )
     with refusing("poses"):
-        body = body_of(held.rig)
+        body = body_of(order.rig)
         motion = {
-            "skeleton": held.settings["skeleton"],
-            "frame_rate_hz": held.settings["frame_rate_hz"],
+            "skeleton": order.settings["skeleton"],
+            "frame_rate_hz": order.settings["frame_rate_hz"],
             "joints": body.skeleton.joint_names,
             "poses": _single(frames.poses),
             "translations": _single(frames.translations),
@@ -233,18 +340,6 @@ def _packed(online: OnlineCoverage) -> bytes:
     return encode_tree(online.as_tree(), MSGPACK)
 
 
-def _said(frames: CoverageFrames) -> str:
-    """Return the digest of a request's frames and offset, independent of the media type."""
-    hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
-    hashed.update("/".join(frames.translated_joints).encode())
-    for name in ("poses", "translations", "roots"):
-        given = getattr(frames, name)
-        if given is not None:
-            hashed.update(f" {name} {given.dtype.str} {given.shape} ".encode())
-            hashed.update(given.tobytes())
-    return f"sha256:{hashed.hexdigest()}"
-
-
 # -- numbers as they travel -------------------------------------------------------------------------------------------
 
 
@@ -260,11 +355,12 @@ def _state(online: OnlineCoverage, settings: Tree) -> Tree:
 def _now(online: OnlineCoverage, settings: Tree) -> Tree:
     """Return the members of `CoverageNow` for a stream."""
     targets = online.targets(settings["target_count"], path_s=settings["path_s"])
+    performer = _performer(online)
     return {
         "index": online.index,
         "missing_s": float(online.deficit_s.sum()),
-        "targets": tuple(map(_target, targets)),
-        "performer": _performer(online),
+        "targets": [_target(target).model_dump() for target in targets],
+        "performer": None if performer is None else performer.model_dump(),
     }
 
 
