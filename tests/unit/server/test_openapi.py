@@ -81,5 +81,5 @@ def test_the_page_shows_every_operation_and_asks_nobody_else() -> None:
 
 
 def test_no_two_resources_share_an_address() -> None:
-    with pytest.raises(ValueError, match="twice"):
+    with pytest.raises(ValueError, match="two resources have the path"):
         RouteTable(None, [*RESOURCES, RESOURCES[0]])
