@@ -242,6 +242,11 @@ def _revealed(value: Any) -> Any:
 
 def read_model(answer: type[Model], response: httpx.Response) -> Model:
     """Return the body of `response` as a model. Raises `UnexpectedAnswer` if it does not fit."""
+    if response.status_code == 204:
+        raise UnexpectedAnswer(
+            f"{response.request.method} {response.request.url.path}: the server made the change, but does not show the "
+            "result, because the token lacks the scope read; use a token that has it"
+        )
     try:
         return answer.model_validate_json(response.content)
     except ValidationError as error:

@@ -169,7 +169,30 @@ def test_a_token_allows_no_more_than_its_scopes(house: House, scope: str) -> Non
     reads = narrow.get(f"/projects/lab/clips/{item}").status_code
     writes = narrow.post("/projects/lab/collections", json={"path": "made-by-narrow"}).status_code
     assert reads == 200 if scope.startswith("read") else reads in (403, 404)
-    assert writes == 201 if scope == "write" else writes in (403, 404)
+    assert writes == 204 if scope == "write" else writes in (403, 404)
+
+
+def test_who_may_write_but_not_read_does_not_see_what_they_change(house: House) -> None:
+    owner = house.people.client(house.tokens["owner"])
+    assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": "*"}).status_code == 200
+    item = f"/projects/lab/clips/{house.variables['item']}"
+    both = ["read!project=lab", "write!project=lab"]
+    for scopes, status in (
+        (["write"], 204),
+        (["write!project=lab"], 204),
+        (["write!project=lab", "jobs"], 204),
+        (both, 200),
+    ):
+        made = owner.post("/tokens", json={"name": "writer", "scopes": scopes})
+        writer = house.people.client(made.json()["secret"])
+        for path in ("/projects/lab", item):
+            changed = writer.patch(path, json={}, headers={"If-Match": "*"})
+            assert changed.status_code == status
+            assert bool(changed.content) == (status == 200)
+            assert "ETag" in changed.headers
+        created = writer.post("/projects/lab/collections", json={"path": f"made/{'-'.join(scopes)}".replace("!", "")})
+        assert created.status_code == (201 if status == 200 else 204)
+        assert created.headers["Location"].startswith("/api/v1/projects/lab/collections/")
 
 
 def test_nobody_makes_a_token_that_reaches_further_than_his_own(house: House) -> None:

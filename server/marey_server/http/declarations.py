@@ -122,6 +122,11 @@ class Operation:
         return changes and self.body is not None and not self.reserved
 
     @property
+    def shows_project(self) -> bool:
+        """Whether this changes a project and the answer shows what is in it, which needs the scope `read` as well."""
+        return self.scope == "write" and self.access.role is not None and self.etag and self.answer is not None
+
+    @property
     def may_create(self) -> bool:
         """Whether the operation accepts `If-None-Match: *`."""
         return self.precondition in ("create", "optional")

@@ -231,6 +231,8 @@ def _responses(operation: Operation, models: _Models) -> Schema:
     found: Schema = {str(operation.status): success}
     if operation.etag and operation.method == "GET":
         found["304"] = {"description": "What you hold is current."}
+    if operation.shows_project:
+        found["204"] = {"description": "The change was made; the token lacks the scope read, which shows the result."}
     for status, model in operation.also:
         found[str(status)] = {"description": HTTPStatus(status).phrase}
         if model is not None:

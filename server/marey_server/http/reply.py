@@ -75,6 +75,11 @@ class Rendered:
     headers: Mapping[str, str]
     body: bytes
 
+    def without_content(self) -> Rendered:
+        """Return this answer for a caller who may make the change but not read its result."""
+        headers = {name: value for name, value in self.headers.items() if name != "Content-Type"}
+        return Rendered(204, headers, b"")
+
 
 @dataclass(frozen=True, slots=True)
 class AnswerForm:
