@@ -48,6 +48,11 @@ class Caller:
         tx.principal = self.principal
         tx.required_role = self.operation.required_role
 
+    def sees_answer(self, project: str | None) -> bool:
+        """Return whether the credential may read the answer about the project in the address."""
+        held = self.principal.scopes if self.principal is not None else ()
+        return not self.operation.shows_project or scopes.allows(held, "read", project)
+
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:

@@ -31,7 +31,6 @@ from pydantic import BaseModel
 from tornado.web import stream_request_body
 
 from marey_schemas.encoding.codecs import JSON
-from marey_server.access import scopes
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
@@ -237,12 +236,6 @@ class Resource(Exchange):
         return True
 
     @property
-    def _may_read_project(self) -> bool:
-        """Whether the credential has the scope `read` in the project of the address."""
-        held = self.principal.scopes if self.principal is not None else ()
-        return scopes.allows(held, "read", self.path_kwargs["project"])
-
-    @property
     def answer_form(self) -> AnswerForm:
         """The form in which the client requested the answer."""
         reading = self.request.method in ("GET", "HEAD")
@@ -409,7 +402,7 @@ class Resource(Exchange):
             outcome = render(outcome, self.answer_form, self.services.answers)
         if outcome is None:
             return
-        if self.operation.shows_project and not self._may_read_project:
+        if not self.caller.sees_answer(self.path_kwargs.get("project")):
             outcome = outcome.without_content()
         if len(outcome.body) > JOINED_BYTES and self.request.method != "HEAD":
             self.holding.grow(len(outcome.body))
