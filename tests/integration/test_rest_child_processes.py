@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,11 @@ from tests.support.edited_takes import make_walk
 from tests.support.rest_server import PATIENCE_S, Server
 
 from marey_motion.documents import clip_to_document, skeleton_to_document
+from marey_schemas.access import ProjectChange, Visibility
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
 from marey_server.motions import previewing
+from marey_server.process.memory import STRANGERS
 
 pytestmark = pytest.mark.slow  # each test ends a child, and the next one takes seconds to start
 
@@ -87,6 +90,21 @@ def test_the_child_of_a_client_that_leaves_is_stopped(
     until(lambda: not psutil.pid_exists(int(noted.read_text())))
     until(lambda: stopped(server, "client-gone") == 1)
     until(lambda: not server.app.services.in_flight)
+
+
+def test_all_strangers_together_have_the_share_of_one_user(
+    server: Server, owner: httpx.Client, preview: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    public = ProjectChange(visibility=Visibility.PUBLIC).model_dump(mode="json", exclude_unset=True)
+    assert owner.patch("/projects/lab", json=public, headers={"If-Match": "*"}).status_code == 200
+    children = server.app.services.children
+    monkeypatch.setattr(children, "limits", replace(children.limits, requests=2))
+    with children.request(STRANGERS):
+        refused = server.client().post(preview, json=TRIM)
+        assert (refused.status_code, refused.json()["code"]) == (503, "children-busy")
+        assert int(refused.headers["Retry-After"]) > 0
+        assert owner.post(preview, json=TRIM).status_code == 200
+    assert server.client().post(preview, json=TRIM).status_code == 200
 
 
 def stopped(server: Server, reason: str) -> float:

@@ -53,7 +53,7 @@ from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.process.children import ChildTask
-from marey_server.process.memory import Holding
+from marey_server.process.memory import STRANGERS, Holding
 from marey_server.process.password_lanes import limited_address
 from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
@@ -212,9 +212,9 @@ class Resource(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """The user to whose share of the child processes this request counts; for anonymous callers, their address."""
+        """The user whose share of the children is used; all strangers together have the share of one user."""
         user = self.principal.user_id if self.principal is not None else None
-        return user or f"address {limited_address(self.client_address)}"
+        return user or STRANGERS
 
     def _write_problem(self, error: BaseException) -> None:
         super()._write_problem(error)
