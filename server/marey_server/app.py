@@ -29,6 +29,7 @@ from marey_schemas.access import TokenCreate
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.processes.memory import keep_freed_memory
+from marey_schemas.sizes import KIB, MIB
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.accepting import (
@@ -61,8 +62,8 @@ from marey_server.store.wakeups import wakeups
 
 log = logging.getLogger(__name__)
 
-READ_CHUNK_BYTES = 256 * 1024
-READ_BUFFER_BYTES = 1024 * 1024
+READ_CHUNK_BYTES = 256 * KIB
+READ_BUFFER_BYTES = MIB
 FIRST_COMMAND = "marey project create lab"
 
 

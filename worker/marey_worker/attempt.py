@@ -25,6 +25,7 @@ from marey_client.errors import LeaseLost, MareyError, NotFound
 from marey_schemas.items import PartPlace
 from marey_schemas.job_kinds import find_kind
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
+from marey_schemas.sizes import MIB
 from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
@@ -51,7 +52,6 @@ from marey_worker.messages import (
 LOG_PIECE_BYTES = 256 << 10
 LIBRARIES = ("marey", "numpy", "scipy", "numba")
 log = logging.getLogger(__name__)
-MIB = 1 << 20
 WATCH_EVERY_S = 0.1
 WEIGH_EVERY_S = 0.5
 LOG_EVERY_S = 2.0

@@ -18,9 +18,9 @@ from marey_client.retries import Retries
 from marey_client.transport import Transport
 from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
 from marey_schemas.log_lines import LogForm, log_to_standard_error, usual_form
+from marey_schemas.sizes import MIB
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 
-MIB = 1 << 20
 BRIEF = Retries(tries=6)
 """Retries of an attempt's requests, limited so that a stopping worker does not wait long for an unreachable server."""
 

@@ -7,10 +7,11 @@ from pydantic import Field
 from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, UserChange, UserCreate
 from marey_schemas.base import Request
 from marey_schemas.names import UserName
+from marey_schemas.sizes import KIB
 from marey_server.access import passwords
 from marey_server.access.roles import require_administrator
 from marey_server.errors import ForbiddenProblem, TooManyRequestsProblem
-from marey_server.http.declarations import KIB, Access, RequestBody, reads, writes
+from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource

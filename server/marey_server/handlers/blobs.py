@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from marey_schemas.items import BlobsMissing, BlobsQuery
 from marey_schemas.names import is_digest
+from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
-from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
+from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.receiving import Receiver
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource

@@ -15,7 +15,8 @@ from marey_schemas.coverage_streams import (
     CoverageStreamCreate,
     CoverageStreamState,
 )
-from marey_server.http.declarations import MIB, Access, RequestBody, reads, writes
+from marey_schemas.sizes import MIB
+from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource

@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
 from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
-from marey_server.http.declarations import MIB, Access, Files, RequestBody, writes
+from marey_server.http.declarations import Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
 from marey_server.http.negotiation import body_type
 from marey_server.http.receiving import Receiver
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 MAX_FILES = 1000
 MAX_UPLOAD_BYTES = 2048 * MIB
-MAX_FORM_BYTES = 256 * 1024
+MAX_FORM_BYTES = 256 * KIB
 FILES_AHEAD = 2
 """Greatest number of files that are read concurrently, in addition to the next one in order."""
 FILES_PER_WRITE = 16

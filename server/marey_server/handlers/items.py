@@ -7,8 +7,9 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
 from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
-from marey_server.http.declarations import MIB, Access, RequestBody, reads, writes
+from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import MAX_INTEGER, CommaSeparated, CountedPageQuery, PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource

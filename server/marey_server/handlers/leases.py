@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
+from marey_schemas.sizes import KIB, MIB
 from marey_schemas.worker_protocol import (
     BatchCompleteAnswer,
     BatchCompleteRequest,
@@ -21,7 +22,7 @@ from marey_schemas.worker_protocol import (
     StageRequest,
 )
 from marey_server.errors import BadRequestProblem
-from marey_server.http.declarations import KIB, MIB, Access, Bytes, RequestBody, writes
+from marey_server.http.declarations import Access, Bytes, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store.jobs import completion, logs, queue, reaper, staging

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from marey_schemas.items import Upload, UploadCreate
+from marey_schemas.sizes import MIB
 from marey_server.access.principal import ANONYMOUS
 from marey_server.errors import BadRequestProblem, ConflictProblem
-from marey_server.http.declarations import MIB, Access, Bytes, RequestBody, reads, writes
+from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import uploads

@@ -18,6 +18,8 @@ from typing import Any
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream
 
+from marey_schemas.sizes import KIB
+
 log = logging.getLogger(__name__)
 
 RESERVED_DESCRIPTORS = 256
@@ -32,7 +34,7 @@ PAUSE_S = 0.5
 """Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""
 LOG_EVERY_S = 60.0
 CHECKS_PER_TIMEOUT = 4
-LEAST_TAKEN_BYTES = 64 * 1024
+LEAST_TAKEN_BYTES = 64 * KIB
 """Least number of bytes that a client must take in each write timeout while more are waiting for it."""
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 

@@ -17,10 +17,8 @@ from pydantic import BaseModel
 
 from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
+from marey_schemas.sizes import MIB
 from marey_server.access.roles import STRICTEST, RequiredRole
-
-KIB = 1024
-MIB = 1024 * KIB
 
 Method = Callable[..., Awaitable[Any]]
 Declared = Callable[..., Coroutine[Any, Any, None]]

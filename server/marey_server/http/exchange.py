@@ -14,6 +14,7 @@ from tornado.web import HTTPError, RequestHandler
 
 from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
+from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
@@ -23,9 +24,9 @@ from marey_server.process.services import Services
 
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
-JOINED_BYTES = 64 * 1024
+JOINED_BYTES = 64 * KIB
 """Size of a body above which it is sent in pieces, each after the client took the one before."""
-PIECE_BYTES = 1024 * 1024
+PIECE_BYTES = MIB
 """Size of a piece of a body: the most that waits in a connection for its client."""
 _LENGTH = re.compile("[0-9]{1,4300}")
 """Pattern of a Content-Length; the number of digits is limited because `int` refuses very long ones."""

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from python_multipart.exceptions import MultipartParseError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from marey_schemas.sizes import KIB
 from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedMediaTypeProblem
 
-MAX_HEAD_BYTES = 16 * 1024
+MAX_HEAD_BYTES = 16 * KIB
 MAX_BOUNDARY_BYTES = 70
 """Pattern of a boundary (RFC 2046, section 5.1.1)."""
 

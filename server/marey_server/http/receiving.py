@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 
+from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import StorageFullProblem
 from marey_server.process.services import Services
 from marey_server.store.blobs import Spool
 
-BATCH_BYTES = 1024 * 1024
-WRITTEN_AT_ONCE_BYTES = 64 * 1024
+BATCH_BYTES = MIB
+WRITTEN_AT_ONCE_BYTES = 64 * KIB
 """Greatest end of a body that is written on the event loop; more is written in a thread."""
 
 

@@ -31,6 +31,7 @@ from pydantic import BaseModel
 from tornado.web import stream_request_body
 
 from marey_schemas.encoding.codecs import JSON
+from marey_schemas.sizes import KIB
 from marey_server.access.principal import ANONYMOUS, Principal
 from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
@@ -47,7 +48,7 @@ from marey_server.http.calls import (
     run_call,
     run_plain,
 )
-from marey_server.http.declarations import KIB, Access, Bytes, Declared, Document, Operation, RequestBody
+from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
 from marey_server.http.reply import AnswerForm, Rendered, Reply, render
@@ -61,7 +62,7 @@ from marey_server.store.transaction import Transaction
 P = ParamSpec("P")
 T = TypeVar("T")
 
-INLINE_BYTES = 4 * 1024
+INLINE_BYTES = 4 * KIB
 """Greatest size of JSON bodies that are decoded on the event loop; larger ones, and other forms, in a thread."""
 CLIENT_GONE = "The client closed the connection before this was computed."
 GUEST_BODY_BYTES = 64 * KIB

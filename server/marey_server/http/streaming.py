@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from urllib.parse import quote
 
+from marey_schemas.sizes import MIB
 from marey_server.errors import RangeNotSatisfiableProblem, UnavailableProblem
-from marey_server.http.declarations import MIB
 from marey_server.http.etags import entity_tag, matches
 from marey_server.http.reply import Rendered
 from marey_server.http.resource import Resource

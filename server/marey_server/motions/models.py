@@ -12,6 +12,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import ZIP_EPOCH, MotionFormat, WrittenUnit
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
+from marey_schemas.sizes import MIB
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import AnswerEncoding, ComputedFile, Message, pack_tree, unpack_tree
 from marey_server.store import items
@@ -26,7 +27,6 @@ if TYPE_CHECKING:  # numeric modules are loaded by children alone
 DRAW_SAMPLES = "marey_server.motions.models:draw_samples"
 WRITE_SAMPLES = "marey_server.motions.models:write_samples"
 """Functions that child processes run."""
-MIB = 1 << 20
 MODEL_CACHE_BYTES = 32 * MIB
 """Greatest size of a child's cache of parsed models; models with search trees have a cache of the same size."""
 LARGEST_ANSWER_BYTES = 32 * MIB

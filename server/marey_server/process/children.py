@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from marey_schemas.processes.child_process import BadMessage, ChildBroken, ChildProcess
+from marey_schemas.sizes import MIB
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
 
@@ -33,7 +34,6 @@ ABANDONED_S = 1.0
 CLOSING_S = 10.0
 ASK_AGAIN_S = 5
 """Time in seconds after which a refused client is asked to try again."""
-MIB = 1 << 20
 JOB_ADVICE = "split it, or submit a job, which may have more"
 _PROBLEMS = {one.status: one for one in (InvalidProblem, NotFoundProblem, TooLargeProblem)}
 

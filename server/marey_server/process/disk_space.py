@@ -12,8 +12,8 @@ import shutil
 import time
 from pathlib import Path
 
+from marey_schemas.sizes import MIB
 from marey_server.errors import StorageFullProblem
-from marey_server.process.settings import MIB
 
 RESERVE_FILE = "reserve"
 RESERVE_BYTES = 16 * MIB

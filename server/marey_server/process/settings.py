@@ -13,13 +13,11 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_schemas.sizes import KIB, MIB
 from marey_server.process.children import ChildLimits
 from marey_server.store.jobs.policy import QueuePolicy
 from marey_server.store.retention import Retention
 from marey_server.store.transaction import Quotas
-
-MIB = 1024 * 1024
-
 
 PREFIX = "MAREY_"
 """Prefix of the variables: MAREY_PORT sets `port`. Client, worker and tests have other variables with this prefix."""
@@ -103,7 +101,7 @@ class Settings(BaseSettings):
         description="Free space of the data folder's disk below which nothing is stored; deleting stays possible.",
     )
     max_header_bytes: int = Field(
-        64 * 1024, ge=4096, description="Greatest size of the request line and the headers, in bytes."
+        64 * KIB, ge=4096, description="Greatest size of the request line and the headers, in bytes."
     )
     login_tries_per_minute: int = Field(
         10,

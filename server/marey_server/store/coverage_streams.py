@@ -15,14 +15,14 @@ from marey_schemas.coverage_streams import MOST_STREAMS, CoverageStream
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
-from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.ids import new_id
 from marey_server.store.tables import coverage_stream
 from marey_server.store.transaction import Transaction
 
 """Greatest number of streams in a project."""
 
-LIFETIME_US = 86400 * 1_000_000
+LIFETIME_US = DAY_US
 """Time without new frames after which a stream is deleted."""
 
 Tree = dict[str, Any]

@@ -15,10 +15,11 @@ from sqlalchemy import ColumnElement, delete, select, update
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.access.principal import Principal
 from marey_server.errors import InvalidProblem
+from marey_server.store.database.clock import DAY_US
 from marey_server.store.tables import idempotency_key
 from marey_server.store.transaction import Transaction
 
-LIFETIME_US = 7 * 86400 * 1_000_000
+LIFETIME_US = 7 * DAY_US
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,12 +21,13 @@ from sqlalchemy import case, delete, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
 from marey_server.errors import TooManyRequestsProblem
+from marey_server.store.database.clock import DAY_US
 from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
 """How many times as many tries an address has for all accounts, and all unknown addresses at once for an account."""
-KNOWN_FOR_US = 90 * 86400 * 1_000_000
+KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
 LimitScope = Literal["account-at-address", "address", "account"]
 _IN_WORDS: dict[LimitScope, str] = {

@@ -22,7 +22,7 @@ from marey_server.access.secret_tokens import (
 )
 from marey_server.errors import AuthorLostProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
 from marey_server.store import listing
-from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
@@ -33,7 +33,7 @@ from marey_server.store.transaction import Transaction
 NOTE_USE_EVERY_S = 3600
 """Precision of `last_used_at`; an update on every request would make every read a write."""
 
-KEPT_AFTER_END_US = 30 * 86400 * 1_000_000
+KEPT_AFTER_END_US = 30 * DAY_US
 """Time for which an expired token is listed, so that its owner can see why a program stopped."""
 
 REPLAY_GRACE_US = 900 * 1_000_000

@@ -25,13 +25,14 @@ from marey_server.errors import (
 )
 from marey_server.store import blob_backings, blobs
 from marey_server.store.blob_backings import CHUNK_BYTES
+from marey_server.store.database.clock import DAY_US
 from marey_server.store.ids import new_id
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import blob, job, upload, upload_chunk
 from marey_server.store.transaction import Transaction
 
 MAX_UPLOAD_BYTES = 16 * 2**30
-LIFETIME_US = 7 * 86400 * 1_000_000
+LIFETIME_US = 7 * DAY_US
 """Time without a new piece after which an upload is deleted."""
 PIECES_AT_ONCE = 8
 """Number of pieces, each of at most 1 MiB, that one transaction deletes, so that others do not wait long for it."""
