@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
@@ -62,11 +62,7 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     shifted together.
     """
     options = options or CostOptions()
-    if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
-        raise MotionError(
-            "both motions must have the shape (frames, points, 3) with the same number of points; their "
-            f"shapes are {a.shape} and {b.shape}"
-        )
+    require_same_points(a, b)
     return costs_between(cost_points(a, options, weights), cost_points(b, options, weights), options)
 
 
@@ -133,6 +129,25 @@ def costs_between(a: CostPoints, b: CostPoints, options: CostOptions) -> Floats:
     else:
         kernels.plain_windows(a.rows, b.columns, options.window, costs)
     return costs
+
+
+def require_same_points(a: NDArray[np.floating], b: NDArray[np.floating]) -> None:
+    """Check that two motions consist of positions of the same number of points.
+
+    Parameters
+    ----------
+    a : (n, P, 3)    points of one motion
+    b : (m, P, 3)    points of the other
+
+    Raises
+    ------
+    MotionError    if the shapes differ in more than the number of frames, or an array is empty
+    """
+    if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
+        raise MotionError(
+            "both motions must have the shape (frames, points, 3) with the same number of points; their "
+            f"shapes are {a.shape} and {b.shape}"
+        )
 
 
 def _shares(weights: ArrayLike | None, count: int) -> Floats:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from marey_motion.alignment.cost import require_same_points
 from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 
@@ -228,9 +229,5 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """Lay out the points of two motions with frames as the first axis of one and the last axis of the other."""
-    if a.ndim != 3 or a.shape[1:] != b.shape[1:] or a.shape[2] != 3 or not a.size or not b.size:
-        raise MotionError(
-            "both motions must have the shape (frames, points, 3) with the same number of points; their "
-            f"shapes are {a.shape} and {b.shape}"
-        )
+    require_same_points(a, b)
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)
