@@ -3,7 +3,7 @@
 import inspect
 from typing import get_args
 
-from marey_motion.editing.annotations.layers import COMMANDS
+from marey_motion.editing.annotations.commands import COMMANDS
 from marey_schemas.editing.annotation_commands import AnnotationCommand
 
 

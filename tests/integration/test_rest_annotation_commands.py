@@ -12,7 +12,7 @@ from tests.support.rest_server import PATIENCE_S, Server
 
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
-from marey_motion.editing.annotations import layers
+from marey_motion.editing.annotations import commands, layers
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
@@ -60,14 +60,14 @@ def segments(client: httpx.Client, annotation: str) -> list[str]:
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, name: str, action: Callable[[], None]) -> None:
     """Let something happen once while commands of this name are carried out."""
-    carry_out, left = layers.COMMANDS[name], [action]
+    carry_out, left = commands.COMMANDS[name], [action]
 
     def interrupted(layer: layers.Layer, **arguments: Any) -> layers.Layer:
         if left:
             left.pop()()
         return carry_out(layer, **arguments)
 
-    monkeypatch.setitem(layers.COMMANDS, name, interrupted)
+    monkeypatch.setitem(commands.COMMANDS, name, interrupted)
 
 
 RELABEL = {"command": "relabel_segment", "at": 5, "label": "b"}

@@ -37,7 +37,7 @@ def apply_commands(
 
 def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocument:
     from marey_motion import documents
-    from marey_motion.editing.annotations.layers import COMMANDS
+    from marey_motion.editing.annotations.commands import COMMANDS
     from marey_motion.errors import MotionError
 
     annotation = Annotation.model_validate(found.tree)

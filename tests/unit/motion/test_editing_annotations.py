@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marey_motion.editing.annotations import layers as annotations
-from marey_motion.editing.annotations.layers import COMMANDS, Keyframe, Layer, Segment, piece_of
+from marey_motion.editing.annotations import commands as annotations
+from marey_motion.editing.annotations.commands import COMMANDS, piece_of
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import AnnotationError
 
 FRAMES = 30

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marey_motion import documents
-from marey_motion.editing.annotations.layers import Segment, piece_of
+from marey_motion.editing.annotations.commands import piece_of
+from marey_motion.editing.annotations.layers import Segment
 from marey_motion.errors import MotionError
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument

@@ -1,0 +1,326 @@
+"""Commands that change a layer of annotation: each returns a new layer or raises `AnnotationError`.
+
+A segment is named by any frame in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment, require_segments, wrong
+from marey_motion.errors import AnnotationError
+
+# Segments
+
+
+def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool) -> Layer:
+    """Add the segment [start, end).
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    start, end : int    its frames
+    overwrite : bool    whether to shorten or remove segments that overlap; if False, an overlap is an error
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if the segment is invalid or overlaps another
+    """
+    made = Segment(label, start, end)
+    first, stop = layer.overlapping(start, end)
+    covered = layer.segments[first:stop]
+    if covered and not overwrite:
+        raise wrong(
+            made,
+            "segments-overlap",
+            f"the new segment overlaps {covered[0]}; set overwrite, or move the other segment first",
+        )
+    require_segments((made,), layer.frame_count)  # what is no segment must not cut others
+    before = [one._replace(end=start) for one in covered if one.start < start]
+    after = [one._replace(start=end) for one in covered if one.end > end]
+    return layer.with_segments(first, stop, *before, made, *after)
+
+
+def remove_segment(layer: Layer, at: int) -> Layer:
+    """Remove the segment that holds a frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if no segment holds the frame
+    """
+    index = layer.index_at(at)
+    return layer.with_segments(index, index + 1)
+
+
+def split_segment(layer: Layer, at: int, label: str | None) -> Layer:
+    """Cut a segment in two at a frame, which becomes the first frame of the second part.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    first frame of the second part
+    label : str or None    label of the second part; None keeps the segment's label
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if no segment can be split there
+    """
+    index = layer.index_at(at)
+    segment = layer.segments[index]
+    if at == segment.start:
+        raise wrong(segment, "empty-segment", f"the segment starts at frame {at}; split it at a later frame")
+    rest = Segment(segment.label if label is None else label, at, segment.end)
+    return layer.with_segments(index, index + 1, segment._replace(end=at), rest)
+
+
+def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", "nearest"]) -> Layer:
+    """Merge a segment with a neighbour: the result keeps the segment's label and includes the gap between them.
+
+    The nearest neighbour is the one with the smaller gap; if both gaps are equal, the next one.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    neighbour : str    "next", "previous" or "nearest"
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if there is no such segment or neighbour
+    """
+    index = layer.index_at(at)
+    segment = layer.segments[index]
+    previous = layer.segments[index - 1] if index else None
+    following = layer.segments[index + 1] if index + 1 < len(layer.segments) else None
+    if neighbour == "nearest" and previous and following:
+        neighbour = "previous" if segment.start - previous.end < following.start - segment.end else "next"
+    elif neighbour == "nearest":
+        neighbour = "previous" if previous else "next"
+    other = previous if neighbour == "previous" else following
+    if other is None:
+        raise wrong(segment, "no-neighbour", f"the segment has no {neighbour} neighbour to merge with")
+    merged = Segment(segment.label, min(segment.start, other.start), max(segment.end, other.end))
+    first = index if neighbour == "next" else index - 1
+    return layer.with_segments(first, first + 2, merged)
+
+
+def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
+    """Move the start or the end of the segment that holds a frame.
+
+    An adjacent segment stays adjacent, and an overlapped one is shortened. Neither may become empty.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    edge : str    "start" or "end"
+    to : int    new frame of the edge
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if a segment would become empty
+    """
+    index = layer.index_at(at)
+    segment = layer.segments[index]
+    moved = segment._replace(start=to) if edge == "start" else segment._replace(end=to)
+    if moved.end <= moved.start:
+        raise wrong(segment, "empty-segment", f"with its {edge} at frame {to}, the segment would have no frames")
+    beside = index - 1 if edge == "start" else index + 1
+    if not 0 <= beside < len(layer.segments):
+        return layer.with_segments(index, index + 1, moved)
+    other = changed = layer.segments[beside]
+    if edge == "start" and (other.end == segment.start or other.end > to):
+        changed = other._replace(end=to)
+    elif edge == "end" and (other.start == segment.end or other.start < to):
+        changed = other._replace(start=to)
+    if changed.end <= changed.start:
+        raise wrong(
+            other,
+            "neighbour-in-the-way",
+            f"moving the {edge} of {segment} to {to} would leave its neighbour {other} without frames",
+        )
+    first = min(index, beside)
+    return layer.with_segments(first, first + 2, *((changed, moved) if edge == "start" else (moved, changed)))
+
+
+def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
+    """Change the label of the segment that holds a frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    at : int    a frame of the segment
+    label : str    its new label
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if no segment holds the frame
+    """
+    index = layer.index_at(at)
+    return layer.with_segments(index, index + 1, layer.segments[index]._replace(label=label))
+
+
+# Keyframes
+
+
+def add_keyframe(layer: Layer, label: str, frame: int) -> Layer:
+    """Add a keyframe.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if the keyframe is invalid or exists already
+    """
+    made = Keyframe(label, frame)
+    place = layer.place_of(made)
+    return layer.with_keyframes(place, place, made)
+
+
+def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
+    """Move a keyframe to another frame.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+    to : int    its new frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if the keyframe does not exist, or its new frame is invalid
+    """
+    return add_keyframe(remove_keyframe(layer, label, frame), label, to)
+
+
+def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
+    """Remove a keyframe.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    label : str    its label
+    frame : int    its frame
+
+    Returns
+    -------
+    Layer    the new layer
+
+    Raises
+    ------
+    AnnotationError    if it does not exist
+    """
+    gone = Keyframe(label, frame)
+    place = layer.place_of(gone)
+    if gone not in layer.keyframes[place : place + 1]:
+        raise AnnotationError(
+            "the layer has no keyframe with this label and frame", code="no-keyframe", where=str(gone)
+        )
+    return layer.with_keyframes(place, place + 1)
+
+
+def clear(layer: Layer) -> Layer:
+    """Remove all segments and keyframes.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+
+    Returns
+    -------
+    Layer    an empty layer
+    """
+    return Layer(layer.frame_count)
+
+
+COMMANDS: Mapping[str, Callable[..., Layer]] = {
+    command.__name__: command
+    for command in (
+        create_segment,
+        remove_segment,
+        split_segment,
+        merge_segment,
+        move_boundary,
+        relabel_segment,
+        add_keyframe,
+        move_keyframe,
+        remove_keyframe,
+        clear,
+    )
+}
+"""Every command by its name; each takes a layer and answers with the changed one."""
+
+
+def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
+    """Make the layer for the part [start, end) of a clip, with one segment and the keyframes inside it.
+
+    Parameters
+    ----------
+    layer : Layer    the layer
+    segment : Segment    one of its segments
+    start, end : int    frames of the part, which contains the segment
+
+    Returns
+    -------
+    Layer    the layer, with frames counted from `start`
+    """
+    if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
+        raise wrong(
+            segment,
+            "outside-clip",
+            f"the segment is not within the frames {start}:{end} that are kept of the clip's "
+            f"{layer.frame_count} frames",
+        )
+    return Layer(
+        end - start,
+        (Segment(segment.label, segment.start - start, segment.end - start),),
+        tuple(
+            Keyframe(one.label, one.frame - start)
+            for one in layer.keyframes
+            if segment.start <= one.frame < segment.end
+        ),
+    )
