@@ -128,7 +128,10 @@ def read_plain_numbers(text, values, i, count):  # type: ignore[no-untyped-def]
             power += np.uint64(exponent)
             if length == 0:
                 break
-        if at != end or digits == 0 or digits > _EXACT_DIGITS or power > _LARGEST_EXACT_POWER:
+        # `end` is wrong if the two words have no white space.
+        if at != end or _word(text, at) & _LOW_BYTE > _SPACE:
+            break
+        if digits == 0 or digits > _EXACT_DIGITS or power > _LARGEST_EXACT_POWER:
             break
         value = np.float64(mantissa) / _EXACT_POWERS[power]
         values[count] = -value if negative else value

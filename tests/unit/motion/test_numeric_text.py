@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,11 +30,19 @@ def test_any_decimal_numeral_is_read_as_python_reads_it(numerals: list[str]) -> 
     assert same_bits(scan("\t".join(numerals).encode()), [float(numeral) for numeral in numerals])
 
 
-@given(st.lists(st.from_regex(r"\A[+-]?(?:[0-9]{1,9}\.?[0-9]{0,9}|\.[0-9]{1,9})(?:[eE][+-]?[0-9]{1,2})?\Z")))
-def test_numerals_far_from_the_end_of_the_text_are_read_as_python_reads_them(numerals: list[str]) -> None:
-    # Eight bytes are read at a time wherever the text does not end soon.
-    text = " ".join(numerals) + 40 * " "
-    assert same_bits(scan(text.encode()), [float(numeral) for numeral in numerals])
+@pytest.mark.parametrize("sign", ["", "-", "+"])
+@pytest.mark.parametrize("exponent", ["", "e-05", "E-7", "e-", "e-123", "e3"])
+def test_numerals_of_every_length_are_read_as_python_reads_them(sign: str, exponent: str) -> None:
+    # Eight characters are read at a time wherever the text does not end soon.
+    digits = "98765432101234567890"
+    for whole, decimals in itertools.product(range(20), range(20)):
+        numeral = f"{sign}{digits[:whole]}.{digits[:decimals]}{exponent}"
+        text = f" 1.5 {numeral} 2.5{40 * ' '}".encode()
+        if whole + decimals and exponent != "e-":
+            assert same_bits(scan(text), [1.5, float(numeral), 2.5]), numeral
+        else:
+            with pytest.raises(BadNumber):
+                scan(text)
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
