@@ -41,7 +41,7 @@ def login(
     with_token: Annotated[
         bool, typer.Option("--with-token", help="Read a token from standard input instead of asking for a password.")
     ] = False,
-    days: Annotated[int, typer.Option(min=1, max=90, help="Days until the login expires.")] = 7,
+    days: Annotated[int, typer.Option(min=1, max=90, help="Days for which the login is valid.")] = 7,
 ) -> None:
     """Store a server and a token for it in a file that only you can read."""
     from marey_client.credentials import logins_path, store_login
@@ -86,7 +86,11 @@ def create_token(
     ] = None,
     days: Annotated[
         int | None,
-        typer.Option(min=0, help="Days until the token ends, 0: never; default: 90, or with your own token if sooner."),
+        typer.Option(
+            min=0,
+            help="Days for which the token is valid; 0: it does not expire; default: 90, but not "
+            "longer than your own token.",
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -129,13 +133,16 @@ def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
 @token.command("ls")
 def list_tokens(
     context: typer.Context,
-    user: Annotated[str | None, typer.Option(help="Tokens of this user (for administrators).")] = None,
-    everybody: Annotated[bool, typer.Option("--everybody", help="Tokens of all users (for administrators).")] = False,
+    user: Annotated[str | None, typer.Option(help="List the tokens of this user (for administrators).")] = None,
+    everybody: Annotated[
+        bool, typer.Option("--everybody", help="List the tokens of all users (for administrators).")
+    ] = False,
     prefix: Annotated[
-        str | None, typer.Option(help="The token whose secret begins with marey_PREFIX_, to find a token that leaked.")
+        str | None,
+        typer.Option(help="List only the token whose secret begins with marey_PREFIX_, for example one that leaked."),
     ] = None,
     expiring: Annotated[
-        int | None, typer.Option(min=0, help="Only tokens that end within this number of days.")
+        int | None, typer.Option(min=0, help="List only tokens that expire within this number of days.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -255,7 +262,11 @@ def change_password(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="User name; default: yourself.")] = None,
     end_tokens: Annotated[
-        bool, typer.Option("--end-tokens", help="Also end all tokens; otherwise only sessions of sign-ins end.")
+        bool,
+        typer.Option(
+            "--end-tokens",
+            help="Also revoke all tokens of the user; otherwise, only the sessions of `marey login` end.",
+        ),
     ] = False,
 ) -> None:
     """Set a new password, and end the other sessions. To change your own password, enter the current one, too."""
@@ -298,7 +309,9 @@ def change_user(
     context: typer.Context,
     name: UserName,
     display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
-    administrator: Annotated[bool | None, typer.Option(help="Grant or revoke the rights of an administrator.")] = None,
+    administrator: Annotated[
+        bool | None, typer.Option(help="Give the user the rights of an administrator, or remove them.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Change the displayed name and the administrator rights of a user."""

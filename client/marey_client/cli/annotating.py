@@ -221,7 +221,8 @@ def import_annotation(
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="inclusive: end_idx is the last frame of a section, as in the predecessor; exclusive: the next."
+            help="inclusive: end_idx is the last frame of a section, as in the predecessor's editor; "
+            "exclusive: the frame after it."
         ),
     ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,

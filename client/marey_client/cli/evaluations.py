@@ -56,7 +56,7 @@ def evaluate(
     normaliser: Annotated[
         str | None,
         typer.Option(
-            help="Use the normaliser of this evaluation, which makes the results comparable: project/folder/name."
+            help="Scale features as in this evaluation, so that the results can be compared: project/folder/name."
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write the report to this file.")] = None,

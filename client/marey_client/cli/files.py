@@ -43,7 +43,9 @@ def upload(
     places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
     project: Annotated[str, typer.Option(help="The project that receives the files.")],
     options: Chosen,
-    left_handed: Annotated[bool, typer.Option("--left-handed", help="Short form of --handedness left.")] = False,
+    left_handed: Annotated[
+        bool, typer.Option("--left-handed", help="The same as --handedness left: the files have left-handed axes.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Import motion files. Refused files are listed with a reason; importing a file again changes nothing."""
@@ -99,7 +101,9 @@ def ls(
     place: Annotated[
         str | None, typer.Argument(help="Project or folder to list: project[/folder]; default: all projects.")
     ] = None,
-    recursive: Annotated[bool, typer.Option("--recursive", "-r", help="Include all folders below.")] = False,
+    recursive: Annotated[
+        bool, typer.Option("--recursive", "-r", help="Also list the contents of all subfolders.")
+    ] = False,
     kind: Annotated[list[str] | None, typer.Option(help="List only items of this kind; may be repeated.")] = None,
     tag: Annotated[
         str | None, typer.Option(help="List only items with one of these tags, separated by commas.")

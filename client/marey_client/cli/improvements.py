@@ -62,7 +62,10 @@ def compare(
     before: Evaluation,
     after: Annotated[
         str,
-        typer.Argument(help="The evaluation after the change: the same trials, evaluated with --normaliser BEFORE."),
+        typer.Argument(
+            help="The evaluation after the change, with the same trials; created by `marey evaluate "
+            "--normaliser BEFORE`."
+        ),
     ],
     params: Chosen,
     job: Chosen,
@@ -99,7 +102,8 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the paths of the clips that can be removed without any effect to this file, one per line."
+            help="Write the paths of the clips that can be removed without any effect on the trials to this "
+            "file, one per line."
         ),
     ] = None,
     wait: Wait = True,

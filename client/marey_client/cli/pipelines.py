@@ -74,11 +74,16 @@ def build_model(
     ] = None,
     label: Annotated[list[str] | None, typer.Option(help="Use only segments with this label; may be repeated.")] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Do not cut the takes; annotations only guide their alignment.")
+        bool,
+        typer.Option("--whole", help="Do not cut the takes into pieces; use their annotations only to align them."),
     ] = False,
     rate: Annotated[float | None, typer.Option(help="Frames per second of the aligned clips.")] = None,
-    mirror: Annotated[bool, typer.Option("--mirror", help="Also train on mirrored examples.")] = False,
-    tree: Annotated[bool, typer.Option("--tree/--no-tree", help="Make a tree, which speeds up searches.")] = True,
+    mirror: Annotated[
+        bool, typer.Option("--mirror", help="Also train the model on mirrored copies of the examples.")
+    ] = False,
+    tree: Annotated[
+        bool, typer.Option("--tree/--no-tree", help="Build a tree of samples for the model, which speeds up searches.")
+    ] = True,
     choices: Annotated[
         list[str] | None,
         typer.Option(

@@ -14,7 +14,10 @@ from marey_schemas.log_lines import LogForm
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
 
 DataFolder = Annotated[
-    Path | None, typer.Option(help="Data folder; default: MAREY_DATA, else the one in marey.toml, else ./marey-data.")
+    Path | None,
+    typer.Option(
+        help="Data folder of the server; default: MAREY_DATA, otherwise `data` in marey.toml, otherwise ./marey-data."
+    ),
 ]
 DatabaseUrl = Annotated[
     str | None,
@@ -153,9 +156,9 @@ def purge_database(data: DataFolder = None, database_url: DatabaseUrl = None) ->
 @db.command("clock")
 def set_clock(
     set_now: Annotated[
-        bool, typer.Option("--set", help="Set the clock of the database to that of this machine, even back.")
+        bool, typer.Option("--set", help="Set the stored clock to the clock of this machine, even if that is earlier.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the clock is set.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Set the clock without asking for confirmation.")] = False,
     data: DataFolder = None,
 ) -> None:
     """Compare the clock that an SQLite database stores with the clock of this machine. The server must be stopped.
