@@ -20,6 +20,11 @@ PHRASES = {
     r"\blast word\b": "final answer",
     r"\btwins?\b": "mirrored copy",
     r"\bmade[- ]up\b(?! of)": "synthetic",
+    r"\bwhoever\b": "the user, the client or the caller that is meant",
+    r"\bmend(?:s|ed|ing)?\b": "correct, or repair",
+    r"\b(?:go|goes|going|gone) away\b": "has closed the connection, or has ended",
+    r"\b(?:no|make|makes|making) room\b": "no space, or free space",
+    r"\bmade to do harm\b": "malicious",
 }  # fmt: skip
 """Phrases that need a second reading, as regular expressions, and plain words for them."""
 

@@ -195,7 +195,7 @@ class Connections:
         for one in own[: max(1, int(self._most * EVICTED_SHARE))]:
             one.close()
         if own:
-            self._log("evicted", "closed idle connections of %s to make room for others", host)
+            self._log("evicted", "closed idle connections of %s, because a limit on connections was reached", host)
 
     def _forget(self, one: _Connection) -> None:
         del self._open[one]

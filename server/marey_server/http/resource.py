@@ -412,9 +412,7 @@ class Resource(Exchange):
             self.send(outcome)
 
     def on_connection_close(self) -> None:
-        """Release the received part of the body when the client has closed the connection, unless a method runs; stop
-        work of child processes.
-        """
+        """Release the body and stop child processes, because the client has closed the connection."""
         super().on_connection_close()
         for task in list(self._in_children):
             task.abandon()

@@ -158,10 +158,10 @@ def test_a_disk_without_room_for_the_tables_is_told(
     tmp_path: Path, command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_tx: Transaction) -> None:
-        raise StorageFullProblem("The disk has no room left.")
+        raise StorageFullProblem("The disk has no space left.")
 
     monkeypatch.setattr("marey_server.store.database.schema.make_cursor_key", full)
-    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no room"):
+    with pytest.raises((commands.CommandFailed, DatabaseUnusable), match="for writing: The disk has no space"):
         command(data=tmp_path)
 
 

@@ -343,7 +343,7 @@ def _translated(error: Exception) -> Exception:
     """
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        return StorageFullProblem("The disk has no room left; nothing was written.") if full else error
+        return StorageFullProblem("The disk has no space left; nothing was written.") if full else error
     if isinstance(error, exc.TimeoutError):
         return _no_answer("All connections to the database are in use; nothing was written.")
     if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
@@ -352,7 +352,7 @@ def _translated(error: Exception) -> Exception:
         return error
     message = str(error.orig)
     if "disk is full" in message or getattr(error.orig, "sqlstate", None) == "53100":
-        return StorageFullProblem("The database's disk has no room left; nothing was written.")
+        return StorageFullProblem("The disk of the database has no space left; nothing was written.")
     if isinstance(error, exc.OperationalError) and not message.startswith(("no such", "near ")):  # those are our faults
         return _no_answer("The database does not answer; nothing was written. Try again.")
     return error

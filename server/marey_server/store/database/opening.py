@@ -74,7 +74,10 @@ def alone(file: Path) -> Iterator[Connection]:
 
 
 def vacuum(file: Path) -> None:
-    """Copy an SQLite file without its free pages. Raises like `alone`, and if the disk has no room for the copy."""
+    """Copy an SQLite file without its free pages.
+
+    Raises the errors of `alone`, and an error if the disk has no space for the copy.
+    """
     with alone(file) as connection:
         connection.commit()  # a vacuum runs outside of transactions; the lock stays
         try:
