@@ -91,7 +91,7 @@ def test_arrays_take_from_the_memory_of_requests_before_they_are_decoded(
         client = server.client(server.make_project())
         monkeypatch.setattr("marey_schemas.encoding.codecs.array_from_leaf", None)
         body = packed(np.zeros((MIB, 1), np.float32))
-        server.app.services.memory.take("another member", 0, 1, reserved=False)
+        server.app.services.memory.take("somebody else", 0, 1, reserved=False)
         refused = client.post(CLIPS, content=body, headers=MSGPACK)
         assert (refused.status_code, refused.json()["code"]) == (503, "memory")
 
