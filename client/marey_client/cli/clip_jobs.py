@@ -66,6 +66,7 @@ def retarget(
         )
         ended = follow(marey, submitted, wait=wait, as_json=as_json)
     if ended is not None:
+        _print_warnings(ended.result or {})
         print_ended(ended, as_json)
 
 
@@ -131,6 +132,12 @@ def print_labelled(result: dict[str, Any]) -> None:
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
     if empty := result.get("empty"):
         print_message(f"nothing was found in {counted(len(empty), 'clip')}, such as {empty[0]}")
+
+
+def _print_warnings(result: dict[str, Any]) -> None:
+    """Print the number of clips with each warning to standard error."""
+    for code, count in result.get("warnings", {}).items():
+        print_message(f"warning {code}: {counted(count, 'clip')}; see `marey show --part info` of a clip")
 
 
 def _reference(marey: Marey, text: str) -> str:

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
 DOWNLOADS_AT_ONCE = 4
+NEW_REVISION = "new revision"
+OUTCOMES = ("created", NEW_REVISION, "unchanged", "companion", "failed")  # in the order of the summary
 
 WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
@@ -48,7 +50,10 @@ def upload(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Import motion files. Refused files are listed with a reason; importing a file again changes nothing."""
+    """Import motion files. Refused files are listed with a reason.
+
+    Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
+    """
     from marey_client.imports import find_files, left_out_text
     from marey_schemas.options.imports import ImportOptions
 
@@ -88,12 +93,15 @@ def _print_entries(entries: Sequence[ImportEntry]) -> None:
         more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
         for text in [*texts[:WARNINGS_SHOWN], *more]:
             print_message(f"warning {code}: {text}")
-    counts = Counter(entry.status for entry in entries)
+    counts = Counter(_outcome(entry) for entry in entries)
     frames = sum(entry.frames or 0 for entry in entries)
-    told = ", ".join(
-        f"{counts[status]} {status}" for status in ("created", "unchanged", "companion", "failed") if counts[status]
-    )
-    typer.echo(f"{counted(len(entries), 'file')}: {told}; {counted(frames, 'frame')}")
+    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
+    typer.echo(f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}")
+
+
+def _outcome(entry: ImportEntry) -> str:
+    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
+    return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status
 
 
 def ls(

@@ -23,9 +23,9 @@ from tests.support.scripted_server import ScriptedServer, problem
 from marey_client.cli import accounts, files, projects, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
-from marey_client.cli.clip_jobs import _print_aligned, print_labelled
+from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.failures import Refused, WrongUsage, sentence
-from marey_client.cli.files import _items_in
+from marey_client.cli.files import _items_in, _print_entries
 from marey_client.cli.following import follow, print_ended
 from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import _done
@@ -34,6 +34,7 @@ from marey_client.cli.pipelines import _tell_shortfalls
 from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
+from marey_schemas.imports import ImportEntry
 from marey_schemas.jobs import Job, JobState, Progress
 from marey_schemas.kinds import Kind
 
@@ -405,6 +406,23 @@ def test_inputs_that_a_job_refused_give_status_1_however_it_is_printed(
     with pytest.raises(Refused):
         print_ended(a_job(id="job_1", result=result), as_json, print_labelled)
     assert "it has no feet" in "".join(capsys.readouterr())
+
+
+def test_warnings_about_results_are_counted_by_code(capsys: pytest.CaptureFixture[str]) -> None:
+    _print_warnings({"clips": 3, "warnings": {"bones-moved-by-translations": 2}, "refused": []})
+    printed = capsys.readouterr()
+    assert printed.err.startswith("warning bones-moved-by-translations: 2 clips; ")
+    assert printed.out == ""
+
+
+def test_an_upload_tells_a_new_revision_from_a_new_clip(capsys: pytest.CaptureFixture[str]) -> None:
+    entries = [
+        ImportEntry(name="a.bvh", status="created", revision=1, frames=2),
+        ImportEntry(name="b.bvh", status="created", revision=3, frames=2),
+        ImportEntry(name="c.bvh", status="unchanged", revision=2, frames=2),
+    ]
+    _print_entries(entries)
+    assert capsys.readouterr().out == "3 files: 1 created, 1 new revision, 1 unchanged; 6 frames\n"
 
 
 def test_who_interrupts_an_upload_is_told_how_to_go_on(

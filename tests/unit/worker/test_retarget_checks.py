@@ -52,6 +52,7 @@ def test_the_checks_of_a_result_name_the_bones_that_translations_moved(
     project.into = "out"
     result = retarget.run(project, RetargetParams())
     assert (result["clips"], result["refused"]) == (2, [])
+    assert result["warnings"] == {"bones-moved-by-translations": 1}
     checks = {output.item_name: output.parts["info"].get("checks", []) for output in project.staged}
     assert checks["plain"] == []
     (check,) = checks["moved"]

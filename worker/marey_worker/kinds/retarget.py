@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from typing import Any
 
 from marey_motion import documents
@@ -23,7 +24,8 @@ from marey_worker.job_io.staged_results import StagedResults
 def run(context: Context, params: RetargetParams) -> dict[str, Any]:
     """Retarget every clip of the job.
 
-    A clip that cannot be retargeted is listed as a refusal in the result, with code and reason.
+    A clip that cannot be retargeted is listed as a refusal in the result, with code and reason. The result counts the
+    clips with a warning, by code; the part `info` of each such clip contains the warning.
     """
     return _Retargeting(context, params).run()
 
@@ -38,6 +40,7 @@ class _Retargeting:
         self._results = StagedResults(context)
         self._places = ResultPlaces(context)
         self._frames = 0
+        self._warnings: Counter[str] = Counter()
 
         (self._target_pin,) = context.inputs["skeleton"]
         self._target = Rig.as_stored(self._target_pin.ref)
@@ -64,6 +67,7 @@ class _Retargeting:
             "clips": self._results.count,
             "frames": self._frames,
             "seconds": round(time.monotonic() - started, 4),
+            "warnings": dict(self._warnings),
             "refused": self._refusals.entries,
         }
 
@@ -78,6 +82,7 @@ class _Retargeting:
         bones = moved_bones(taken, plan)
         checks = () if bones.warning is None else (Check.model_validate(bones.warning.as_dict()),)
         clip = retarget(taken, plan, bones)
+        self._warnings.update(check.code for check in checks)
         self._frames += clip.frame_count
         return StagedOutput(
             name=f"{pin.collection}/{pin.name}",
