@@ -234,7 +234,7 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     found = list(_things(marey.project(address.project), address, wanted, deleted=deleted))
     kinds = list(dict.fromkeys(one.kind for one in found))
     if len(kinds) > 1:
-        raise WrongUsage(f"several items are called {address}: a {{' and a '.join(kinds)}}; choose one with --kind")
+        raise WrongUsage(f"several items are called {address}: a {' and a '.join(kinds)}; choose one with --kind")
     if not found:
         if not deleted:
             raise _missing(marey, address, "no item or folder")
