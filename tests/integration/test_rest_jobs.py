@@ -278,12 +278,13 @@ def test_strangers_neither_see_nor_touch_jobs(server: Server, owner: httpx.Clien
     assert stranger.post("/leases", json={"worker": "w", "kinds": ["errand"]}).status_code == 403
 
 
-def test_the_kinds_of_job_are_told_to_anybody(server: Server) -> None:
-    anybody = server.client()
-    kinds = ok(anybody.get("/job-kinds"))["items"]
-    assert {"import", "retarget", "export"} <= {kind["name"] for kind in kinds}
-    assert ok(anybody.get("/job-kinds/retarget"))["inputs"]["clips"]["kind"] == "clip"
-    assert anybody.get("/job-kinds/levitate").status_code == 404
+def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
+    worker = server.make_user("worker", scopes=("work",))
+    for anybody in (server.client(), server.client(worker)):
+        kinds = ok(anybody.get("/job-kinds"))["items"]
+        assert {"import", "retarget", "export"} <= {kind["name"] for kind in kinds}
+        assert ok(anybody.get("/job-kinds/retarget"))["inputs"]["clips"]["kind"] == "clip"
+        assert anybody.get("/job-kinds/levitate").status_code == 404
 
 
 def test_jobs_of_lost_workers_are_taken_back_whatever_becomes_of_the_other_chores(

@@ -37,7 +37,7 @@ class JobKinds(Resource):
     path = "/job-kinds"
     tag = "Jobs"
 
-    @reads(access=Access.ANYONE, answer=JobKind, paged=True)
+    @reads(access=Access.ANYONE, scope=None, answer=JobKind, paged=True)
     async def get(self) -> Reply:
         """List all kinds of jobs, with the inputs and parameters they take."""
         return Reply(Page(items=tuple(kind.document() for kind in job_kinds().values())))
@@ -49,7 +49,7 @@ class JobKindResource(Resource):
     path = "/job-kinds/{job_kind}"
     tag = "Jobs"
 
-    @reads(access=Access.ANYONE, answer=JobKind)
+    @reads(access=Access.ANYONE, scope=None, answer=JobKind)
     async def get(self, job_kind: str) -> Reply:
         """Return a kind of job."""
         try:
