@@ -95,7 +95,7 @@ class ClipError(MotionError):
     ...     generate_gait(1.2, 0.0, 2.0).sliced(5, 5)
     ... except ClipError as error:
     ...     print(error)
-    slice: frames 5:5 are not a part of 0:120; start must come before stop
+    slice: the range of frames 5:5 must lie within 0:120, and its start must be before its stop
     """
 
     default_code = "clip-invalid"
@@ -128,7 +128,7 @@ class MappingError(MotionError):
     ...     map_joints(skeleton).indices(skeleton, ["left_wing"])
     ... except MappingError as error:
     ...     print(error)
-    left_wing: the mapping names no joint for left_wing; add them to it
+    left_wing: the joint mapping contains no joint for left_wing; add one for each
     """
 
     default_code = "mapping-invalid"

@@ -76,7 +76,7 @@ def test_clips_of_two_skeletons_are_refused_by_name(lab: ProjectHandle, tmp_path
     at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
     (tmp_path / "stranger.bvh").write_bytes(write_bvh(Clip(skeleton, 30.0, np.tile(at_rest, (60, 1)), None, ())))
     lab.imports.upload(find_files([tmp_path / "stranger.bvh"]).files, ImportOptions(collection="walks"))
-    with pytest.raises(JobUnsuccessful, match=r"but not walks/stranger; .* marey retarget"):
+    with pytest.raises(JobUnsuccessful, match=r"but walks/stranger do not; .*marey retarget"):
         lab.evaluation(lab.evaluate("walks", **SMALL))
     assert list(lab.evaluations.list()) == []
 

@@ -144,7 +144,7 @@ def test_a_job_of_any_kind_is_handed_in_from_the_shell(run: CommandLine, takes: 
     ended = run(*retarget, "--input", f"skeleton={studio.name}", "--param", "suffix=-x", "--param", "scale=1.5")
     assert json.loads(ended.stdout)["clips"] == 1
     assert [clip.path for clip in marey.project("jobs").clips.list(collection="out")] == ["out/raw/walk-x"]
-    assert "it has clips, skeleton" in run(*retarget, "--input", "nose=raw", status=2).stderr
+    assert "their inputs are clips, skeleton" in run(*retarget, "--input", "nose=raw", status=2).stderr
     assert "no skeleton at jobs/absent" in run(*retarget, "--input", "skeleton=absent", status=2).stderr
     assert "its job kinds are import" in run("job", "submit", "jobs", "nothing", status=2).stderr
 

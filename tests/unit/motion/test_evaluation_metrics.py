@@ -153,7 +153,7 @@ def test_a_trial_without_a_circle_measures_nothing_on_it() -> None:
 
 
 def test_a_record_of_another_trial_is_refused_by_name() -> None:
-    with pytest.raises(MotionError, match=r"circle v=2 w=50: the record has 61 ticks"):
+    with pytest.raises(MotionError, match=r"circle v=2 w=50: the record of the trial has 61 ticks"):
         measure_trial(LEFT, reference(LEFT), record_of(closed_reference(Trial("circle", 1.0, 0.0, 0.0, 1.0))), OPTIONS)
 
 

@@ -107,11 +107,11 @@ def test_many_joints_are_warned_of() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"extra_joints": ("head", "head")}, "extra_joints\n.*given twice"),
+        ({"extra_joints": ("head", "head")}, "extra_joints\n.*a joint twice"),
         ({"horizons_s": ()}, "horizons_s"),
         ({"horizons_s": (0.5, 0.25)}, "horizons_s"),
         ({"horizons_s": (0.0, 0.25)}, "horizons_s"),
-        ({"horizons_s": (0.005, 0.25)}, "horizons_s: .* one frame \\(1/60 s\\) ahead"),
+        ({"horizons_s": (0.005, 0.25)}, "horizons_s: .* one frame \\(1/60 s\\)"),
         ({"horizons_s": (0.25, 0.252)}, "horizons_s: .* one frame"),
         ({"horizons_s": (0.02,), "rate_hz": 20.0}, "horizons_s: .* one frame \\(1/20 s\\)"),
         ({"weights": {"hip_velocity": -1.0}}, "weights.hip_velocity"),

@@ -43,7 +43,7 @@ def test_the_callers_own_array_stays_writable() -> None:
     ("changes", "where", "words"),
     [
         ({"joint_names": ()}, "joint_names", "at least one"),
-        ({"joint_names": ("a", "b", "a")}, "joint_names", "'a' repeats"),
+        ({"joint_names": ("a", "b", "a")}, "joint_names", "two joints are called 'a'"),
         ({"joint_names": ("a", "", "c")}, "joint_names", "joint 1"),
         ({"parents": [0, 0, 1]}, "a", "root"),
         ({"parents": [-1, 2, 1]}, "b", "earlier joint"),
@@ -54,7 +54,7 @@ def test_the_callers_own_array_stays_writable() -> None:
         ({"offsets": np.zeros((3, 3), dtype=complex)}, "offsets", "complex"),
         ({"rest_rotations": np.full((3, 4), 0.9)}, "a", "unit quaternion"),
         ({"end_sites": (EndSite(3, np.zeros(3)),)}, "end_sites", "joint 3"),
-        ({"display_names": ("a",)}, "display_names", "1 names for 3"),
+        ({"display_names": ("a",)}, "display_names", "1 display names for 3 joints"),
     ],
 )
 def test_a_wrong_skeleton_is_refused_with_the_place_of_the_fault(

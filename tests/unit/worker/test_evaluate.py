@@ -69,7 +69,7 @@ def test_progress_is_told_trial_by_trial(project: ProjectInMemory) -> None:
 
 def test_clips_of_several_skeletons_are_refused_with_their_names(project: ProjectInMemory) -> None:
     add_clip(project, "stranger", generate_gait(1.0, 0.0, 3.0), skeleton="skeleton_b")
-    with pytest.raises(JobRefused, match=r"3 of 4 have rigs/SKELETON_A, but not walks/stranger") as refused:
+    with pytest.raises(JobRefused, match=r"3 of 4 have rigs/SKELETON_A, but walks/stranger do not") as refused:
         evaluate.run(project, PARAMS)
     assert refused.value.code == "several-skeletons"
 
