@@ -117,8 +117,8 @@ def restore(*, source: Path, **settings: Any) -> None:
     _say(f"{target} is restored from {source}; `marey db fsck` verifies it")
 
 
-def fsck(*, as_json: bool = False, **settings: Any) -> None:
-    """Verify every digest and reference; fail if there are defects."""
+def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> None:
+    """Verify every digest, reference and counter; fail if there are defects. `repair` corrects counters."""
     from marey_server.app import connect_database
     from marey_server.store.fsck import check_store
 
@@ -127,7 +127,7 @@ def fsck(*, as_json: bool = False, **settings: Any) -> None:
         _sqlite_file(chosen, must_exist=True)
     checked: dict[str, int] = {}
     with _database_of(chosen), closing(connect_database(chosen)) as database:
-        findings = list(check_store(database, progress=checked.__setitem__))
+        findings = list(check_store(database, progress=checked.__setitem__, repair=repair))
     if as_json:
         import json
 

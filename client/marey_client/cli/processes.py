@@ -139,9 +139,16 @@ def restore_database(
 
 
 @db.command("fsck")
-def check_database(data: DataFolder = None, database_url: DatabaseUrl = None, as_json: AsJson = False) -> None:
-    """Verify all digests and references in the database."""
-    _database("fsck", data, database_url, as_json=as_json)
+def check_database(
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Correct wrong counters of items and bytes. Other writes wait meanwhile.")
+    ] = False,
+    data: DataFolder = None,
+    database_url: DatabaseUrl = None,
+    as_json: AsJson = False,
+) -> None:
+    """Verify all digests, references and counters in the database."""
+    _database("fsck", data, database_url, repair=repair, as_json=as_json)
 
 
 @db.command("purge")

@@ -166,6 +166,14 @@ class Settings(BaseSettings):
     user_projects: int = Field(
         Quotas.user_projects, ge=0, description="Number of owned projects from which on a user creates no more."
     )
+    user_items: int = Field(Quotas.user_items, ge=0, description="Greatest number of items that a user created.")
+    user_stored_bytes: int = Field(
+        Quotas.user_stored_bytes, ge=0, description="Greatest number of bytes that the revisions of these items take."
+    )
+    project_items: int = Field(Quotas.project_items, ge=0, description="Greatest number of items in a project.")
+    project_stored_bytes: int = Field(
+        Quotas.project_stored_bytes, ge=0, description="Greatest number of bytes that the revisions of its items take."
+    )
     events_days: int = Field(
         Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever, as for the next two."
     )
@@ -211,7 +219,7 @@ class Settings(BaseSettings):
 
     @property
     def quotas(self) -> Quotas:
-        """Return the limits of what one user may hold."""
+        """Return the limits of what one user, or one project, may hold."""
         return Quotas(**{field.name: getattr(self, field.name) for field in fields(Quotas)})
 
     @property

@@ -276,14 +276,19 @@ def require_readable(tx: Transaction, digest: str) -> int:
 
 def sizes_of_readable(tx: Transaction, digests: Collection[str]) -> dict[str, int]:
     """Return the sizes of blobs in bytes, by digest. Raises `NotFoundProblem` if the caller may not read one."""
-    allowed = readable(tx, digests)
-    sizes: dict[str, int] = {}
-    for some in _batched(allowed):
-        rows = tx.execute(select(blob.c.digest, blob.c.size_bytes).where(blob.c.digest.in_(some)))
-        sizes.update((row.digest, row.size_bytes) for row in rows)
+    sizes = sizes_of(tx, readable(tx, digests))
     for digest in digests:
         if digest not in sizes:
             raise NotFoundProblem(f"There is no blob {digest} that you may read.")
+    return sizes
+
+
+def sizes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
+    """Return the sizes of stored blobs in bytes, by digest, without a check of access."""
+    sizes: dict[str, int] = {}
+    for some in _batched(digests):
+        rows = tx.execute(select(blob.c.digest, blob.c.size_bytes).where(blob.c.digest.in_(some)))
+        sizes.update((row.digest, row.size_bytes) for row in rows)
     return sizes
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Row, func, literal, or_, select, update
 from marey_schemas.access import Role
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Page
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
-from marey_server.store import listing, projects
+from marey_server.store import listing, projects, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
@@ -197,11 +197,13 @@ def delete_collection(tx: Transaction, project: str, collection_id: str, *, expe
     below = (collection.c.project_id == project_row.id, at_or_below(path))
     tx.execute(update(collection).where(*below, _ALIVE).values(deleted_us=tx.now_us, rev=collection.c.rev + 1))
     hidden = select(collection.c.id).where(*below, collection.c.deleted_us == tx.now_us)
-    tx.execute(
+    gone = tx.execute(
         update(item)
         .where(item.c.collection_id.in_(hidden), item.c.deleted_us.is_(None))
         .values(deleted_us=tx.now_us, rev=item.c.rev + 1)
+        .returning(item.c.creator_id, item.c.stored_bytes)
     )
+    quotas.release(tx, project_row.id, quotas.by_creator(gone))
     tx.emit("collection.deleted", collection_id, project_id=project_row.id, path=path)
 
 
@@ -224,12 +226,14 @@ def restore_collection(
         together = (collection.c.project_id == project_row.id, at_or_below(gone.path))
         hidden = collection.c.deleted_us == gone.deleted_us
         tx.execute(update(collection).where(*together, hidden).values(deleted_us=None, rev=collection.c.rev + 1))
-    tx.execute(
+    back = tx.execute(
         update(item)
         .where(item.c.collection_id.in_(select(collection.c.id).where(*together, _ALIVE)))
         .where(item.c.deleted_us == gone.deleted_us)
         .values(deleted_us=None, rev=item.c.rev + 1)
+        .returning(item.c.creator_id, item.c.stored_bytes)
     )
+    quotas.hold(tx, project_row.id, quotas.by_creator(back))
     tx.emit("collection.restored", collection_id, project_id=project_row.id, path=gone.path)
     return _shown(row)
 

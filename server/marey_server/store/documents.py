@@ -211,16 +211,20 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
     return ready.digest
 
 
-def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> None:
-    """Store documents as `store_document` does, all with the same few statements."""
+def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
+    """Store documents as `store_document` does, all with the same few statements.
+
+    Returns for how many bytes the new ones count, by digest.
+    """
     by_digest = {one.digest: one for one in contents}
-    _require_files(tx, by_digest.values())
+    file_sizes = _require_files(tx, by_digest.values())
     rows = [
         {
             "digest": one.digest,
             "schema": one.schema,
             "body": one.body,
             "size_bytes": one.size_bytes,
+            "file_bytes": _file_bytes(one, file_sizes),
             "created_us": tx.now_us,
         }
         for one in by_digest.values()
@@ -236,6 +240,11 @@ def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> No
             for pointer, digest in [*((at, digest) for at, (digest, _data) in one.arrays.items()), *one.files.items()]
         ],
     )
+    return {one.digest: one.size_bytes + _file_bytes(one, file_sizes) for one in added}
+
+
+def _file_bytes(one: PreparedDocument, sizes: Mapping[str, int]) -> int:
+    return sum(sizes[digest] for digest in set(one.files.values())) if one.files else 0
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
@@ -244,7 +253,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
         return
     digests = [digest_of_body(body) for _, body in variants]
     of_originals = sorted({original for original, _ in variants})
-    columns = (document.c.digest, document.c.schema, document.c.size_bytes)
+    columns = (document.c.digest, document.c.schema, document.c.size_bytes, document.c.file_bytes)
     originals = {row.digest: row for row in tx.execute(select(*columns).where(document.c.digest.in_(of_originals)))}
     rows = [
         {
@@ -252,6 +261,7 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
             "schema": originals[original].schema,
             "body": body,
             "size_bytes": originals[original].size_bytes,
+            "file_bytes": originals[original].file_bytes,
             "created_us": tx.now_us,
         }
         for digest, (original, body) in zip(digests, variants, strict=True)
@@ -264,7 +274,8 @@ def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> Non
     _refer(tx, [(digest, *place) for digest, original in added.items() for place in held.get(original, ())])
 
 
-def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> None:
+def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
+    """Check that the caller may name the files, and return their sizes in bytes."""
     naming = [one.files for one in contents if one.files]
     held = blobs.hold(tx, {digest for files in naming for digest in files.values()}) if naming else set()
     for files in naming:
@@ -272,6 +283,7 @@ def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> Non
         if lacking:
             errors = [FieldError(pointer=at, code="missing-blob", detail=digest) for at, digest in lacking.items()]
             raise blobs.missing_blobs(lacking.values(), errors)
+    return blobs.sizes_of(tx, held)
 
 
 def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
@@ -282,6 +294,23 @@ def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
     rows = [dict(zip(columns, one, strict=True)) for one in references]
     if rows:
         tx.execute(insert(document_blob), rows)
+
+
+_STORED_BYTES = Prepared(
+    select(document.c.digest, (document.c.size_bytes + document.c.file_bytes).label("stored_bytes")).where(
+        document.c.digest.in_(bindparam("digests", expanding=True))
+    )
+)
+
+
+def stored_bytes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
+    """Return how many bytes stored documents count for, by digest: text, arrays, and the files that they name."""
+    wanted = sorted(set(digests))
+    return {
+        row.digest: row.stored_bytes
+        for start in range(0, len(wanted), IN_LIST)
+        for row in tx.run(_STORED_BYTES, {"digests": padded(wanted[start : start + IN_LIST])})
+    }
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -8,15 +8,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from sqlalchemy import Row, Select, Table, and_, exists, func, select, text
+from sqlalchemy import Column, Row, Select, Table, and_, exists, func, select, text
 
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
-from marey_server.store import documents
+from marey_server.store import documents, quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
@@ -27,14 +28,18 @@ from marey_server.store.tables import (
     document,
     document_blob,
     item,
+    project,
     revision,
     revision_part,
     upload,
     upload_chunk,
+    user,
 )
 from marey_server.store.transaction import Transaction
 
 PAGE = 100
+MISCOUNTED = "counter-wrong"
+"""Code of defects that `check_store` can repair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +51,13 @@ class StoreDefect:
     detail: str
 
 
-def check_store(database: Database, *, progress: Callable[[str, int], None] | None = None) -> Iterator[StoreDefect]:
-    """Yield all defects as they are found; call `progress(check, count)` after each page."""
+def check_store(
+    database: Database, *, progress: Callable[[str, int], None] | None = None, repair: bool = False
+) -> Iterator[StoreDefect]:
+    """Yield all defects as they are found; call `progress(check, count)` after each page.
+
+    With `repair`, counters of items and bytes that are wrong are then corrected; they are yielded nevertheless.
+    """
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (
         ("blobs", blob, _check_blob),
@@ -55,15 +65,21 @@ def check_store(database: Database, *, progress: Callable[[str, int], None] | No
         ("items", item, _check_item),
         ("collections", collection, _check_collection),
         ("uploads", upload, _check_upload),
+        ("projects", project, partial(_check_holding, owner=item.c.project_id)),
+        ("users", user, partial(_check_holding, owner=item.c.creator_id)),
     )
+    miscounted = False
     for name, table, check in passes:
         behind, count = "", 0
         while page := database.read(SYSTEM, _check_page, table, check, behind):
             behind, count = page[-1][0], count + len(page)
             for _key, findings in page:
+                miscounted = miscounted or any(one.code == MISCOUNTED for one in findings)
                 yield from findings
             if progress is not None:
                 progress(name, count)
+    if miscounted and repair:
+        database.write(SYSTEM, quotas.recount)
 
 
 def _check_page(
@@ -106,6 +122,9 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     if digest_of(canonical_json(row.body)) != row.digest:
         findings.append(StoreDefect("document-corrupt", row.digest, "the text has another digest"))
     arrays, files = documents.references_of(row.schema, row.body)
+    file_bytes = select(func.coalesce(func.sum(blob.c.size_bytes), 0)).where(blob.c.digest.in_(set(files.values())))
+    if tx.execute(file_bytes).scalar_one() != row.file_bytes:
+        findings.append(StoreDefect("document-reference", row.digest, "the files that it names have another size"))
     statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
     statement = statement.outerjoin(blob, blob.c.digest == document_blob.c.blob_digest)
     held = {
@@ -157,6 +176,9 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         if (summary.shown, summary.frames, summary.skeleton_id) != (row.summary, row.frames, row.skeleton_id):
             findings.append(StoreDefect("summary-wrong", row.id, "the summary is not that of the newest revision"))
         findings += _check_named_items(tx, row, bodies)
+    if (size := tx.execute(select(quotas.BYTES_OF_ITEM).where(item.c.id == row.id)).scalar_one()) != row.stored_bytes:
+        detail = f"its revisions take {size} bytes, but {row.stored_bytes} are recorded"
+        findings.append(StoreDefect(MISCOUNTED, row.id, detail))
     place = tx.execute(select(collection).where(collection.c.id == row.collection_id)).first()
     if place is None or place.project_id != row.project_id or (row.deleted_us is None) > (place.deleted_us is None):
         findings.append(StoreDefect("misplaced-item", row.id, "its collection is deleted, gone or of another project"))
@@ -193,6 +215,12 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     if tx.execute(select(above)).scalar():
         return []
     return [StoreDefect("orphan-collection", row.id, f"{row.path!r} lies in {parent!r}, which is not there")]
+
+
+def _check_holding(tx: Transaction, row: Row[Any], owner: Column[str]) -> list[StoreDefect]:
+    """Check the counters of a project or a user, whom the column `owner` of items names."""
+    counted, recorded = quotas.count_held(tx, owner, row.id), quotas.read_held(tx, row.id)
+    return [] if counted == recorded else [StoreDefect(MISCOUNTED, row.id, f"it holds {counted}, not {recorded}")]
 
 
 def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:

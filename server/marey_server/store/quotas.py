@@ -1,18 +1,30 @@
-"""Quotas: limits on the uploads, tokens and projects of one user.
+"""Quotas: limits on what one user, or one project, may have.
 
-The transaction that adds to them counts them, so the count is always exact.
+The transaction that adds something counts it, so the count is always exact. Items and their bytes have counters in the
+table `holding`, for the project and for the user who created the item. Everything else is counted when one is added.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, func, or_, select
+from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select, text, update
 
 from marey_schemas.access import Role
 from marey_server.errors import QuotaExceededProblem
-from marey_server.store.tables import member, project, token, upload
+from marey_server.store.database.prepared import Prepared
+from marey_server.store.tables import (
+    document,
+    holding,
+    item,
+    member,
+    project,
+    revision_part,
+    token,
+    upload,
+)
 from marey_server.store.transaction import Transaction
 
 
@@ -24,11 +36,15 @@ class _Rule:
     remedy: str
 
 
+_DELETE = "Delete items that nobody needs, or ask an administrator to raise the setting `{quota}`."
+
 _RULES = {
     "user_uploads": _Rule("open uploads", "Finish or delete one of them, such as {oldest}."),
     "user_upload_bytes": _Rule("bytes announced by open uploads", "Finish or delete one of them, such as {oldest}."),
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
+    "items": _Rule("items", _DELETE),
+    "stored_bytes": _Rule("bytes of items", _DELETE),
 }
 
 
@@ -46,10 +62,15 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     if used + more <= limit:
         return
     oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
-    rule = _RULES[quota]
-    raise QuotaExceededProblem(
-        f"You have {used:,} {rule.noun}, the limit is {limit:,}, and this needs {more:,} more. "
-        + rule.remedy.format(oldest=oldest or "none"),
+    remedy = _RULES[quota].remedy.format(oldest=oldest or "none")
+    raise _exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
+
+
+def _exceeded(
+    subject: str, quota: str, noun: str, used: int, limit: int, more: int, remedy: str
+) -> QuotaExceededProblem:
+    return QuotaExceededProblem(
+        f"{subject} {used:,} {noun}, the limit is {limit:,}, and this needs {more:,} more. {remedy}",
         context={"quota": quota, "used": used, "limit": limit},
     )
 
@@ -68,3 +89,132 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
 
 def _open(user_id: str) -> tuple[Any, ...]:
     return upload.c.user_id == user_id, upload.c.finished_digest.is_(None), upload.c.dropped.is_(False)
+
+
+# -- items and their bytes --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Numbers of items, and of the bytes of their revisions."""
+
+    items: int = 0
+    stored_bytes: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.items:,} items of {self.stored_bytes:,} bytes"
+
+    def __add__(self, more: Held) -> Held:
+        return Held(self.items + more.items, self.stored_bytes + more.stored_bytes)
+
+
+COUNTED = ("items", "stored_bytes")
+"""Quotas of which the table `holding` has counters."""
+
+_ADD = Prepared(
+    update(holding)
+    .where(holding.c.owner_id == bindparam("owner"))
+    .values({name: holding.c[name] + bindparam(f"more_{name}") for name in COUNTED})
+    .returning(*holding.c)
+)
+
+
+def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, Held]:
+    """Return what items hold, given as rows of `creator_id` and `stored_bytes`, by their creators."""
+    held: dict[str | None, Held] = {}
+    for row in rows:
+        held[row.creator_id] = held.get(row.creator_id, Held()) + Held(1, row.stored_bytes)
+    return held
+
+
+def hold(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> None:
+    """Add to what a project and the creators of its items hold.
+
+    The counters are locked until the transaction ends, so that no concurrent writes exceed a quota together. Raises
+    `QuotaExceededProblem`; the caller must then roll back.
+    """
+    total = sum(more.values(), Held())
+    if total == Held():
+        return
+    _hold(tx, "project", project_id, total)
+    for creator_id in sorted(filter(None, more)):
+        _hold(tx, "user", creator_id, more[creator_id])
+
+
+def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
+    row = _add(tx, owner_id, more)
+    for name in COUNTED:
+        used, added, limit = getattr(row, name), getattr(more, name), limit_of(tx, of, name, row.limits)
+        if added and used > limit:
+            subject = "The project has" if of == "project" else "The user who created the items has"
+            rule = _RULES[name]
+            remedy = rule.remedy.format(quota=f"{of}_{name}")
+            raise _exceeded(subject, f"{of}_{name}", rule.noun, used - added, limit, added, remedy)
+
+
+def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> int:
+    """Return the limit that is set for one project or user, or else that of the settings."""
+    return limits.get(name, getattr(tx.quotas, f"{of}_{name}"))
+
+
+def release(tx: Transaction, project_id: str, less: Mapping[str | None, Held]) -> None:
+    """Take from what a project and the creators of its items hold."""
+    total = sum(less.values(), Held())
+    for owner_id, held in ((project_id, total), *sorted((one, less[one]) for one in less if one is not None)):
+        if held != Held():
+            _add(tx, owner_id, Held(-held.items, -held.stored_bytes))
+
+
+def _add(tx: Transaction, owner_id: str, more: Held) -> Any:
+    given = {"owner": owner_id, "more_items": more.items, "more_stored_bytes": more.stored_bytes}
+    row = tx.first(_ADD, given)
+    if row is None:
+        tx.execute(tx.insert_or_ignore(holding, {"owner_id": owner_id, "limits": {}}))
+        row = tx.first(_ADD, given)
+    return row
+
+
+# -- checks -----------------------------------------------------------------------------------------------------------
+
+_BEFORE = revision_part.alias("before")
+_UNCHANGED = exists().where(
+    _BEFORE.c.item_id == revision_part.c.item_id,
+    _BEFORE.c.number == revision_part.c.number - 1,
+    _BEFORE.c.part == revision_part.c.part,
+    _BEFORE.c.document_digest == revision_part.c.document_digest,
+)
+BYTES_OF_ITEM = (
+    select(func.coalesce(func.sum(document.c.size_bytes + document.c.file_bytes), 0))
+    .join(revision_part, revision_part.c.document_digest == document.c.digest)
+    .where(revision_part.c.item_id == item.c.id, ~_UNCHANGED)
+    .correlate(item)
+    .scalar_subquery()
+)
+"""Bytes of all revisions of an item; a part counts in each revision that changed it."""
+
+
+_SUMS = (func.count().label("items"), func.coalesce(func.sum(item.c.stored_bytes), 0).label("stored_bytes"))
+
+
+def count_held(tx: Transaction, owner: Column[str], owner_id: str) -> Held:
+    """Return what a project or a user holds, counted item by item; `owner` is the column of items that names it."""
+    row = tx.execute(select(*_SUMS).where(owner == owner_id, item.c.deleted_us.is_(None))).one()
+    return Held(row.items, int(row.stored_bytes))
+
+
+def read_held(tx: Transaction, owner_id: str) -> Held:
+    """Return what the counters say that a project or a user holds."""
+    row = tx.execute(select(holding.c["items"], holding.c.stored_bytes).where(holding.c.owner_id == owner_id)).first()
+    return Held() if row is None else Held(row.items, row.stored_bytes)
+
+
+def recount(tx: Transaction) -> None:
+    """Set all counters to what is stored. Other writes of items wait until the end."""
+    if tx.is_postgres:
+        tx.execute(text("LOCK TABLE item IN SHARE ROW EXCLUSIVE MODE"))
+    tx.execute(update(item).where(item.c.stored_bytes != BYTES_OF_ITEM).values(stored_bytes=BYTES_OF_ITEM))
+    tx.execute(update(holding).values(items=0, stored_bytes=0))
+    for owner in (item.c.project_id, item.c.creator_id):
+        sums = select(owner.label("owner_id"), *_SUMS).where(item.c.deleted_us.is_(None), owner.is_not(None))
+        for row in tx.execute(sums.group_by(owner)).all():
+            _add(tx, row.owner_id, Held(row.items, int(row.stored_bytes)))

@@ -94,6 +94,15 @@ project = Table(
     _alive("project", "name"),
 )
 
+holding = Table(  # what a project or a user holds, and limits other than those of the settings
+    "holding",
+    metadata,
+    Column("owner_id", ID, primary_key=True),  # of a project, or of a user
+    Column("items", BigInteger, nullable=False, default=0, server_default=text("0")),
+    Column("stored_bytes", BigInteger, nullable=False, default=0, server_default=text("0")),
+    Column("limits", Document, nullable=False),  # by the name of the quota
+)
+
 member = Table(
     "member",
     metadata,
@@ -130,6 +139,8 @@ item = Table(
     Column("summary", Document, nullable=False),
     Column("frames", Integer, nullable=False, default=0),
     Column("skeleton_id", ID, index=True),
+    Column("creator_id", ID),  # the user for whom the item counts; null for the server
+    Column("stored_bytes", BigInteger, nullable=False, default=0, server_default=text("0")),  # of all its revisions
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
     Column("deleted_us", Micros),
@@ -177,6 +188,7 @@ document = Table(
     Column("schema", String(128), nullable=False),
     Column("body", Document, nullable=False),  # array leaves stand as {"dtype", "shape", "content"}
     Column("size_bytes", BigInteger, nullable=False),
+    Column("file_bytes", BigInteger, nullable=False, default=0, server_default=text("0")),  # of the files it names
     Column("created_us", Micros, nullable=False),
 )
 

@@ -29,12 +29,16 @@ _INSERT_EVENT = Prepared(sqlalchemy.insert(tables.event))
 
 @dataclass(frozen=True)
 class Quotas:
-    """Greatest numbers of uploads, tokens and projects of one user; `quotas.require_room` checks them."""
+    """Greatest numbers of things that one user, or one project, may have; functions of `store.quotas` check them."""
 
     user_uploads: int = 1000
     user_upload_bytes: int = 128 * 2**30
     user_tokens: int = 1000
     user_projects: int = 1000
+    user_items: int = 2_000_000
+    user_stored_bytes: int = 128 * 2**30
+    project_items: int = 1_000_000
+    project_stored_bytes: int = 64 * 2**30
 
 
 class Transaction:

@@ -71,7 +71,7 @@ def test_a_sound_store_has_no_findings(full: FullLab) -> None:
     seen = []
     assert list(fsck.check_store(full.database, progress=lambda what, count: seen.append((what, count)))) == []
     assert dict(seen)["items"] == 3
-    assert dict(seen).keys() == {"blobs", "documents", "items", "collections", "uploads"}
+    assert dict(seen).keys() == {"blobs", "documents", "items", "collections", "uploads", "projects", "users"}
 
 
 def motion_blob() -> ScalarSelect[Any]:

@@ -309,7 +309,7 @@ def test_a_publisher_whom_others_always_overtake_is_asked_to_try_again(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     publish(lab, rig_draft(), clip_draft())
-    monkeypatch.setattr(publishing, "write_head", lambda *_args: False)
+    monkeypatch.setattr(publishing, "write_head", lambda *_args, **_more: False)
     with pytest.raises(ConflictProblem, match="are changing the item 'walk'") as refused:
         publish(lab, rig_draft(), clip_draft(seed=1))
     assert refused.value.error_code == "contended"

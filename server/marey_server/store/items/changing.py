@@ -10,7 +10,7 @@ from marey_schemas.items import Item, ItemChange, ItemCreate
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import collections, documents, projects
+from marey_server.store import collections, documents, projects, quotas
 from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.drafts import Draft
@@ -25,6 +25,7 @@ from marey_server.store.items.revisions import (
     write_revisions,
 )
 from marey_server.store.projects import ProjectRow
+from marey_server.store.quotas import Held
 from marey_server.store.revs import ExpectedRev, change_row, is_expected, moved_on
 from marey_server.store.tables import item, item_tag
 from marey_server.store.transaction import Transaction
@@ -90,9 +91,12 @@ def put_part(
         if parts.get(part) == digest:
             return _shown(tx, project_row, kind, item_id)
         parts[part] = digest
-        if write_head(tx, kind, item_id, parts, {part: prepared.body}, item.c.rev == found.rev):
+        added = documents.stored_bytes_of(tx, [digest])[digest]
+        bodies, unchanged = {part: prepared.body}, item.c.rev == found.rev
+        if write_head(tx, kind, item_id, parts, bodies, unchanged, added_bytes=added):
             made = NewRevision(item_id, found.head + 1, parts, message)
             write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
+            quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
             shown = _shown(tx, project_row, kind, item_id)
             emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
             return shown
@@ -128,7 +132,8 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
     gone = _shown(tx, project_row, kind, item_id)
     absent = no_item(kind, item_id)
-    change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
+    row = change_row(tx, item, which, {"deleted_us": tx.now_us}, expected_rev=expected_rev, absent=absent)
+    quotas.release(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     emit_item(tx, "item.deleted", project_row, gone)
 
 
@@ -143,7 +148,8 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
     with taken(ConflictProblem(f"There is another {kind} {gone.name!r} in its place now.", code="name-taken")):
-        change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
+        row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
+    quotas.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)
     emit_item(tx, "item.restored", project_row, shown)
     return shown

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sqlalchemy import Row, and_, insert, select
@@ -13,7 +13,7 @@ from sqlalchemy import Row, and_, insert, select
 from marey_schemas.kinds import PARTS, Kind
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem
-from marey_server.store import collections, documents
+from marey_server.store import collections, documents, quotas
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.ids import new_id
 from marey_server.store.items import references
@@ -21,6 +21,7 @@ from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.revisions import NewRevision, read_part_digests, write_head, write_revisions
 from marey_server.store.items.summaries import summarise
 from marey_server.store.projects import ProjectRow
+from marey_server.store.quotas import Held
 from marey_server.store.tables import item, item_tag, lineage, revision_part
 from marey_server.store.transaction import Transaction
 
@@ -55,6 +56,7 @@ def publish(
     publication = _Publication(tx, project_row, author_id, job_id)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
+    quotas.hold(tx, project_row.id, publication.added)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts]
@@ -128,6 +130,8 @@ class _Ready:
     draft: Draft
     digests: Mapping[str, str]
     bodies: Mapping[str, Tree]
+    stored_bytes: Mapping[str, int]
+    """Bytes that each part counts for."""
 
     @property
     def required(self) -> tuple[str | None, ...]:
@@ -150,6 +154,7 @@ class _Head:
     id: str
     number: int
     parts: Mapping[str, str]
+    creator_id: str | None
 
 
 @dataclass
@@ -161,6 +166,8 @@ class _Publication:
     author_id: str | None
     job_id: str | None
     done: dict[str, Published] = field(default_factory=dict)
+    added: dict[str | None, Held] = field(default_factory=dict)
+    """New items and bytes, by the creator of the items."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -195,7 +202,7 @@ class _Publication:
         """Store the documents of drafts, with references to earlier drafts replaced by their revisions."""
         fresh: list[PreparedDocument] = []
         variants: list[tuple[str, Tree]] = []
-        ready = []
+        stored = []
         for one in group:
             digests: dict[str, str] = {}
             bodies: dict[str, Tree] = {}
@@ -212,10 +219,15 @@ class _Publication:
                     variants.append((content.digest, body))
                     digest = documents.digest_of_body(body)
                 digests[part], bodies[part] = digest, body
-            ready.append(_Ready(one.draft, digests, bodies))
-        documents.store_documents(self.tx, fresh)
+            stored.append((one.draft, digests, bodies))
+        sizes = documents.store_documents(self.tx, fresh)
         documents.store_variants(self.tx, variants)
-        return ready
+        known = {digest for _, digests, _ in stored for digest in digests.values() if digest not in sizes}
+        sizes |= documents.stored_bytes_of(self.tx, known)
+        return [
+            _Ready(draft, digests, bodies, {part: sizes[digest] for part, digest in digests.items()})
+            for draft, digests, bodies in stored
+        ]
 
     # -- finding -------------------------------------------------------------------------------------------------------
 
@@ -225,7 +237,7 @@ class _Publication:
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
         parts = read_part_digests(self.tx, {(row.id, row.head) for row in found.values()})
-        return {name: _Head(row.id, row.head, parts[row.id, row.head]) for name, row in found.items()}
+        return {name: _Head(row.id, row.head, parts[row.id, row.head], row.creator_id) for name, row in found.items()}
 
     def _find_places(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
         folders: defaultdict[str, dict[str, str]] = defaultdict(dict)
@@ -233,7 +245,7 @@ class _Publication:
             folders[self._collection_id(one.draft.collection)][one.draft.item_name] = one.draft.name_in_batch
         found = {}
         for collection_id, names in folders.items():
-            statement = select(item.c.id, item.c.head, item.c.name).where(
+            statement = select(item.c.id, item.c.head, item.c.creator_id, item.c.name).where(
                 item.c.collection_id == collection_id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
             )
             for row in self.tx.execute(statement.where(item.c.name.in_(list(names)))):
@@ -243,7 +255,7 @@ class _Publication:
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
         """For each draft, find the first item whose required parts are equal."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
-        statement = select(item.c.id, item.c.head).where(
+        statement = select(item.c.id, item.c.head, item.c.creator_id).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
         )
         named = []
@@ -255,7 +267,7 @@ class _Publication:
             named.append(held.c.document_digest.label(f"digest_{place}"))
         rows: dict[tuple[str | None, ...], Row[Any]] = {}
         for row in self.tx.execute(statement.add_columns(*named).order_by(item.c.id)):
-            rows.setdefault(tuple(row[2:]), row)
+            rows.setdefault(tuple(row[3:]), row)
         return {one.draft.name_in_batch: rows[one.required] for one in waiting if one.required in rows}
 
     @staticmethod
@@ -291,9 +303,9 @@ class _Publication:
         while named := {at: name for at in ids if at not in made and (name := next(names[at], None)) is not None}:
             given = [rows[at] | {"name": name, "name_folded": name.casefold()} for at, name in named.items()]
             made.update(self.tx.execute(insertion, given).scalars())
-        self._write(
-            "item.created", [(one, _Head(at, 1, one.digests)) for at, one in zip(ids, new, strict=True) if at in made]
-        )
+        created = [(one, at) for at, one in zip(ids, new, strict=True) if at in made]
+        self._write("item.created", [(one, _Head(at, 1, one.digests, self.author_id)) for one, at in created])
+        self._add(self.author_id, Held(len(created), sum(rows[at]["stored_bytes"] for _, at in created)))
         for one in new:
             if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
                 place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
@@ -308,7 +320,8 @@ class _Publication:
             "id": item_id, "project_id": self.project.id, "kind": one.draft.kind.value, "head": 1,
             "collection_id": self._collection_id(one.draft.collection), "created_us": self.tx.now_us,
             "updated_us": self.tx.now_us, "summary": summary.shown, "frames": summary.frames,
-            "skeleton_id": summary.skeleton_id,
+            "skeleton_id": summary.skeleton_id, "creator_id": self.author_id,
+            "stored_bytes": sum(one.stored_bytes.values()),
         }  # fmt: skip
 
     def _reuse(self, one: _Ready, head: _Head) -> None:
@@ -317,8 +330,14 @@ class _Publication:
             self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
             return
         parts = {**head.parts, **one.digests}
-        if write_head(self.tx, one.draft.kind, head.id, parts, one.bodies, item.c.head == head.number):
-            self._write("item.revised", [(one, _Head(head.id, head.number + 1, parts))])
+        added = sum(size for part, size in one.stored_bytes.items() if one.digests[part] != head.parts.get(part))
+        unchanged = item.c.head == head.number
+        if write_head(self.tx, one.draft.kind, head.id, parts, one.bodies, unchanged, added_bytes=added):
+            self._write("item.revised", [(one, replace(head, number=head.number + 1, parts=parts))])
+            self._add(head.creator_id, Held(stored_bytes=added))
+
+    def _add(self, creator_id: str | None, more: Held) -> None:
+        self.added[creator_id] = self.added.get(creator_id, Held()) + more
 
     def _write(self, event: str, made: Sequence[tuple[_Ready, _Head]]) -> None:
         """Insert the newest revisions of items, with their tags, sources and events."""

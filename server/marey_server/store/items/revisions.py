@@ -36,10 +36,11 @@ def write_head(
     parts: Mapping[str, str],
     bodies: Mapping[str, dict[str, Any]],
     *conditions: ColumnElement[bool],
+    added_bytes: int,
 ) -> bool:
     """Set the item's newest revision to the next one; return false if the item does not meet `conditions`.
 
-    `bodies` may omit parts that do not change.
+    `bodies` may omit parts that do not change. `added_bytes` is what the changed parts count for.
     """
     known = dict(bodies)
     for part, digest in parts.items():
@@ -52,6 +53,7 @@ def write_head(
         .values(
             head=item.c.head + 1, rev=item.c.rev + 1, updated_us=tx.now_us,
             summary=summary.shown, frames=summary.frames, skeleton_id=summary.skeleton_id,
+            stored_bytes=item.c.stored_bytes + added_bytes,
         )
     )  # fmt: skip
     return tx.execute(statement).rowcount == 1
