@@ -51,7 +51,7 @@ class FakeServer:
 
     A job in `lost` has lost its lease; requests about one in `silent` get the answer that the server is away, and are
     counted in `refused`. Results of a job in `slow` are not answered while it is there; those of one in `unwelcome` are
-    refused. `order` lists claims and ends of jobs.
+    refused, and one in `over_quota` cannot complete. `order` lists claims and ends of jobs.
     """
 
     def __init__(self) -> None:
@@ -69,6 +69,7 @@ class FakeServer:
         self.silent: set[str] = set()
         self.slow: set[str] = set()
         self.unwelcome: set[str] = set()
+        self.over_quota: set[str] = set()
         self.order: list[tuple[str, str]] = []
         self.refused: defaultdict[str, int] = defaultdict(int)
         self.leased: dict[str, FakeJob] = {}
@@ -206,9 +207,11 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
         def on_complete(self, job: str, body: bytes) -> None:
             server.completing.add(job)
             server.may_complete.wait(60)
+            if job in server.over_quota:
+                return self.problem(409, "quota-exceeded")
             server.completed[job] = json.loads(body)
             server.order.append(("ended", job))
-            self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
+            return self.reply(200, json.dumps({"job": job, "state": "succeeded"}).encode())
 
         def on_fail(self, job: str, body: bytes) -> None:
             server.failed[job] = json.loads(body)

@@ -21,7 +21,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from marey_client.errors import LeaseLost, MareyError, NotFound
+from marey_client.errors import Conflict, LeaseLost, MareyError, NotFound
 from marey_schemas.items import PartPlace
 from marey_schemas.job_kinds import find_kind
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
@@ -203,7 +203,7 @@ class RunningAttempt:
         try:
             if isinstance(end, Done):
                 end = self._when_staged(end)
-            self._report(end)
+            end = self._report(end)
         except LeaseLost as error:
             log.warning("%s: given up: %s", self._lease.job, error)
         except MareyError as error:
@@ -323,17 +323,26 @@ class RunningAttempt:
                 return Failed("exception", detail, signatures.STAGING, retryable=not reply.missing)
         return done
 
-    def _report(self, end: Done | Failed | Stop) -> None:
-        """Report the result to the server. Heartbeats continue, because the server may be unreachable for a while."""
+    def _report(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
+        """Report the end to the server and return it; a success becomes a failure if its results cannot be published.
+
+        Heartbeats continue, because the server may be unreachable for a while.
+        """
         if end is Stop.LEASE_LOST:
             log.warning("%s: %s", self._lease.job, self._watch.explain(end))
-            return
+            return end
         self._keeper.confirm(patiently=isinstance(end, Done))
         self._try_to_send_log()
         if isinstance(end, Done):
-            self._complete(end)
-        else:
+            try:
+                self._complete(end)
+            except LeaseLost:
+                raise
+            except Conflict as error:  # such as a quota that is exceeded; to compute the results again would not help
+                end = Failed(error.code, f"the results cannot be published: {error}", None, retryable=False)
+        if not isinstance(end, Done):
             self._api.fail(self._failure(end))
+        return end
 
     def _complete(self, done: Done) -> None:
         request = CompleteRequest(

@@ -66,6 +66,16 @@ def test_results_that_are_refused_while_the_next_job_runs_fail_their_own_job(
     assert first not in shared_server.completed
 
 
+def test_results_that_exceed_a_quota_fail_their_job_for_good(shared_server: FakeServer) -> None:
+    shared_server.over_quota.add("toomuch")
+    shared_server.submit("make", {"results": 2}, job="toomuch")
+    failed = shared_server.ended("toomuch")
+    assert (failed["code"], failed["retryable"]) == ("quota-exceeded", False)
+    assert failed["detail"].startswith("the results cannot be published: ")
+    next_job = shared_server.submit("add", {"a": 1, "b": 2})
+    assert shared_server.ended(next_job)["result"]
+
+
 def test_results_that_are_refused_before_others_are_made_end_the_job_at_once(shared_server: FakeServer) -> None:
     shared_server.unwelcome.add("manymade")
     shared_server.submit("make", {"results": 10_000}, job="manymade")
