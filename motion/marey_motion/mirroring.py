@@ -74,7 +74,7 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
 
 def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Motion:
-    """Reflect a motion in x, as `mirror_clip` in double precision.
+    """Reflect a motion in x, like `mirror_clip`, but in double precision.
 
     Parameters
     ----------

@@ -54,8 +54,8 @@ class ModelPlan(Request):
             raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
             raise ValueError(
-                "annotations: annotations can be given only for existing clips, not for files to "
-                "import, and not if annotations are proposed"
+                "annotations: give annotations only for existing clips, neither together with files to "
+                "import nor together with `annotate`, which proposes them"
             )
         if self.cut is not None and not self.annotations and self.annotate is None:
             raise ValueError("cut: cutting needs annotations; give some, or let them be proposed")

@@ -36,9 +36,9 @@ def field_errors(
 
 
 def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
-    """Return the part of a location that exists in the tree, plus the name of a missing field.
+    """Return the steps of an error's location that exist in the document, and the name of a missing field.
 
-    The other parts are names of union members that pydantic tried.
+    The steps that are left out are names of union members, which pydantic inserts.
     """
     steps = []
     for index, step in enumerate(location):

@@ -134,7 +134,7 @@ def preview_edit(
     file: From = None,
     saved: With = None,
     frames: Annotated[str, typer.Option(help="Frames of the result to show, such as 100:200.")] = ":",
-    piece: Annotated[int, typer.Option(min=1, help="Number of the result to show if the clip is split, from 1.")] = 1,
+    piece: Annotated[int, typer.Option(min=1, help="If the clip is split: the result to show, counted from 1.")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Show the result of commands on a clip without storing it. With --json, its motion too."""

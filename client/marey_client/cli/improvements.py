@@ -102,8 +102,8 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="Write the paths of the clips that can be removed without any effect on the trials to this "
-            "file, one per line."
+            help="File to which the paths of clips are written, one per line, that can be removed without any effect "
+            "on the trials."
         ),
     ] = None,
     wait: Wait = True,

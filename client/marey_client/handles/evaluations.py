@@ -55,9 +55,9 @@ class EvaluationHandle(ReportedHandle):
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
         """Return the frames that the trials displayed, the jumps between them, and the order of each walk.
 
-        `nodes` are frames of clips with the number of ticks for which they were displayed; `edges` are jumps with their
-        number, by index of the nodes; `walks` are runs of frames, one list for each of `trials`. Without `trial`, the
-        graph is that of all trials together.
+        `nodes` are frames of clips, with the number of ticks for which they were displayed. Each of `edges` has the
+        indices of two nodes, and the number of jumps from the first to the second. `walks` has a list of runs of frames
+        for each of `trials`. Without `trial`, the graph is that of all trials together.
         """
         return dict(json.loads(self._walk_graph("json", trial)))
 

@@ -57,8 +57,8 @@ class SourceExample:
     uid : str    stable name of the example
     name : str    name shown to people; of equally good references, the first by name, then uid, is chosen
     clip : Clip    the motion
-    cuts : tuple of Cut    frames of the clip that all examples have under the same labels, in the order of time
-        (`segments.cuts_of`)
+    cuts : tuple of Cut    labelled frames of this clip, in the order of time (`segments.cuts_of`); all
+        examples have cuts with the same labels
     """
 
     uid: str

@@ -123,7 +123,7 @@ def parse_number(text, start):  # type: ignore[no-untyped-def]
 
 @compiled
 def _scan(text, width, values, long_tokens, state):  # type: ignore[no-untyped-def]
-    """Read numbers; return 1 at a malformed token, 0 if the text ends or `values` or `long_tokens` is full."""
+    """Read numbers until the text ends or an array is full, and return 0; return 1 at a malformed number."""
     i, end = np.uint64(state[_POSITION]), np.uint64(text.size)
     line, count, in_line, rows = state[_LINE], state[_VALUES], state[_IN_LINE], state[_ROWS]
     long_count = 0

@@ -122,7 +122,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
     MotionError    when they match different joints or horizons, or with different weights
     """
     if not databases:
-        raise MotionError("a normaliser is fitted to databases, but none were given", code="no-features")
+        raise MotionError("no databases were given to fit the normaliser to", code="no-features")
     ordered = sorted(databases, key=database_digest)
     layout = ordered[0].layout
     for other in ordered[1:]:

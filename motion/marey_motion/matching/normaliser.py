@@ -170,7 +170,7 @@ def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> N
     MotionError    without rows
     """
     if not len(features):
-        raise MotionError("a normaliser is fitted to features, but none were given", code="no-features")
+        raise MotionError("no features were given to fit the normaliser to", code="no-features")
     offset = features.mean(axis=0)
     deviations = np.array([features[:, d].std() for d in range(layout.dimension_count)])
     scale = np.empty(layout.dimension_count)

@@ -48,7 +48,7 @@ def _from_box(builder: ir.IRBuilder, sides: Values, query: ir.Value) -> ir.Value
 
 
 def _summed(gap: Gap, operands: int) -> Any:
-    """Make an intrinsic that sums weight · gap² over dimensions, for arrays with `operands` vectors for each."""
+    """Make an intrinsic that sums weight · gap² over dimensions; its arrays have `operands` vectors per dimension."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Values) -> ir.Value:
         blocks, query, weights, sums = (

@@ -81,7 +81,7 @@ def _write_bson(plain: Any) -> bytes:
     try:
         return bson.encode(plain)
     except (bson.errors.BSONError, OverflowError) as error:
-        raise CodecError("too-large", "", f"a BSON document is smaller than 2 GiB: {error}") from error
+        raise CodecError("too-large", "", f"BSON is limited to 2 GiB; use JSON: {error}") from error
 
 
 def decode_tree(

@@ -159,7 +159,7 @@ class Exchange(RequestHandler):
             self.set_header(name, value)
 
     def compute_etag(self) -> None:
-        """Return no tag: the tags of this API name states, and hashing an answer costs more than sending it."""
+        """Return no tag: resources set their own ETags; hashing an answer, as Tornado does, costs more than sending."""
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Answer any error with a problem document; details of internal errors are only logged."""

@@ -107,7 +107,7 @@ class ChildTask(Generic[T]):
             self.future.set_result(result)
 
     def count_end(self, reason: str) -> None:
-        """Count that a child ended while it ran this task."""
+        """Count one more child that ended while it ran this task."""
         self.count_stop(reason, self.function.partition(":")[2])
 
     def fail(self, error: Exception) -> None:

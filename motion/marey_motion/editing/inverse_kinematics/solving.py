@@ -300,7 +300,7 @@ def solve_two_bone(
     if limb_targets(targets, limb) is None:
         raise EditError(
             "in the two-bone solver, all targets must be for the end of the limb, and the position target "
-            "must have all axes",
+            "must constrain all three axes",
             where="targets",
         )
     path = skeleton.path_to_root(limb.end)

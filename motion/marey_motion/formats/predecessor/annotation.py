@@ -41,8 +41,8 @@ def read_predecessor_annotation(
     frame_count : int    frames of the clip
     end_index : str    "inclusive" if sections include their frame `end_idx`, as in the predecessor's editor;
         "exclusive" if they end before it, as in the predecessor's time warping
-    labels : sequence of str, optional    read only these, for example if labels of a document overlap and must become
-        several layers. Sections of a list have no label and are named "section 1" and so on.
+    labels : sequence of str, optional    read only these, for example if sections of different labels overlap, so
+        that each label needs a layer of its own. Sections without labels are called "section 1" and so on.
 
     Returns
     -------

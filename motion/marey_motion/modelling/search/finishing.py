@@ -33,7 +33,8 @@ class Finished:
 
     Parameters
     ----------
-    errors : remaining errors, metres or radians, by step and place of the constraint, of those that a solver can meet
+    errors : remaining error, in metres or radians, of each constraint that a solver can meet; the keys are the index of
+        the step and the index of the constraint in the step
     """
 
     found: FoundMotion

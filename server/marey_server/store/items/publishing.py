@@ -272,7 +272,7 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first draft of each content; drafts with the same content then find the item that it creates."""
+        """Return the first of the drafts with equal content; the others reuse the item that it creates."""
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)
