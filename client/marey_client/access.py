@@ -12,6 +12,8 @@ from marey_schemas.access import (
     Member,
     MemberChange,
     NewToken,
+    QuotaChange,
+    QuotasInUse,
     Role,
     Token,
     TokenCreate,
@@ -22,6 +24,11 @@ from marey_schemas.access import (
 
 ANY_STATE = {"If-Match": "*"}
 """Header of a change that replaces any state."""
+
+
+def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
+    """Change the quotas of a project or a user."""
+    return read_model(QuotasInUse, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
 @dataclass(frozen=True)
@@ -55,6 +62,14 @@ class Users:
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
         """End the sessions of a user, or all tokens; the token of this client stays valid."""
         return self.change(name, UserChange(end_tokens=which))
+
+    def quotas(self, name: str) -> QuotasInUse:
+        """Return the number of items and bytes that count for a user, and the limits."""
+        return self.transport.get(QuotasInUse, f"/users/{name}/quotas")
+
+    def change_quotas(self, name: str, change: QuotaChange) -> QuotasInUse:
+        """Change the limits of a user; None means the limit in the server's settings. For administrators."""
+        return change_quotas(self.transport, f"/users/{name}/quotas", change)
 
     def enable(self, name: str) -> User:
         """Enable a disabled user again, with the same password and tokens."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
-from marey_client.access import Members
+from marey_client.access import Members, change_quotas
 from marey_client.handles.coverage_streams import CoverageStreams
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
@@ -29,7 +29,7 @@ from marey_client.requests import (
     retarget_request,
 )
 from marey_client.transport import Params, as_json, read_model
-from marey_schemas.access import Project, ProjectChange
+from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
 from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EvaluateParams, ModelParams, RetargetParams
 from marey_schemas.jobs import CacheMode, Job, JobCreate
 from marey_schemas.model_pipelines import model_pipeline
@@ -56,6 +56,14 @@ class ProjectHandle(ProjectItems):
         return read_model(
             Project, self.transport.send("PATCH", self.url, content=as_json(change), headers={"If-Match": "*"})
         )
+
+    def quotas(self) -> QuotasInUse:
+        """Return the number of items and bytes in the project, and the limits."""
+        return self.transport.get(QuotasInUse, f"{self.url}/quotas")
+
+    def change_quotas(self, change: QuotaChange) -> QuotasInUse:
+        """Change the limits of the project; None means the limit in the server's settings. For administrators."""
+        return change_quotas(self.transport, f"{self.url}/quotas", change)
 
     def delete(self) -> None:
         """Delete the project; `restore` restores it."""

@@ -177,6 +177,32 @@ class Project(Answer):
     rev: int
 
 
+class QuotaChange(Request):
+    """Change of the limits of one project or one user.
+
+    An absent limit stays as it is; null means the limit in the server's settings.
+    """
+
+    items: int | None = Field(None, ge=0, le=2**53, description="Largest number of items.")
+    stored_bytes: int | None = Field(
+        None, ge=0, le=2**53, description="Largest number of bytes that all revisions of the items take together."
+    )
+
+
+class QuotaUse(Answer):
+    """Use and limit of one quota."""
+
+    used: int
+    allowed: int
+
+
+class QuotasInUse(Answer):
+    """Use and limits of the quotas of a project or a user. Deleted items do not count."""
+
+    items: QuotaUse
+    stored_bytes: QuotaUse
+
+
 class MemberChange(Request):
     """Request to give a user a role in a project."""
 

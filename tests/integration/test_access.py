@@ -107,6 +107,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "GET /users": "administrator",
         "POST /users": "administrator",
         "DELETE /users/{user}": "administrator",
+        "PATCH /users/{user}/quotas": "administrator",
+        "PATCH /projects/{project}/quotas": "administrator",
         "PATCH /projects/{project}": "owner",
         "DELETE /projects/{project}": "owner",
         "POST /projects/{project}/restore": "owner",

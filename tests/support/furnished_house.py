@@ -41,6 +41,7 @@ BODIES = {
     "UserChange": {"display_name": "D"},
     "ProjectCreate": {"name": "lab"},  # the name is taken: 409 means that the caller was admitted
     "ProjectChange": {"title": "T"},
+    "QuotaChange": {"items": 10**6},
     "MemberChange": {"role": "reader"},
     "CollectionCreate": {"path": CANARY},
     "CollectionChange": {"path": "elsewhere"},

@@ -13,6 +13,7 @@ import typer
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, UserName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.quotas import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -326,6 +327,24 @@ def change_user(
     if as_json:
         return print_json(changed)
     return print_message(f"user {changed.name} is changed")
+
+
+@user.command("quota")
+def user_quota(
+    context: typer.Context,
+    name: UserName,
+    items: ItemLimit = None,
+    stored_bytes: ByteLimit = None,
+    defaults: DefaultLimits = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show how many items and bytes count for a user, and the limits, which administrators can change."""
+    change = quota_change(items, stored_bytes, defaults)
+    with connect(context) as marey:
+        found = marey.users.quotas(name) if change is None else marey.users.change_quotas(name, change)
+    if as_json:
+        return print_json(found)
+    return print_quotas(found)
 
 
 def _ask_name() -> str:

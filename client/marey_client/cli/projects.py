@@ -9,6 +9,7 @@ import typer
 from marey_client.cli.failures import ANONYMOUS_HINT
 from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.quotas import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
 member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
@@ -85,6 +86,24 @@ def change_project(
     if as_json:
         return print_json(changed)
     return print_message(f"project {changed.name} is changed")
+
+
+@project.command("quota")
+def project_quota(
+    context: typer.Context,
+    name: ProjectName,
+    items: ItemLimit = None,
+    stored_bytes: ByteLimit = None,
+    defaults: DefaultLimits = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show how many items and bytes a project has, and the limits, which administrators can change."""
+    change = quota_change(items, stored_bytes, defaults)
+    with connect(context) as marey:
+        found = marey.project(name).quotas() if change is None else marey.project(name).change_quotas(change)
+    if as_json:
+        return print_json(found)
+    return print_quotas(found)
 
 
 @project.command("delete")

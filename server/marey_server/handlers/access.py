@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from marey_schemas.access import Login, Me, NewToken, Token, TokenCreate, User, UserChange, UserCreate
+from marey_schemas.access import (
+    Login,
+    Me,
+    NewToken,
+    QuotaChange,
+    QuotasInUse,
+    Token,
+    TokenCreate,
+    User,
+    UserChange,
+    UserCreate,
+)
 from marey_schemas.base import Request
 from marey_schemas.names import UserName
 from marey_schemas.sizes import KIB
@@ -258,6 +269,23 @@ class UserResource(PasswordResource):
         return await self.answer(users.delete_user, user, expected_rev=self.precondition.expected_rev)
 
 
+class UserQuotas(Resource):
+    """Quotas of a user."""
+
+    path = "/users/{user}/quotas"
+    tag = "Access"
+
+    @reads(access=Access.USER, answer=QuotasInUse)
+    async def get(self, user: str) -> Rendered:
+        """Return the number of items and bytes that count for a user, and the limits; also to this user."""
+        return await self.answer(users.read_quotas, user)
+
+    @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)
+    async def patch(self, user: str, body: QuotaChange) -> Rendered:
+        """Change the limits of a user."""
+        return await self.answer(users.change_quotas, user, body)
+
+
 RESOURCES: tuple[type[Resource], ...] = (
     MeResource,
     LoginResource,
@@ -266,4 +294,5 @@ RESOURCES: tuple[type[Resource], ...] = (
     TokenResource,
     AllUsers,
     UserResource,
+    UserQuotas,
 )

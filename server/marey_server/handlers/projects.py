@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from marey_schemas.access import Member, MemberChange, Project, ProjectChange, ProjectCreate
+from marey_schemas.access import Member, MemberChange, Project, ProjectChange, ProjectCreate, QuotaChange, QuotasInUse
 from marey_server.http.declarations import Access, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
@@ -76,6 +76,23 @@ class ProjectRestoration(Resource):
         return await self.answer(projects.restore_project, project)
 
 
+class ProjectQuotas(Resource):
+    """Quotas of a project."""
+
+    path = "/projects/{project}/quotas"
+    tag = "Projects"
+
+    @reads(access=Access.READER, answer=QuotasInUse, public=False)
+    async def get(self, project: str) -> Rendered:
+        """Return the number of items and bytes in a project, and the limits."""
+        return await self.answer(projects.read_quotas, project)
+
+    @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)
+    async def patch(self, project: str, body: QuotaChange) -> Rendered:
+        """Change the limits of a project."""
+        return await self.answer(projects.change_quotas, project, body)
+
+
 class ProjectMembers(Resource):
     """Members of a project."""
 
@@ -118,6 +135,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     Projects,
     ProjectResource,
     ProjectRestoration,
+    ProjectQuotas,
     ProjectMembers,
     MemberResource,
 )

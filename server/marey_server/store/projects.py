@@ -21,17 +21,17 @@ from sqlalchemy import (
     true,
 )
 
-from marey_schemas.access import Project, ProjectChange, ProjectCreate, Role, Visibility
+from marey_schemas.access import Project, ProjectChange, ProjectCreate, QuotaChange, QuotasInUse, Role, Visibility
 from marey_schemas.items import Page
 from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
+from marey_server.access.roles import require_administrator
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
-from marey_server.store import listing
+from marey_server.store import listing, quotas
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
-from marey_server.store.quotas import require_room
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
@@ -194,6 +194,11 @@ def list_projects(
     return Page(items=tuple(one.shown() for one in seen if one is not None), next_cursor=next_cursor)
 
 
+def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
+    """Return the number of items and bytes in a project, and the limits."""
+    return quotas.show_quotas(tx, "project", require(tx, name).id)
+
+
 # -- changing ---------------------------------------------------------------------------------------------------------
 
 
@@ -204,7 +209,7 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
         raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
         raise ForbiddenProblem("The token does not allow creating projects.", code="insufficient-scope")
-    require_room(tx, "user_projects")
+    quotas.require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,
         tx.now_us, tx.now_us, None, 1, Role.OWNER, False,
@@ -255,6 +260,15 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
     tx.emit("project.restored", seen.id, project_id=seen.id, name=name)
     return restored
+
+
+def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
+    """Change the limits of a project; for administrators."""
+    require_administrator(tx.principal)
+    found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
+    if found is None:
+        raise NotFoundProblem(f"There is no project {name!r}.", code="no-project")
+    return quotas.change_limits(tx, "project", found, change)
 
 
 def _change(

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Column, Row, Select, bindparam, exists, func, or_, select, text, update
 
-from marey_schemas.access import Role
+from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import (
@@ -36,7 +36,7 @@ class _Rule:
     remedy: str
 
 
-_DELETE = "Delete items that nobody needs, or ask an administrator to raise the setting `{quota}`."
+_DELETE = "Delete items that nobody needs, or ask an administrator for a higher limit (`marey {of} quota`)."
 
 _RULES = {
     "user_uploads": _Rule("open uploads", "Finish or delete one of them, such as {oldest}."),
@@ -148,7 +148,7 @@ def _hold(tx: Transaction, of: str, owner_id: str, more: Held) -> None:
         if added and used > limit:
             subject = "The project has" if of == "project" else "The user who created the items has"
             rule = _RULES[name]
-            remedy = rule.remedy.format(quota=f"{of}_{name}")
+            remedy = rule.remedy.format(of=of)
             raise _exceeded(subject, f"{of}_{name}", rule.noun, used - added, limit, added, remedy)
 
 
@@ -172,6 +172,27 @@ def _add(tx: Transaction, owner_id: str, more: Held) -> Any:
         tx.execute(tx.insert_or_ignore(holding, {"owner_id": owner_id, "limits": {}}))
         row = tx.first(_ADD, given)
     return row
+
+
+def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) -> QuotasInUse:
+    """Return the use and the limits of the quotas of a project or a user."""
+    row = tx.execute(select(holding).where(holding.c.owner_id == owner_id)).first()
+    limits = {} if row is None else row.limits
+    return QuotasInUse(
+        **{
+            name: QuotaUse(used=0 if row is None else getattr(row, name), allowed=limit_of(tx, of, name, limits))
+            for name in COUNTED
+        }
+    )
+
+
+def change_limits(tx: Transaction, of: Literal["project", "user"], owner_id: str, change: QuotaChange) -> QuotasInUse:
+    """Change the limits of a project or a user. The caller must have checked that the principal is an administrator."""
+    changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True)
+    limits = {name: limit for name, limit in changed.items() if limit is not None}
+    tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
+    tx.emit(f"{of}.limited", owner_id, project_id=owner_id if of == "project" else None, limits=limits)
+    return show_quotas(tx, of, owner_id)
 
 
 # -- checks -----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, func, insert, select
 
-from marey_schemas.access import EndTokens, Scope, User, UserChange, UserCreate
+from marey_schemas.access import EndTokens, QuotaChange, QuotasInUse, Scope, User, UserChange, UserCreate
 from marey_schemas.items import Page
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -18,7 +18,7 @@ from marey_server.errors import (
     PreconditionFailedProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing, tokens
+from marey_server.store import listing, quotas, tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
@@ -60,6 +60,19 @@ def find_user(tx: Transaction, name: str) -> User:
     if row is None:
         raise _no_user(name)
     return _shown(row)
+
+
+def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
+    """Return the number of items and bytes that count for a user, and the limits, to the user or an administrator."""
+    if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
+        raise ForbiddenProblem("The token does not allow reading in all projects.", code="insufficient-scope")
+    return quotas.show_quotas(tx, "user", find_user(tx, name).id)
+
+
+def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
+    """Change the limits of a user; for administrators."""
+    require_administrator(tx.principal)
+    return quotas.change_limits(tx, "user", find_user(tx, name).id, change)
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:

@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 from tests.support.server_process import ServerProcess
+from tests.support.store_fixtures import skeleton_tree
 
 from marey_client.cli import main
+from marey_client.errors import Conflict
 from marey_client.imports import find_files
 from marey_client.marey import Marey
 from marey_client.project import ProjectHandle
@@ -199,6 +201,27 @@ def test_a_disabled_user_is_let_in_again_and_an_administrator_made(
     run("user", "change", "ada", "--no-administrator")
     assert not marey.users.get("ada").administrator
     assert "give --display-name, --administrator or both" in run("user", "change", "ada", status=2).stderr
+
+
+def test_quotas_are_shown_and_changed(run: Command, marey: Marey, lab: ProjectHandle) -> None:
+    used = lab.quotas().items.used
+    assert used > 3
+    shown = json.loads(run("project", "quota", "lab", "--items", "3", "--json").stdout)
+    assert shown["items"] == {"used": used, "allowed": 3}
+    shown = json.loads(run("project", "quota", "lab", "--stored-bytes", "50", "--json").stdout)
+    assert (shown["items"]["allowed"], shown["stored_bytes"]["allowed"]) == (3, 50)
+    run("tag", "lab/raw/a", "--add", "slow")  # a tag needs no room
+    with pytest.raises(Conflict, match=r"the limit is 3, and this needs 1 more.*marey project quota"):
+        lab.skeletons.create("more", {"hierarchy": skeleton_tree()})
+    lines = run("project", "quota", "lab", "--defaults", "--items", "1000").stdout.splitlines()
+    assert [line.split() for line in lines if "items" in line] == [["items", f"{used:,}", "1,000"]]
+    assert lab.quotas().stored_bytes.allowed > 50
+    run("user", "create", "ada", "--without-password")
+    assert json.loads(run("user", "quota", "ada", "--items", "7", "--json").stdout)["items"] == {
+        "used": 0,
+        "allowed": 7,
+    }
+    assert marey.users.quotas("ada").items.allowed == 7
 
 
 def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
