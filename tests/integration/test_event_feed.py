@@ -193,6 +193,31 @@ def test_followers_and_waiting_workers_read_nothing_while_nothing_happens(server
         assert numbers == sorted(set(numbers))
 
 
+def test_followers_of_one_user_are_limited(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, user_followers=2) as server:
+        token, other = server.make_project(), server.make_user("oda", administrator=True)
+        followers = Followers(server, token, 2)
+        followers.until(lambda received: len(received) >= 1)
+        following = {"Accept": "text/event-stream"}
+        refused = server.client(token).get("/projects/lab/events", headers=following)
+        assert (refused.status_code, refused.json()["code"]) == (429, "too-many-followers")
+        assert "2 connections" in refused.json()["detail"]
+        assert server.client(token).get("/projects/lab/events").status_code == 200
+        more = Followers(server, other, 2)
+        more.until(lambda received: len(received) >= 1)
+
+
+def test_a_follower_that_disconnects_no_longer_counts(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, user_followers=1) as server:
+        client, following = server.client(server.make_project()), {"Accept": "text/event-stream"}
+        for _ in range(3):
+            with client.stream("GET", "/projects/lab/events", headers=following) as stream:
+                assert stream.status_code == 200
+            waiting = threading.Event()
+            while server.app.services.followers:
+                waiting.wait(0.005)
+
+
 def test_changes_of_another_process_wake_who_waits(server: Server, database: Database) -> None:
     """Another connection stands for the other process: it wakes nobody of this one by itself."""
     token = server.make_project()

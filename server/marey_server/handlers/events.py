@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
-from marey_server.errors import BadRequestProblem
+from marey_server.errors import BadRequestProblem, TooManyRequestsProblem
 from marey_server.http.declarations import Access, reads
 from marey_server.http.negotiation import EVENT_STREAM
 from marey_server.http.reply import Reply
@@ -31,6 +34,7 @@ class Events(Resource):
 
     path = "/projects/{project}/events"
     tag = "Events"
+    _listener: Listener | None = None
 
     @reads(
         access=Access.READER,
@@ -54,12 +58,38 @@ class Events(Resource):
             return Reply(Page(items=tuple(found)))
         project_id = (await self.look_up(projects.require, project)).id
         await self.look_up(events.require_kept, after)
-        self.set_header("Content-Type", "text/event-stream")
-        self.set_header("Cache-Control", "no-store")
-        if self.request.method != "HEAD":
-            with wakeups.listen([events_topic(project_id)]) as listener:
+        with self._counted(), wakeups.listen([events_topic(project_id)]) as listener:
+            self.set_header("Content-Type", "text/event-stream")
+            self.set_header("Cache-Control", "no-store")
+            if self.request.method != "HEAD":
+                self._listener = listener
                 await self._follow(project, after, listener)
         return None
+
+    def on_connection_close(self) -> None:
+        """Stop following, because the client has closed the connection."""
+        super().on_connection_close()
+        if self._listener is not None:
+            self._listener.wake()
+
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        """Count this connection for its user. Raises `TooManyRequestsProblem` above the limit `user_followers`."""
+        user, counts = str(self.principal and self.principal.user_id), self.services.followers
+        limit = self.services.settings.user_followers
+        if counts[user] >= limit:
+            raise TooManyRequestsProblem(
+                f"You follow events over {counts[user]:,} connections; the limit is {limit:,}. Close some of them.",
+                code="too-many-followers",
+                context={"quota": "user_followers", "used": counts[user], "limit": limit},
+            )
+        counts[user] += 1
+        try:
+            yield
+        finally:
+            counts[user] -= 1
+            if not counts[user]:
+                del counts[user]
 
     def _last_received(self, query: EventsQuery) -> int:
         text = self.request.headers.get("Last-Event-ID")

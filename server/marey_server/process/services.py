@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -73,6 +74,8 @@ class Services:
         """Documents of models as bytes for children, with their search trees and mappings where these are used."""
         self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)
         """Times at which callers were admitted, by what the admission depends on."""
+        self.followers: Counter[str] = Counter()
+        """Number of open connections that follow events, by the id of the user."""
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.password_lane = PasswordLane("known")

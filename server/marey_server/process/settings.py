@@ -166,6 +166,16 @@ class Settings(BaseSettings):
     user_projects: int = Field(
         Quotas.user_projects, ge=0, description="Number of owned projects from which on a user creates no more."
     )
+    user_jobs: int = Field(
+        Quotas.user_jobs,
+        ge=0,
+        description="Greatest number of unfinished jobs of a user, including their tasks.",
+    )
+    user_followers: int = Field(
+        256,
+        ge=0,
+        description="Greatest number of open connections over which a user follows events.",
+    )
     user_items: int = Field(Quotas.user_items, ge=0, description="Greatest number of items that a user created.")
     user_stored_bytes: int = Field(
         Quotas.user_stored_bytes, ge=0, description="Greatest number of bytes that the revisions of these items take."

@@ -16,9 +16,11 @@ from marey_schemas.access import QuotaChange, QuotasInUse, QuotaUse, Role
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import (
+    UNFINISHED,
     document,
     holding,
     item,
+    job,
     member,
     project,
     revision_part,
@@ -43,6 +45,7 @@ _RULES = {
     "user_upload_bytes": _Rule("bytes announced by open uploads", "Finish or delete one of them, such as {oldest}."),
     "user_tokens": _Rule("valid tokens", "Revoke one that you do not need; see `marey token ls`."),
     "user_projects": _Rule("projects that you own", "Delete one, or let another owner take over."),
+    "user_jobs": _Rule("unfinished jobs", "Wait until some have ended, or cancel some; see `marey job ls`."),
     "items": _Rule("items", _DELETE),
     "stored_bytes": _Rule("bytes of items", _DELETE),
 }
@@ -83,6 +86,8 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
         return select(func.count()).select_from(token).where(token.c.user_id == user_id, ~token.c.session, valid)
+    if quota == "user_jobs":
+        return select(func.count()).select_from(job).where(job.c.author_id == user_id, UNFINISHED)
     owned = select(func.count()).select_from(member.join(project, project.c.id == member.c.project_id))
     return owned.where(member.c.user_id == user_id, member.c.role == Role.OWNER.value, project.c.deleted_us.is_(None))
 

@@ -256,6 +256,9 @@ lineage = Table(
     Index("ix_lineage_input", "input_item_id", "input_number"),
 )
 
+UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
+"""Condition of `ix_job_unfinished`, in the words that let SQLite use this index."""
+
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
 """Index that refuses a second running job of a concurrency key; a concurrent claim that violates it picks again."""
 
@@ -350,6 +353,7 @@ job = Table(
         sqlite_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
         postgresql_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
     ),
+    Index("ix_job_unfinished", "author_id", sqlite_where=UNFINISHED, postgresql_where=UNFINISHED),
     Index("ix_job_cache", "project_id", "cache_key"),
     Index(
         "ix_job_retry",

@@ -35,6 +35,7 @@ class Quotas:
     user_upload_bytes: int = 128 * 2**30
     user_tokens: int = 1000
     user_projects: int = 1000
+    user_jobs: int = 200_000
     user_items: int = 2_000_000
     user_stored_bytes: int = 128 * 2**30
     project_items: int = 1_000_000

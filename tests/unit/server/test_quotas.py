@@ -7,13 +7,16 @@ from dataclasses import fields, replace
 from typing import Any
 
 import pytest
+from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.access import ProjectCreate, TokenCreate
+from marey_schemas.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
 from marey_server.process.settings import Settings
 from marey_server.store import projects, tokens, uploads
 from marey_server.store.blobs import digest_of
+from marey_server.store.jobs import reading
 from marey_server.store.transaction import Quotas, Transaction
 
 LIMIT = 3
@@ -74,6 +77,24 @@ def test_what_ends_makes_room_and_nothing_is_lost(lab: Lab) -> None:
                 lab.write(uploads.finish, ended, digest_of(data), None)
             else:
                 lab.write(uploads.abandon, ended)
+
+
+def test_unfinished_jobs_and_their_tasks_count_until_they_end(desk: Desk) -> None:
+    desk.database.quotas = Quotas(user_jobs=LIMIT)
+    things = tuple(ItemInput(item=one) for one in desk.things(4))
+    first = desk.submit("square", inputs={"things": things})
+    with pytest.raises(
+        QuotaExceededProblem, match="3 unfinished jobs, the limit is 3, and this needs 1 more"
+    ) as refused:
+        desk.submit()
+    assert refused.value.context == {"quota": "user_jobs", "used": 3, "limit": LIMIT}
+    assert [job.id for job in desk.database.read(desk.user, reading.list_jobs, desk.project).items] == [first]
+    desk.cancel(first)
+    desk.submit_many(*[JobCreate(kind="errand")] * LIMIT)
+    desk.complete(desk.claim())
+    later = desk.submit()
+    desk.cancel(later)
+    desk.submit()
 
 
 def test_every_quota_is_a_setting_with_the_same_default() -> None:

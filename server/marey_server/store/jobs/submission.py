@@ -30,6 +30,7 @@ from marey_server.store.jobs.layout import NewJob, Submission, lay_out, new_row
 from marey_server.store.jobs.propagation import propagate_ends
 from marey_server.store.jobs.result_places import find_clash
 from marey_server.store.projects import ProjectRow, require
+from marey_server.store.quotas import require_room
 from marey_server.store.tables import job, job_dependency
 from marey_server.store.transaction import IN_LIST, Transaction
 
@@ -86,6 +87,7 @@ def submit_checked(
     heads = [_head(project, one, upstream) for one in submissions]
     tasks, sources = lay_out(tx, [one for one in heads if not one.unbound])
     everything = [*heads, *tasks]
+    require_room(tx, "user_jobs", sum(not JobState(one.state).terminal for one in everything))
     rows = {one.id: new_row(tx, one) for one in everything}
     tx.run_each(_INSERT_JOB, list(rows.values()))
     _insert_dependencies(tx, submissions, upstream)

@@ -1,0 +1,21 @@
+"""Index of the unfinished jobs of each user, which counts them for the quota `user_jobs`."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0011"
+down_revision = "0010"
+branch_labels = None
+depends_on = None
+
+UNFINISHED = sa.text("state IN ('waiting', 'queued', 'running')")
+
+
+def upgrade() -> None:
+    """Add the index."""
+    op.create_index("ix_job_unfinished", "job", ["author_id"], sqlite_where=UNFINISHED, postgresql_where=UNFINISHED)
+
+
+def downgrade() -> None:
+    """Remove the index."""
+    op.drop_index("ix_job_unfinished", "job")
