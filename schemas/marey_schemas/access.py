@@ -112,6 +112,12 @@ class TokenCreate(Request):
         description="Time until the token ends; null if it never does. A token cannot outlive the one that creates it; "
         "by default it ends after 90 days, or with that one if that is sooner.",
     )
+    labels: dict[str, str] | None = Field(
+        None,
+        description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
+        "`work`. Jobs that require other labels cannot be claimed with it. Null: the labels of the token that creates "
+        "it, if it is bound to labels, else any.",
+    )
 
 
 class Token(Answer):
@@ -128,6 +134,9 @@ class Token(Answer):
     session: bool = Field(False, description="Whether a sign-in created the token.")
     created_by: str | None = Field(
         None, description="The id of the token whose bearer created this one; null for sign-ins and for the server."
+    )
+    labels: dict[str, str] | None = Field(
+        None, description="The labels that a worker with this token may announce; null: any."
     )
 
 

@@ -283,7 +283,7 @@ def make_worker_token(database: Database, settings: Settings) -> str:
 def _replace_worker_token(tx: Transaction, name: str) -> str:
     tx.principal = users.administrator_principal(tx)
     tokens.revoke_named(tx, name)
-    wanted = TokenCreate(name=name, scopes=("work",), expires_in_s=None)
+    wanted = TokenCreate(name=name, scopes=("work",), labels={}, expires_in_s=None)
     return tokens.create_token(tx, wanted).secret
 
 

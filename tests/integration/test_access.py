@@ -174,6 +174,26 @@ def test_a_token_allows_no_more_than_its_scopes(house: House, scope: str) -> Non
     assert writes == 204 if scope == "write" else writes in (403, 404)
 
 
+def test_a_worker_token_reaches_no_further_than_its_labels(house: House) -> None:
+    owner, chief = (house.people.client(house.tokens[role]) for role in ("owner", "administrator"))
+    clip = {"item": house.variables["item"]}
+    job = {"kind": "export", "inputs": {"clips": [clip]}, "cache": "off"}
+    needs = {site: {**job, "labels": {"site": site}} for site in ("lyon", "paris")}
+    jobs = {site: owner.post("/projects/lab/jobs", json=body).json()["id"] for site, body in needs.items()}
+    made = chief.post("/tokens", json={"name": "lyon", "scopes": ["work"], "labels": {"site": "lyon"}})
+    assert (made.status_code, made.json()["labels"]) == (201, {"site": "lyon"})
+    worker = house.people.client(made.json()["secret"])
+    claim = {"worker": "w", "kinds": ["export"], "max": 9}
+    refused = worker.post("/leases", json={**claim, "labels": {"site": "paris"}})
+    assert (refused.status_code, refused.json()["code"]) == (403, "label-not-allowed")
+    assert refused.json()["context"] == {"label": "site=paris"}
+    leases = worker.post("/leases", json={**claim, "labels": {"site": "lyon"}}).json()["leases"]
+    assert jobs["lyon"] in [lease["job"] for lease in leases]
+    assert jobs["paris"] not in [lease["job"] for lease in leases]
+    pointless = chief.post("/tokens", json={"name": "x", "scopes": ["read"], "labels": {"site": "lyon"}})
+    assert (pointless.status_code, pointless.json()["errors"][0]["pointer"]) == (422, "/labels")
+
+
 def test_who_may_write_but_not_read_does_not_see_what_they_change(house: House) -> None:
     owner = house.people.client(house.tokens["owner"])
     assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": "*"}).status_code == 200

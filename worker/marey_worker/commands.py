@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast, get_args
 
 from marey_client.credentials import Credential, resolve
@@ -30,7 +31,7 @@ def work(
     *,
     slots: int = 1,
     kinds: tuple[str, ...] = (),
-    labels: tuple[str, ...] = (),
+    labels: Mapping[str, str] = MappingProxyType({}),
     name: str | None = None,
     cache: Path | None = None,
     cache_mb: int | None = None,
@@ -52,7 +53,7 @@ def work(
     if cache_mb is not None:
         given["cache_bytes"] = cache_mb * MIB
     options = WorkerOptions(
-        slots=slots, kinds=_known_kinds(kinds), labels=_parsed_labels(labels),
+        slots=slots, kinds=_known_kinds(kinds), labels=labels,
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
     supervisor = Supervisor(Transport(credential.url, credential.token, retries=BRIEF), options)
@@ -106,16 +107,6 @@ def _known_kinds(names: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(find_kind(name).name for name in names) or tuple(job_kinds())
     except UnknownKindError as error:
         raise MareyError(str(error)) from error
-
-
-def _parsed_labels(texts: tuple[str, ...]) -> dict[str, str]:
-    labels = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise MareyError(f"the label {text!r} is not a name with a value; write name=value")
-        labels[name] = value
-    return labels
 
 
 def _stop_at_end_of_input(supervisor: Supervisor) -> None:

@@ -93,6 +93,13 @@ def create_token(
             "longer than your own token.",
         ),
     ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="With the scope work: label, as name=value, that a worker with this token may announce; may be "
+            "repeated. Default: the labels of your own token, or any."
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -102,11 +109,14 @@ def create_token(
     as_json: AsJson = False,
 ) -> None:
     """Create a token. Its secret is shown only once."""
+    from marey_client.cli.typed_values import assignment
     from marey_schemas.access import TokenCreate
 
     given: dict[str, Any] = {"scopes": tuple(scope)} if scope else {}
     if days is not None:
         given["expires_in_s"] = days * SECONDS_PER_DAY or None
+    if label:
+        given["labels"] = dict(map(assignment, label))
     wanted = TokenCreate(name=name, **given)
     with connect(context) as marey:
         made = marey.tokens.create(wanted) if output is None else _token_in_file(marey, wanted, output)
@@ -147,16 +157,26 @@ def list_tokens(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show your tokens, without their secrets. Scopes show to which projects a token is limited."""
+    """Show your tokens, without their secrets. Scopes show to which projects a token is limited, labels to which
+    workers.
+    """
     within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
         tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))
     if as_json:
         return print_json(tokens)
     rows = [
-        (one.id, one.user, one.name, one.prefix, " ".join(one.scopes), _end_of(one), one.last_used_at) for one in tokens
+        (one.id, one.user, one.name, one.prefix, " ".join(one.scopes), _labels_of(one), _end_of(one), one.last_used_at)
+        for one in tokens
     ]
-    return print_table(("id", "user", "name", "prefix", "scopes", "expires", "last used"), rows)
+    return print_table(("id", "user", "name", "prefix", "scopes", "labels", "expires", "last used"), rows)
+
+
+def _labels_of(token: Token) -> str:
+    """Return the labels to which a token is bound: nothing if it is not bound, `none` if it allows no label."""
+    if token.labels is None:
+        return ""
+    return " ".join(f"{name}={value}" for name, value in sorted(token.labels.items())) or "none"
 
 
 def _end_of(token: Token) -> str:

@@ -79,6 +79,7 @@ def worker(
     """Run jobs of a server until stopped. The token must have the scope `work`."""
     from marey_client import embedded
     from marey_client.cli.invocation import Invocation
+    from marey_client.cli.typed_values import assignment
     from marey_client.credentials import resolve
 
     given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
@@ -87,7 +88,7 @@ def worker(
         found,
         slots=slots,
         kinds=tuple(kind or ()),
-        labels=tuple(label or ()),
+        labels=dict(map(assignment, label or ())),
         name=name,
         cache=cache,
         cache_mb=cache_mb,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -31,6 +32,8 @@ class Principal:
     claim_key: bytes = field(default=b"", repr=False)
     """Secret from which the tokens of repeatable claims are derived; empty without a user's token."""
     ended: bool = False
+    labels: Mapping[str, str] | None = field(default=None, hash=False)
+    """Labels that a worker with this token may announce; None: any."""
 
     @property
     def actor(self) -> str | None:

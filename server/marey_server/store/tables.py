@@ -70,6 +70,7 @@ token = Table(
     Column("last_used_us", Micros),
     Column("session", Boolean, nullable=False, default=False, server_default=false()),  # made by a sign-in
     Column("created_by", ID),  # the token whose bearer created it
+    Column("labels", Document),  # that its workers may announce; null: any
 )
 
 sign_in_limit = Table(

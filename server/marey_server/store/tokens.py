@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Row, and_, bindparam, delete, insert, or_, select, update
 
 from marey_schemas.access import EndTokens, NewToken, Token, TokenCreate
 from marey_schemas.items import Page
+from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
 from marey_server.access import scopes
 from marey_server.access.principal import Principal
@@ -20,12 +22,19 @@ from marey_server.access.secret_tokens import (
     secret_matches,
     split_user_token,
 )
-from marey_server.errors import AuthorLostProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
+from marey_server.errors import (
+    AuthorLostProblem,
+    ForbiddenProblem,
+    InvalidProblem,
+    NotFoundProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.store import listing
 from marey_server.store.database.clock import DAY_US, datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
 from marey_server.store.jobs.fencing import AUTHOR_MAY_RUN, RUNNING, lease_lost
+from marey_server.store.jobs.labels import first_outside, labels_key
 from marey_server.store.quotas import require_room
 from marey_server.store.tables import attempt, job, token, user
 from marey_server.store.transaction import Transaction
@@ -44,7 +53,7 @@ _ATTEMPT_SCOPES = ("read",)
 # Every request runs one of these.
 _USER_TOKEN = Prepared(
     select(token.c.id, token.c.secret_hash, token.c.scopes, token.c.expires_us)
-    .add_columns(user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
+    .add_columns(token.c.labels, user.c.id.label("user_id"), user.c.name, user.c.administrator, user.c.disabled)
     .join(user, user.c.id == token.c.user_id)
     .where(token.c.prefix == bindparam("prefix"))
 )
@@ -101,6 +110,7 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
         row.id,
         row.expires_us,
         claim_key=derive_claim_key(secret),
+        labels=row.labels,
     )
 
 
@@ -131,8 +141,9 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    Raises `ForbiddenProblem` if it would have a scope that the caller's own token lacks, or would be valid longer than
-    that token.
+    Raises `ForbiddenProblem` if it would have a scope that the caller's own token lacks, would allow workers a label
+    that this token does not allow, or would be valid longer than it; `InvalidProblem` for labels without the scope
+    `work`.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -141,10 +152,10 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
             f"the scope {beyond[0]!r}.",
             code="insufficient-scope",
         )
-    ends_us = _end_of(tx, request)
+    labels, ends_us = _labels_of(tx, request), _end_of(tx, request)
     if tx.principal.token_id is not None:  # the server itself may always make one, for its workers or after a loss
         require_room(tx, "user_tokens")
-    return _insert(tx, user_id, request, ends_us, session=False)
+    return _insert(tx, user_id, request, ends_us, labels=labels)
 
 
 def create_session(tx: Transaction, expires_in_s: int) -> NewToken:
@@ -154,17 +165,42 @@ def create_session(tx: Transaction, expires_in_s: int) -> NewToken:
 
 
 def _insert(
-    tx: Transaction, user_id: str | None, request: TokenCreate, expires_us: int | None, *, session: bool
+    tx: Transaction,
+    user_id: str | None,
+    request: TokenCreate,
+    expires_us: int | None,
+    *,
+    session: bool = False,
+    labels: Mapping[str, str] | None = None,
 ) -> NewToken:
     issued = issue_user_token()
     row = {
         "id": new_id("token"), "user_id": user_id, "name": request.name, "prefix": issued.prefix,
         "secret_hash": issued.secret_hash, "scopes": list(request.scopes), "created_us": tx.now_us,
-        "expires_us": expires_us, "session": session, "created_by": tx.principal.token_id,
+        "expires_us": expires_us, "session": session, "created_by": tx.principal.token_id, "labels": labels,
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
     tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
     return NewToken(**_shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
+
+
+def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | None:
+    """Return the labels to which a new token is bound: those requested, or else those of the caller's token."""
+    claims_jobs = scopes.reaches_somewhere(request.scopes, "work")
+    if request.labels is None:
+        return tx.principal.labels if claims_jobs else None
+    if not claims_jobs:
+        detail = "Only a token with the scope work, which claims jobs, can be bound to labels of workers."
+        raise InvalidProblem(detail, errors=[FieldError(pointer="/labels", code="needs-work", detail=detail)])
+    labels_key(request.labels)  # raises InvalidProblem for labels that no worker can announce
+    if (beyond := first_outside(request.labels, tx.principal.labels)) is not None:
+        raise ForbiddenProblem(
+            "A token can allow only labels that the token that creates it allows, and yours does not allow "
+            f"the label {beyond!r}.",
+            code="label-not-allowed",
+            context={"label": beyond},
+        )
+    return request.labels
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
@@ -302,5 +338,5 @@ def _shown(row: Row[Any], user_name: str | None) -> Token:
         id=row.id, name=row.name, prefix=row.prefix, scopes=tuple(row.scopes), created_at=datetime_of(row.created_us),
         expires_at=None if row.expires_us is None else datetime_of(row.expires_us),
         last_used_at=None if row.last_used_us is None else datetime_of(row.last_used_us),
-        user=user_name, session=row.session, created_by=row.created_by,
+        user=user_name, session=row.session, created_by=row.created_by, labels=row.labels,
     )  # fmt: skip

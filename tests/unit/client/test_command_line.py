@@ -455,6 +455,29 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
     assert not (tmp_path / "new").exists()
 
 
+def test_a_token_is_bound_to_labels_and_listed_with_them(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
+    token = {
+        "id": "token_1", "name": "w", "prefix": "abc", "scopes": ["work"], "expires_at": None, "user": "ada",
+        "created_at": "2026-01-01T00:00:00Z", "labels": {"site": "lyon", "gpu": "a100"},
+    }  # fmt: skip
+    script.answers = [httpx.Response(201, json={**token, "secret": "marey_abc_def"})]
+    accounts.create_token(NO_OPTIONS, "w", scope=["work"], label=["gpu=a100", "site=lyon"])
+    assert json.loads(script.requests[0].content)["labels"] == {"gpu": "a100", "site": "lyon"}
+    with pytest.raises(WrongUsage, match="write name=value"):
+        accounts.create_token(NO_OPTIONS, "w", scope=["work"], label=["lyon"])
+    listed = [token, {**token, "labels": {}}, {**token, "labels": None}]
+    script.answers = [httpx.Response(200, json={"items": listed, "next_cursor": None})]
+    capsys.readouterr()
+    accounts.list_tokens(NO_OPTIONS)
+    header, *rows = (line for line in capsys.readouterr().out.splitlines() if "id" in line or "token_1" in line)
+    assert "labels" in header
+    assert ["gpu=a100 site=lyon" in row for row in rows] == [True, False, False]
+    assert ["none" in row for row in rows] == [False, True, False]
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -76,7 +76,8 @@ def test_a_server_that_starts_again_replaces_its_workers_token_and_no_other_serv
     beside = make_worker_token(database, other)
     again = make_worker_token(database, one)
     for secret in (beside, again):
-        assert database.read(SYSTEM, tokens.resolve_token, secret).scopes == ("work",)
+        holder = database.read(SYSTEM, tokens.resolve_token, secret)
+        assert (holder.scopes, holder.labels) == (("work",), {})
     with pytest.raises(UnauthenticatedProblem):
         database.read(SYSTEM, tokens.resolve_token, first)
 

@@ -91,6 +91,32 @@ def test_too_many_labels_are_refused(desk: Desk) -> None:
         desk.claim_many(labels={f"label{n}": "x" for n in range(7)})
 
 
+def test_a_worker_whose_token_is_bound_to_labels_announces_no_others(desk: Desk) -> None:
+    plain = desk.submit()
+    gpu = desk.submit(labels={"gpu": "a100"})
+    both = desk.submit(labels={"gpu": "a100", "site": "lyon"})
+    elsewhere = desk.submit(labels={"gpu": "a100", "site": "paris"})
+    desk.user = replace(desk.user, labels={"gpu": "a100", "site": "lyon"})
+    for labels in ({"gpu": "a100", "site": "paris"}, {"site": "paris"}, {"site": "lyon", "disk": "ssd"}):
+        with pytest.raises(ForbiddenProblem, match="bound to other labels") as refused:
+            desk.claim_many(labels=labels)
+        assert refused.value.error_code == "label-not-allowed"
+        assert refused.value.context["label"] in ("site=paris", "disk=ssd")
+        assert refused.value.context["label"] in refused.value.detail
+    assert [lease.job for lease in desk.claim_many(labels={"gpu": "a100"})] == [plain, gpu]
+    assert [lease.job for lease in desk.claim_many(labels={"gpu": "a100", "site": "lyon"})] == [both]
+    assert desk.claim_many(labels={"gpu": "a100", "site": "lyon"}, job=elsewhere) == []
+
+
+def test_a_token_bound_to_no_label_claims_only_jobs_without_labels(desk: Desk) -> None:
+    plain = desk.submit()
+    desk.submit(labels={"gpu": "a100"})
+    desk.user = replace(desk.user, labels={})
+    with pytest.raises(ForbiddenProblem, match="gpu=a100"):
+        desk.claim_many(labels={"gpu": "a100"})
+    assert [lease.job for lease in desk.claim_many()] == [plain]
+
+
 def test_at_most_one_job_runs_with_a_concurrency_key_and_others_are_passed_over(desk: Desk) -> None:
     keyed = [desk.submit(concurrency_key="camera") for _ in range(3)]
     free = desk.submit(priority=-1)

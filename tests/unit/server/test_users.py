@@ -16,6 +16,7 @@ from marey_server.access.secret_tokens import issue_attempt_token
 from marey_server.errors import (
     ConflictProblem,
     ForbiddenProblem,
+    InvalidProblem,
     LeaseLostProblem,
     NotFoundProblem,
     PreconditionFailedProblem,
@@ -205,6 +206,42 @@ def test_a_chain_of_tokens_never_widens(database: Database, chief: Principal) ->
         held = make_token(database, caller, scopes=narrower)
         assert held.created_by == caller.token_id
         assert held.expires_at == first.expires_at
+
+
+def holder(database: Database, made: NewToken) -> Principal:
+    return database.read(ANONYMOUS, tokens.resolve_token, made.secret)
+
+
+def test_a_token_bound_to_labels_makes_none_that_allows_others(database: Database, chief: Principal) -> None:
+    lyon = {"gpu": "a100", "site": "lyon"}
+    held = make_token(database, chief, scopes=("write", "work"), labels=lyon)
+    caller = holder(database, held)
+    assert caller.labels == held.labels == lyon
+    for wider in ({"gpu": "a100", "site": "paris"}, {"disk": "ssd"}):
+        with pytest.raises(ForbiddenProblem, match="does not allow the label") as refused:
+            make_token(database, caller, scopes=("work",), labels=wider)
+        assert refused.value.error_code == "label-not-allowed"
+    assert make_token(database, caller, scopes=("work!project=walk",)).labels == lyon
+    assert make_token(database, caller, scopes=("work",), labels=None).labels == lyon
+    narrower = make_token(database, caller, scopes=("write", "work"), labels={"gpu": "a100"})
+    assert make_token(database, holder(database, narrower), scopes=("work",)).labels == {"gpu": "a100"}
+    assert make_token(database, holder(database, narrower), scopes=("work",), labels={}).labels == {}
+    assert make_token(database, caller, scopes=("write",)).labels is None
+    shown = {one.id: one.labels for one in database.read(chief, tokens.list_tokens).items}
+    assert shown[held.id] == lyon
+
+
+@pytest.mark.parametrize(
+    ("scopes", "labels"),
+    [(("read", "write", "jobs"), {"gpu": "a100"}), (("admin",), {}), (("work",), {f"n{n}": "x" for n in range(7)})],
+)
+def test_labels_that_a_token_cannot_have_are_refused(
+    database: Database, chief: Principal, scopes: tuple[str, ...], labels: dict[str, str]
+) -> None:
+    with pytest.raises(InvalidProblem) as refused:
+        make_token(database, chief, scopes=scopes, labels=labels)
+    assert [error.pointer for error in refused.value.errors] == ["/labels"]
+    assert database.read(chief, tokens.list_tokens).items == ()
 
 
 def sign_in(database: Database, name: str, password: str) -> NewToken:

@@ -30,6 +30,16 @@ def keys_within(labels: Mapping[str, str]) -> list[str]:
     return [",".join(subset) for size in range(len(pairs) + 1) for subset in combinations(pairs, size)]
 
 
+def first_outside(labels: Mapping[str, str], allowed: Mapping[str, str] | None) -> str | None:
+    """Return the first label, as `name=value`, that is not among those allowed; None if there is none.
+
+    `allowed` is None if every label is allowed.
+    """
+    if allowed is None:
+        return None
+    return next((f"{name}={value}" for name, value in sorted(labels.items() - allowed.items())), None)
+
+
 def _checked_pairs(labels: Mapping[str, str]) -> list[str]:
     if len(labels) > MOST_LABELS:
         raise _refusal(f"There are {len(labels)} labels; at most {MOST_LABELS} are possible.")

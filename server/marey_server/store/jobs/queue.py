@@ -53,7 +53,7 @@ from marey_server.store.jobs.fencing import (
     lease_lost,
     require_attempt,
 )
-from marey_server.store.jobs.labels import keys_within
+from marey_server.store.jobs.labels import first_outside, keys_within
 from marey_server.store.jobs.policy import DEFAULT_POLICY, SECOND_US, QueuePolicy
 from marey_server.store.tables import attempt, job, member, project
 from marey_server.store.transaction import Transaction
@@ -63,13 +63,14 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
     A repeated `claim_id` gets the leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
-    caller may not claim jobs, `InvalidProblem` for another protocol version, and `LeaseLostProblem` if no lease of the
-    earlier claim is held any more.
+    caller may not claim jobs or announce such labels, `InvalidProblem` for another protocol version, and
+    `LeaseLostProblem` if no lease of the earlier claim is held any more.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = _require_worker(tx.principal)
+    _require_labels(tx.principal, request)
     claim_id = request.claim_id if tx.principal.claim_key else None
     if claim_id is not None and (again := _claimed_before(tx, claim_id, policy)):
         return again
@@ -276,6 +277,17 @@ def _require_worker(caller: Principal) -> list[str]:
     if not scopes or caller.kind not in ("user", "system"):
         raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")
     return scopes
+
+
+def _require_labels(caller: Principal, request: ClaimRequest) -> None:
+    """Raise `ForbiddenProblem` if the worker announces a label that the caller's token does not allow."""
+    if (beyond := first_outside(request.labels, caller.labels)) is not None:
+        raise ForbiddenProblem(
+            f"The worker announces the label {beyond!r}, but its token is bound to other labels. Start the worker "
+            "without this label, or with a token that allows it.",
+            code="label-not-allowed",
+            context={"label": beyond},
+        )
 
 
 def _claim_rows(tx: Transaction, request: ClaimRequest, scopes: Sequence[str], policy: QueuePolicy) -> list[Row[Any]]:
