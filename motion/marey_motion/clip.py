@@ -12,14 +12,14 @@ from marey_motion.errors import ClipError
 from marey_motion.skeleton import UNIT_TOLERANCE, Skeleton
 
 _SURELY_UNIT = 1.9 * UNIT_TOLERANCE
-"""Deviation of a squared length from 1 that is permitted, less a margin that exceeds any rounding of float32."""
+"""Permitted deviation of a squared length from 1, minus a margin larger than any rounding error of float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
     """Poses of a skeleton over time.
 
-    Arrays are used without a copy where their type fits, and are read-only afterwards.
+    Arrays of the right type are not copied. The arrays of a clip are read-only.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Clip:
 
     Raises
     ------
-    ClipError    naming the field, frame and joint that is wrong
+    ClipError    naming the invalid field, frame and joint
 
     Examples
     --------
@@ -135,7 +135,7 @@ class Clip:
 
         Parameters
         ----------
-        start, stop : int    first frame, and the one after the last
+        start, stop : int    first frame, and the frame after the last
 
         Returns
         -------
@@ -173,7 +173,9 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
 
 
 def _surely_unit(rotations: NDArray[np.float32]) -> bool:
-    """Return whether rotations (F, J, 4) are of unit length beyond any rounding; takes half as long as the check."""
+    """Return whether rotations (F, J, 4) have unit length with a margin for rounding, in half the time of the full
+    check.
+    """
     with np.errstate(over="ignore"):  # the check names the rotation
         squares = rotations * rotations
     lengths = squares[..., 0] + squares[..., 1]

@@ -83,7 +83,7 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
     Parameters
     ----------
     clip : Clip    F frames
-    skeleton : RevisionRef or OutputRef    where its skeleton is stored
+    skeleton : RevisionRef or OutputRef    reference to its stored skeleton
 
     Returns
     -------
@@ -175,7 +175,7 @@ def layer_to_document(
     Parameters
     ----------
     layer : Layer    segments and keyframes
-    clip : RevisionRef or OutputRef    where the annotated clip is stored
+    clip : RevisionRef or OutputRef    reference to the stored clip that is annotated
     name : str    name of the layer
     made_by : str    "person" or "algorithm"
 

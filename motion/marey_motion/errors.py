@@ -15,7 +15,7 @@ class MotionError(ValueError):
     ----------
     message : str    the problem and its remedy, for a person
     code : str, optional    stable slug; each class has its own default
-    where : str, optional    place in the input (joint, field, frame); None when the error concerns the whole
+    where : str, optional    place in the input (joint, field, frame); None when the error concerns the whole input
 
     Examples
     --------
@@ -196,7 +196,7 @@ class FormatError(MotionError):
 
 
 class UnknownFormat(FormatError):
-    """Refusal of a file that no reader recognises.
+    """The file has a format that no reader recognises.
 
     Examples
     --------

@@ -16,7 +16,7 @@ from marey_motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class Placement:
-    """Position and heading at the start of a clip, which the move to the canonical frame removed.
+    """Original position and heading of a clip's first frame, before the clip was moved to the canonical frame.
 
     A point p of the canonical frame was at R(heading) p + (x, y, z) in the source; R rotates about the vertical axis.
 
@@ -24,9 +24,9 @@ class Placement:
     ----------
     heading_rad : float    heading in the first frame, 0 along +z, positive to the left
     x, z : float    position of `joint` in the first frame, metres
-    y : float    metres subtracted from all heights; 0 if heights are kept, which is the default
-    joint : int    the joint that carries the body (`MatchingBody.carrier`): the root, or, below a root that is a
-        static reference on the floor, mostly the hips
+    y : float    metres subtracted from all heights; 0 by default, which leaves the heights unchanged
+    joint : int    index of the joint that carries the body (`MatchingBody.carrier`): the root, or usually the hips if
+        the root is a static reference on the floor
     """
 
     heading_rad: float
@@ -50,7 +50,7 @@ class AlignedClip:
         strictly increasing from 0 to the last frame of the source
     placement : Placement    start of the source on the ground
     cost : float    mean cost per cell of the alignment path from which the time function was made, square metres
-    source_frames : int    frames of the source at the set's rate
+    source_frames : int    number of frames of the source at the set's rate
     """
 
     uid: str

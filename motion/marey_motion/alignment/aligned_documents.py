@@ -1,4 +1,4 @@
-"""Conversion of aligned examples to and from trees of plain values and arrays, one example in each."""
+"""Conversion of aligned examples to and from trees of plain values and arrays, with one tree per example."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
     ----------
     item : str    id of the clip
     revision : int    its revision
-    mirrored : bool    whether it is the mirrored copy
+    mirrored : bool    whether the uid is for the clip's mirrored copy
 
     Returns
     -------
@@ -56,7 +56,7 @@ def uid_of(item: str, revision: int, *, mirrored: bool = False) -> str:
 def example_to_tree(
     aligned: AlignedSet, example: AlignedClip, *, digest: str | None = None, options: Tree | None = None
 ) -> Tree:
-    """Make the part `info` of one example of a set whose uids are those of `uid_of`.
+    """Make the document part `info` for one example. All uids of the set must come from `uid_of`.
 
     Parameters
     ----------
@@ -132,7 +132,8 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
 
 def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
-    """Restore the source clip of a stored example: its frames at the set's rate, in its own time and place.
+    """Restore the source clip of a stored example: its frames at the set's rate, with their original timing and
+    position.
 
     Parameters
     ----------

@@ -40,9 +40,9 @@ from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOp
 LEAST_CLIPS = 2
 LEAST_FRAMES = 4
 MOST_FRAMES = 4000
-"""Most frames of one example: the costs of two such examples take 128 MB."""
+"""Maximum number of frames of one example: the costs of two such examples take 128 MB."""
 MOST_JOINT_FRAMES = 30_000_000
-"""Most joints times frames of all examples together: these take about 3 GB."""
+"""Maximum of joints times frames, summed over all examples: about 3 GB of memory."""
 MIRRORED = "~mirrored"
 
 Progress = Callable[[float, float | None, str], None]
@@ -55,10 +55,11 @@ class SourceExample:
     Parameters
     ----------
     uid : str    stable name of the example
-    name : str    name shown to people; of equally good references, the first by name, then uid, is chosen
+    name : str    name shown to people; of equally good references, the one that is first by name, then by uid, is
+        chosen
     clip : Clip    the motion
-    cuts : tuple of Cut    labelled frames of this clip, in the order of time (`segments.cuts_of`); all
-        examples have cuts with the same labels
+    cuts : tuple of Cut    labelled frames of this clip, in the order of time (`segments.cuts_of`); all examples must
+        have cuts with the same labels
     """
 
     uid: str
@@ -121,7 +122,7 @@ def align_clips(
     ----------
     clips : sequence of SourceExample    clips of one skeleton
     body : MatchingBody    body of that skeleton
-    options : AlignOptions, optional    options; their reference may be the uid of an example
+    options : AlignOptions, optional    options; `options.reference` may be the uid of an example
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
     on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned;
@@ -341,7 +342,8 @@ def _with_signs_of(motion: Motion, reference: Motion) -> Motion:
 def restore(clip: AlignedClip, skeleton: Skeleton) -> Motion:
     """Undo `align_clips` for one clip.
 
-    Exact if the time function is the identity; otherwise the poses are interpolated between canonical frames.
+    The result is exact if the time function is the identity; otherwise the poses are interpolated between canonical
+    frames.
 
     Parameters
     ----------

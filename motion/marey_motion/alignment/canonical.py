@@ -19,8 +19,8 @@ from marey_motion.skeleton import Skeleton
 def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True) -> tuple[Motion, Placement]:
     """Rotate and move a motion as a whole so that its first frame is at x = z = 0 and faces +z.
 
-    The joint that is placed there carries the body: the root, unless the root is a static reference on the floor.
-    Such a root keeps its rotations and moves with the body; translations of the joints between the root and the
+    The joint placed at the origin is the one that carries the body: the root, unless it is a static reference on the
+    floor. Such a root keeps its rotations and moves with the body; translations of the joints between the root and the
     carrying joint are merged into the root's. The facing direction is computed from hips and shoulders, in the first
     frame in which it is defined.
 
@@ -28,7 +28,7 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
     ----------
     motion : Motion    F frames
     body : MatchingBody    body of its skeleton
-    keep_height : bool    whether heights above the floor stay; if False, the body also begins at y = 0
+    keep_height : bool    whether heights above the floor stay unchanged; if False, the body also begins at y = 0
 
     Returns
     -------

@@ -55,8 +55,8 @@ def frame_costs(a: Floats, b: Floats, options: CostOptions | None = None, weight
     Notes
     -----
     Kovar and Gleicher 2002, equation 1, divided by the sum of weights. With horizontal positions as complex numbers z
-    about their weighted centre, the least sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a z̄_b|;
-    the differences of heights are added as they are.
+    about their weighted centre, the minimum of the sum over all turns and shifts is Σ w|z_a|² + Σ w|z_b|² - 2 |Σ w z_a
+    z̄_b|; the differences of heights are added as they are.
 
     At the ends of a motion, its first and last frame are repeated for the window. All frames of a window are turned and
     shifted together.

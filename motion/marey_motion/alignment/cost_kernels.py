@@ -12,9 +12,10 @@ from marey_motion.kernels import compiled
 
 @compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
-    """Sum over the points, for each frame of `others` (P, 3, m): horizontal products z·z̄', squared height differences.
+    """Sum horizontal products h·h̄' and squared height differences over the points, for each frame of `others` (P, 3,
+    m).
 
-    z = x + i·z are horizontal positions as complex numbers.
+    h = x + i·z are horizontal positions as complex numbers.
     """
     real[:] = 0.0
     imaginary[:] = 0.0
@@ -31,9 +32,9 @@ def _products(points, others, real, imaginary, heights):  # type: ignore[no-unty
 
 @compiled
 def turned(rows, columns, energies, other_energies, costs):  # type: ignore[no-untyped-def]
-    """Fill `costs` (n, m), each after the best rotation about the vertical; the points are centred in each frame.
+    """Fill `costs` (n, m) with the cost of each pair of frames after the best rotation about the vertical.
 
-    rows (n, P, 3) and columns (P, 3, m) are the points of the two motions.
+    rows (n, P, 3) and columns (P, 3, m) are the points of the two motions, centred in each frame.
     """
     n, m = costs.shape
     real, imaginary, heights = np.empty(m), np.empty(m), np.empty(m)

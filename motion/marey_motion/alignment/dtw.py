@@ -22,7 +22,7 @@ _ROUNDING_SLACK = 1.0 - 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """A path through n × m cells.
+    """An alignment path through a matrix of n × m costs.
 
     Parameters
     ----------
@@ -35,15 +35,16 @@ class Alignment:
 
 
 def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
-    """Find the cheapest path.
+    """Find the cheapest path through a matrix of costs.
 
-    Among equally cheap paths a step 1-1 is preferred to 1-0, and 1-0 to 0-1.
+    A step is named after the frames by which it advances in both motions. Among equally cheap paths, a step 1-1 is
+    preferred to 1-0, and 1-0 to 0-1.
 
     Parameters
     ----------
     costs : (n, m) float    finite costs of each pair of frames
-    max_run : int, optional    largest number of consecutive steps 1-0, or 0-1 (the slope limit of Kovar and Gleicher
-        2003); unlimited if None
+    max_run : int, optional    maximum number of consecutive steps 1-0, and of consecutive steps 0-1 (the slope limit of
+        Kovar and Gleicher 2003); unlimited if None
 
     Returns
     -------
@@ -72,7 +73,7 @@ def align(costs: ArrayLike, *, max_run: int | None = None) -> Alignment:
 
 
 def least_total(costs: Floats, *, max_run: int | None = None) -> float:
-    """Compute the total cost of the path that `align` finds, without the path.
+    """Compute only the total cost of the path that `align` finds.
 
     Parameters
     ----------
@@ -156,9 +157,9 @@ def warped_distance(a: NDArray[np.floating], b: NDArray[np.floating], *, limit: 
 def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_per_box: int = FRAMES_PER_BOX) -> float:
     """Compute a lower bound of `warped_distance(a, b)` in much less time.
 
-    The other motion is divided into runs of `frames_per_box` frames, each enclosed in a bounding box per point. Every
-    frame is on the path at least once and costs at least its distance from the nearest box. The first and the last cell
-    of the matrix are on every path.
+    One motion is divided into runs of `frames_per_box` frames, and each run is enclosed in a bounding box per point.
+    Every frame of the other motion is on the path at least once and costs at least its distance from the nearest box.
+    The first and the last cell of the matrix are on every path.
 
     Parameters
     ----------
@@ -177,7 +178,7 @@ def distance_bound(a: NDArray[np.floating], b: NDArray[np.floating], *, frames_p
 
 
 class RangeBounds:
-    """Lower bounds of the warped distances between one motion and many others, from one bounding box per motion.
+    """Lower bounds of the warped distances between one motion and others, from one bounding box per motion and point.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ def align(costs, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cheapest(both, first, second):  # type: ignore[no-untyped-def]
-    """Find the least of three totals and its step, without branches, which the processor could not predict."""
+    """Find the least of three totals and its step. No branches are used, since they are unpredictable."""
     least = min(both, first, second)
     alone = least < both
     return least, np.uint8(alone) + np.uint8(alone & (least < first))
@@ -113,7 +113,7 @@ def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
 
 @compiled
 def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
-    """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite without a path."""
+    """Compute the total cost of the cheapest path with limited runs in O(max_run·m) memory; infinite if none exists."""
     n, m = costs.shape
     not_first, not_second = np.empty((2, m)), np.empty((2, m))
     runs, scratch = np.full((max_run, m), np.inf), np.empty((2, m))
@@ -125,7 +125,8 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill a row of totals from the row before; row r of `runs` (max_run, m): totals after r + 1 consecutive steps 1-0.
+    """Fill a row of totals from the row before; row r of `runs` (max_run, m) has the totals after r + 1 steps 1-0 in a
+    row.
 
     A run of steps 0-1 starts from totals that depend only on the row before. No cell therefore waits for its left
     neighbour, and every loop runs over whole vectors.
@@ -294,7 +295,7 @@ def _mean_distance(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cost_from_box(points, start, stop, low, high, most):  # type: ignore[no-untyped-def]
-    """Sum over frames the mean distance of the points from a bounding box; stop when the sum exceeds `most`."""
+    """Sum the mean distances of the points from a bounding box over frames; stop when the sum exceeds `most`."""
     total = 0.0
     for i in range(start, stop):
         cost = 0.0

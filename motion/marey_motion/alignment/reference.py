@@ -17,7 +17,7 @@ Advance = Callable[[int, int], None]
 """Function called with the number of alignments done and their total."""
 
 SAME = 1e-9
-"""Sums of costs that differ by less than this share of them are ties."""
+"""Relative difference below which two sums of costs count as equal."""
 
 
 def nearest_mean_length(frame_counts: Sequence[int]) -> int:

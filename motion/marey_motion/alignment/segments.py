@@ -1,4 +1,4 @@
-"""Labelled cuts that all examples of an action share, and alignments that keep them."""
+"""Labelled cuts that all examples of an action share, and alignments that match these cuts."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
 
     Parameters
     ----------
-    own, common : tuple of tuples of str    labels of the bounds, of this example and of the others
+    own, common : tuple of tuples of str    labels of the bounds of this example, and of those of the others
 
     Raises
     ------
@@ -194,7 +194,7 @@ def align_sections(
 
     Parameters
     ----------
-    costs : (N, M) float64    costs of reference and source frames
+    costs : (N, M) float64    cost of each pair of a reference frame and a source frame
     reference, source : sequence of int    equally many bounds of each motion, from 0 to N - 1 and from 0 to M - 1
     align : callable    finds the path through the costs of one section
 
@@ -204,7 +204,7 @@ def align_sections(
 
     Raises
     ------
-    MotionError    for sections without two frames
+    MotionError    if a section has fewer than two frames
     """
     paths: list[NDArray[np.int32]] = []
     times: list[Floats] = []

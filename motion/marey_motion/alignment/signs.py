@@ -35,7 +35,7 @@ def consistent_poses(poses: Floats, reference: Floats) -> Floats:
     Parameters
     ----------
     poses : (m, N, 3 + 4·J) float64    root translations and rotations
-    reference : (N, 3 + 4·J) float64    those of the reference
+    reference : (N, 3 + 4·J) float64    root translations and rotations of the reference
 
     Returns
     -------

@@ -24,9 +24,9 @@ def time_function(path: NDArray[np.integer]) -> Floats:
     """Compute the time function of an alignment path between a reference and a source.
 
     A canonical frame that is matched with several source frames is mapped to their mean. A source frame that is matched
-    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. First
-    frames and last frames correspond exactly. If a slope is below `LEAST_SLOPE`, the slopes are replaced by the
-    nearest ones, in least squares, that are not.
+    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. First frames
+    and last frames correspond exactly. If a slope is below `LEAST_SLOPE`, all slopes are replaced by the nearest ones,
+    in least squares, that are at least `LEAST_SLOPE`.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def time_function(path: NDArray[np.integer]) -> Floats:
 
 
 def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
-    """Find the mean cell of each run of cells that share a frame; the first and last knot are the ends of the path."""
+    """Find the mean cell of each run of cells that share a frame; the ends of the path are the first and last knot."""
     steps = np.diff(path, axis=0)
     side = steps[:, 0] - steps[:, 1]  # 0 for a step in both, else which motion steps alone
     before = np.concatenate(([0], side[:-1]))
@@ -60,7 +60,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Find the times with the same ends and no step below the least slope whose steps are nearest in least squares."""
+    """Find the nearest times, by least squares of their steps, with the same ends and no step below the least slope."""
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:
         return times

@@ -1,1 +1,1 @@
-"""Motion editing: lists of commands that make one or several clips from one, and leave the original unchanged."""
+"""Motion editing: lists of commands that make one or several new clips from a clip, which itself stays unchanged."""

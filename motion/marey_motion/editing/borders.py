@@ -1,4 +1,4 @@
-"""Weights of the frames of a range for a change: 1 inside, with smooth transitions at the borders."""
+"""Weights of a change in each frame of a range: 1 inside, with smooth transitions at the borders."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from marey_motion.editing.take import Take
 def range_weights(take: Take, frames: tuple[int, int | None] | None, border_s: float) -> tuple[slice, Floats]:
     """Compute the weight of each frame of a range.
 
-    Each border is inside the range and at most half as long. There is no border at an end of the range that is also an
-    end of the motion.
+    Each transition lies inside the range and is at most half as long as the range. There is no transition at an end of
+    the range that is also an end of the motion.
 
     Parameters
     ----------
     take : Take    F frames
     frames : (int, int or None) or None    half-open range; all frames if None
-    border_s : float    seconds of each border
+    border_s : float    duration of each transition, seconds
 
     Returns
     -------

@@ -1,8 +1,7 @@
 """Limit on the computing work of an edit.
 
-The work is estimated in advance, so the same edit is always accepted or always refused.
-
-Work is estimated in nanoseconds of one thread, with measured weights.
+The work is estimated in advance, in nanoseconds of one thread and with measured weights, so the same edit is always
+accepted or always refused.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ PER_RIG = 10_000_000
 """Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean for each number: for each frame of its window, and the most for a long window."""
+"""Work of a moving mean per number of the motion: per frame of its window, and the maximum for long windows."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
-"""Work of one range of constraints that is solved and blended in, and work for each number of its frames."""
+"""Work of solving and blending in one range of constraints, and additional work for each number in its frames."""
 
 
 @dataclass

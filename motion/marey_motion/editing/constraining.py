@@ -35,7 +35,7 @@ from marey_schemas.editing.constraints import Solver
 MOST_ROUNDS = 12
 SETTLED = 1e-3
 _PER_FRAME = 40_000
-"""Preparing, measuring, and closed forms."""
+"""Work per frame, in nanoseconds, of preparing the arrays, measuring the errors and evaluating closed forms."""
 _LIMIT_PASSES = 4
 
 
@@ -59,7 +59,7 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class ConstrainedMotion:
-    """A motion in which constraints are met as far as they can be.
+    """A motion in which constraints are met as well as possible.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def constrain_motion(
 
     Raises
     ------
-    EditError    naming the invalid constraint; also if the budget is too small
+    EditError    if a constraint is invalid (the error names it) or the budget is too small
     """
     freedom = freedom or Freedom()
     for number, constraint in enumerate(constraints):

@@ -152,7 +152,7 @@ class _Rig:
 
 
 def _named(number: int, make: Any, *arguments: Any) -> Any:
-    """Call `make`, and prefix the place of its errors with the constraint."""
+    """Call `make`, and add the number of the constraint to the place that its errors name."""
     try:
         return make(*arguments)
     except MotionError as error:
@@ -244,7 +244,7 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Return the given contacts of the toes; the heels are in contact if they are slow in the same frames."""
+    """Return the toe contacts of the command; a heel is in contact in those of these frames in which it is slow."""
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):

@@ -73,7 +73,7 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
 
 def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence[Window]) -> Motion:
-    """Change some frames and spread the change over windows; frames outside the windows stay identical to the bit.
+    """Change some frames and spread the change over windows; frames outside the windows stay bit-identical.
 
     Parameters
     ----------
@@ -190,7 +190,8 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:
-    """Lower diagonals (4, count) of the quadratic form that measures bending and tension of `count` control points.
+    """Compute the lower diagonals (4, count) of the quadratic form that measures bending and tension of `count` control
+    points.
 
     Beyond a smooth end all control points are zero; beyond an end that is not smooth there are no control points.
     """

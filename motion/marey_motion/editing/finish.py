@@ -1,4 +1,4 @@
-"""Last step after drawing a motion from a model or searching for one: removes the remaining errors of constraints."""
+"""Final step for a motion sampled from a model or found by search: removal of the remaining constraint errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 FAR_M = 0.05
-"""A model that misses a position by more does not reach there: inverse kinematics would hide that."""
+"""Largest error of a position, in metres, at which the model counts as able to reach the position."""
 
 
 @dataclass(frozen=True, eq=False)

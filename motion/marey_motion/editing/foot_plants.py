@@ -30,7 +30,7 @@ from marey_schemas.editing.constraints import PlantOptions
 
 MOST_LOWERING_M = 0.1
 SHORTEST_CONTACT_S = 0.06
-"""Shorter contacts are noise."""
+"""Duration, in seconds, below which a contact counts as noise."""
 # Less than this is rounding.
 SHORTEST_LOWERING_M = 1e-9
 
@@ -57,7 +57,7 @@ class PlantedMotion:
     Parameters
     ----------
     motion : the whole motion
-    contacts : of each foot
+    contacts : frames in which each foot touches the ground
     slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 without contacts
     lowered_m : largest distance by which the root is lowered
     """
@@ -130,7 +130,7 @@ def plant_feet(
 def find_contacts(positions: Floats, foot: Foot, frame_rate_hz: float, options: PlantOptions) -> FootContacts:
     """Find the frames in which toe and ankle of a foot are slow.
 
-    Contacts shorter than `SHORTEST_CONTACT_S` are noise, and so are gaps between the remaining contacts.
+    Contacts shorter than `SHORTEST_CONTACT_S` count as noise, and so do shorter gaps between the remaining contacts.
 
     Parameters
     ----------

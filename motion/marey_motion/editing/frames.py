@@ -80,7 +80,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : Concatenate    name of the clip, its place, and the blend
+    command : Concatenate    name of the clip to append, its placement, and the blend
 
     Returns
     -------
@@ -138,7 +138,7 @@ def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
 
 
 def _joined(first: Motion, second: Motion, overlap: int, count: int, frame_rate_hz: float) -> Motion:
-    """Join two motions, blended over `count` frames, with or without overlap; 0 makes a hard cut."""
+    """Join two motions, blended over `count` frames, with or without overlap; a `count` of 0 makes a hard cut."""
     if overlap:
         return _faded_over(first, second, overlap)
     return _in_a_row(first, _inertialised(first, second, count, frame_rate_hz) if count else second)

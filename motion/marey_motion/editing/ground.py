@@ -17,7 +17,7 @@ from marey_schemas.options.annotations import ContactOptions
 
 FEET = ("left_foot", "right_foot")
 LOWEST_SHARE = 0.05
-"""Share of the frames, the lowest ones, from which the ground is estimated where no foot is ever in stance."""
+"""Share of the frames, those with the lowest feet, from which the ground is estimated if no foot is ever in stance."""
 
 
 class Ground(NamedTuple):

@@ -20,7 +20,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.commands import Paste, RotateJoint
 
 SAME_AXES_RAD = 0.02
-"""Largest angle between rest rotations that count as equal: subjects of one rig differ a little."""
+"""Largest angle, in radians, between rest rotations that count as equal: they differ a little between subjects."""
 
 
 def paste(take: Take, command: Paste) -> Take:

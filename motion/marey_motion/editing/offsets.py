@@ -18,7 +18,7 @@ from marey_motion.looping import about_vertical
 from marey_motion.motion import Motion
 
 VELOCITY_S = 0.15
-"""A difference of velocities is used up after this, so that long blends do not swing out."""
+"""Seconds after which a difference of velocities has decayed to zero, so that long blends do not overshoot."""
 
 
 class PoseOffset(NamedTuple):
@@ -118,7 +118,7 @@ def step_of(motion: Motion, frame: int) -> PoseOffset:
 
 
 def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
-    """Compute the offset that, added to the start of a motion, continues another one, and its change per frame.
+    """Compute the offset, and its change per frame, with which the start of a motion continues the end of another.
 
     The step across the seam belongs to neither motion. It is estimated as the mean of the last step before and the
     first step after the seam.
@@ -170,7 +170,7 @@ def dying_away(offset: PoseOffset, velocity: PoseOffset, ages: Floats, life: flo
     offset : PoseOffset    of one pose
     velocity : PoseOffset    per frame
     ages : (n,) float64    frames since the start
-    life, velocity_life : float    frames after which the part of the initial value, and that of the velocity, is zero
+    life, velocity_life : float    frames after which the contribution of the initial value, or of the velocity, is zero
 
     Returns
     -------

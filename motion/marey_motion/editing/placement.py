@@ -83,7 +83,7 @@ def face(take: Take, command: Face) -> Take:
 
 
 def move_to_origin(take: Take, command: MoveToOrigin) -> Take:
-    """Shift the motion on the ground, so that the pelvis is above the origin at a frame; heights stay.
+    """Shift the motion on the ground, so that the pelvis is above the origin at a frame. Heights do not change.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Every command by its name, and lists of commands applied to clips.
+"""Table of all commands by name, and functions that apply lists of commands to clips.
 
 A command is a model of `marey_schemas.editing`, which declares its parameters. The function of the same name receives a
 take and the command, and returns one or more takes. It is pure: the same take and command give the same bytes.
@@ -55,7 +55,8 @@ COMMANDS: Mapping[str, Callable[..., Take | tuple[Take, ...]]] = {
         plant_feet,
     )
 }
-"""Functions by the name of their command. A new one gets its line here and its model in `marey_schemas.editing`."""
+"""Functions by the names of their commands. A new command needs an entry here and a model in `marey_schemas.editing`.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class EditedClip:
     Parameters
     ----------
     clip : the motion
-    pieces : number of its piece, from 1, in each split that was applied
+    pieces : for each split that was applied, the number of the piece that contains this clip, counted from 1
     findings : findings of the commands
     """
 
@@ -90,8 +91,8 @@ def edit_clip(
     Parameters
     ----------
     clip : Clip    F frames; stays unchanged
-    commands : sequence of commands    in order; after a split, the rest applies to each piece
-    body : EditedBody, optional    joints of the skeleton; by default inferred from names and build
+    commands : sequence of commands    in order; after a split, the remaining commands apply to each piece
+    body : EditedBody, optional    joints of the skeleton; by default inferred from names and proportions
     sources : mapping of str to Clip, optional    other clips by the names that the commands use
     most_numbers : int    largest number of values that the motion may have
     most_work : float    largest work of all commands together, in nanoseconds of one thread (`compute_budget`)

@@ -15,12 +15,14 @@ from marey_motion.errors import EditError
 from marey_schemas.editing.commands import Smooth
 
 LONG_WINDOW = 512
-"""Means over more frames are computed by Fourier transforms, in which the length of the window costs little."""
+"""Frames of a window above which means are computed by Fourier transforms, whose cost hardly depends on the window."""
 CHANNELS_AT_ONCE = 32
-"""Channels that are transformed together: a Fourier transform takes several times the memory of its input."""
+"""Channels that are transformed together. The number is limited because a Fourier transform takes several times the
+memory of its input.
+"""
 
 LEAST_LENGTH = 0.1
-"""Least length of a mean of unit quaternions; a shorter one is of rotations in all directions, which have no mean."""
+"""Minimum length of a mean of unit quaternions; rotations with a shorter mean are so different that they have none."""
 
 
 def smooth(take: Take, command: Smooth) -> Take:

@@ -21,7 +21,7 @@ from marey_motion.rigs import JointMapping, map_joints, symmetric_joints
 from marey_motion.skeleton import Skeleton
 
 MOST_NUMBERS = 200_000_000
-"""Most numbers of a motion that a command may make: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
+"""Maximum count of numbers in a motion that a command makes: 1.6 GB, or two and a half hours of 60 joints at 90 Hz."""
 
 
 UNIT_IN_SINGLE = 3e-7
@@ -48,17 +48,19 @@ class EditedBody:
 
     @cached_property
     def partners(self) -> NDArray[np.int32]:
-        """Index (J,) of each joint's partner on the other side of the body; joints in the middle have their own."""
+        """Index (J,) of each joint's partner on the other side of the body; joints in the middle of the body have their
+        own index.
+        """
         return symmetric_joints(self.skeleton, self.mapping)
 
     @cached_property
     def pelvis(self) -> int:
-        """The joint whose position is that of the body: the pelvis, or the root if no pelvis is known."""
+        """Index of the joint that represents the body's position: the pelvis, or the root if no pelvis is known."""
         return self.skeleton.index_of(self.mapping.joints.get("pelvis", self.skeleton.joint_names[0]))
 
     @cached_property
     def carrier(self) -> int:
-        """The joint that carries the whole body (`MatchingBody.carrier`); the root if no joints are mapped."""
+        """Index of the joint that carries the whole body (`MatchingBody.carrier`); the root if no joints are mapped."""
         try:
             return self.matching.carrier
         except MappingError:
@@ -72,7 +74,7 @@ class EditedBody:
 
 @dataclass(frozen=True)
 class EditFinding:
-    """A finding of a command about the motion before it.
+    """Values that a command reports about its input motion.
 
     Parameters
     ----------
@@ -95,7 +97,7 @@ class Take:
     body : the skeleton and its standard joints
     sources : other clips, by the names that commands use
     findings : findings of the commands so far
-    pieces : number of its piece, from 1, in each split that was applied
+    pieces : for each split that was applied, the number of the piece that contains this motion, counted from 1
     most_numbers : largest number of values that the motion may have
     budget : remaining work of the whole edit
     """
@@ -180,7 +182,8 @@ class Take:
 
         Parameters
         ----------
-        bounds : (int, int or None) or None    None is all frames, and as a stop the end
+        bounds : (int, int or None) or None    start and stop; a stop of None is the end of the motion, and bounds of
+            None are all frames
 
         Returns
         -------
@@ -230,7 +233,7 @@ class Take:
         return round(seconds * self.frame_rate_hz)
 
     def require_room(self, frames: int) -> None:
-        """Check that the motion may grow to so many frames.
+        """Check that a motion with a given number of frames is not too large.
 
         Parameters
         ----------
@@ -238,7 +241,7 @@ class Take:
 
         Raises
         ------
-        EditError    if that exceeds the limit
+        EditError    if such a motion would have more values than `most_numbers`
         """
         width = 3 + 4 * self.skeleton.joint_count + 3 * len(self.motion.translated_joints)
         most = self.most_numbers // width
@@ -251,7 +254,7 @@ class Take:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """Convert a clip to double precision; frames that no command changes keep their bytes.
+    """Convert a clip to double precision; frames that no command changes can be converted back bit by bit.
 
     Parameters
     ----------

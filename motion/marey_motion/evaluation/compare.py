@@ -18,7 +18,7 @@ CONFIDENCE = 0.95
 RESAMPLES = 9_999
 BOOTSTRAP_SEED = 0
 SAME_CHANGE = 1e-12
-"""Changes that differ by no more than this share are the same but for rounding."""
+"""Relative difference up to which two changes count as equal, since rounding can cause it."""
 
 LESS_IS_BETTER = (
     "abs_se_v",

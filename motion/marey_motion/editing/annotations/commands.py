@@ -1,6 +1,6 @@
 """Commands that change a layer of annotation: each returns a new layer or raises `AnnotationError`.
 
-A segment is named by any frame in it.
+A segment is identified by any frame in it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from marey_motion.errors import AnnotationError
 
 
 def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite: bool) -> Layer:
-    """Add the segment [start, end).
+    """Add a segment with the frames [start, end).
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
         clear,
     )
 }
-"""Every command by its name; each takes a layer and answers with the changed one."""
+"""Function of each command by its name; it takes a layer and returns the changed layer."""
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:

@@ -15,7 +15,7 @@ from marey_motion.matching.body import MatchingBody
 from marey_schemas.options.annotations import ContactOptions
 
 LEAVING_FACTOR = 1.6
-"""A contact that has begun lasts until the foot is faster than this times its greatest speed in contact."""
+"""Hysteresis: a contact ends when the foot is faster than this factor times the speed below which a contact begins."""
 SMOOTHING_S = 0.045
 
 
@@ -37,7 +37,8 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 
     Returns
     -------
-    (list of Stance, list of Stance)    of each foot, in order; a stance may begin or end with the clip
+    (list of Stance, list of Stance)    stances of the left and of the right foot, in the order of time; a stance may
+        begin or end with the clip
     """
     positions = kinematics.global_positions(clip)
     feet = [positions[:, list(pair)] for pair in zip(body.feet, body.toes, strict=True)]

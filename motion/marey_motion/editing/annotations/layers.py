@@ -17,7 +17,7 @@ from marey_schemas.names import MAX_LABEL_LENGTH
 
 
 class Segment(NamedTuple):
-    """The frames [start, end) under a label."""
+    """A range of frames [start, end) with a label."""
 
     label: str
     start: int
@@ -45,7 +45,7 @@ class Layer:
 
     Raises
     ------
-    AnnotationError    naming the segment or keyframe that is wrong
+    AnnotationError    naming the invalid segment or keyframe
     """
 
     frame_count: int
@@ -95,7 +95,7 @@ class Layer:
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
     def with_segments(self, first: int, stop: int, *segments: Segment) -> Layer:
-        """Replace a range of segments by others. Only these and their neighbours are checked: the rest is valid.
+        """Replace a range of segments by others. Only the new segments and their neighbours are checked.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class Layer:
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
-        """Replace a range of keyframes by others. Only these and their neighbours are checked: the rest is valid.
+        """Replace a range of keyframes by others. Only the new keyframes and their neighbours are checked.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ def require_segments(segments: Sequence[Segment], frame_count: int) -> None:
 
     Raises
     ------
-    AnnotationError    naming the first segment that is wrong
+    AnnotationError    naming the first invalid segment
     """
     for segment in segments:
         _require_label(segment.label, str(segment))
@@ -213,9 +213,9 @@ def wrong(what: Segment | Keyframe, code: str, reason: str) -> AnnotationError:
 
     Parameters
     ----------
-    what : Segment or Keyframe    what is wrong
+    what : Segment or Keyframe    the invalid segment or keyframe
     code : str    machine-readable code of the error
-    reason : str    a sentence about it
+    reason : str    description of the defect
 
     Returns
     -------

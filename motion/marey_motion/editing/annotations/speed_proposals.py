@@ -1,4 +1,4 @@
-"""Proposals of segments and keyframes where motion pauses and where a hand arrives, for people to review."""
+"""Proposals of segments and keyframes at pauses and reaching movements, for people to review."""
 
 from __future__ import annotations
 

@@ -80,7 +80,8 @@ def _standing(stances: tuple[list[Stance], ...], clip: Clip, standing_s: float) 
 def _steps(stances: tuple[list[Stance], ...], standing: list[Stance]) -> list[_Step]:
     """Find the steps, each from a contact to the next contact of the other foot.
 
-    A step after standing begins where the foot leaves the ground. A stance that begins with the clip has no contact.
+    A step after standing begins where the foot leaves the ground. A stance that includes the first frame of the clip
+    does not count as a contact, since its start is unknown.
     """
     begins, ends = {one.start for one in standing}, {one.end for one in standing}
     lifts = [{after.start: before.end for before, after in pairwise(of_side)} for of_side in stances]

@@ -1,1 +1,3 @@
-"""Inverse kinematics: poses that meet targets of joints, by coordinate descent, two bones, or damped least squares."""
+"""Inverse kinematics: poses that meet targets of joints, by cyclic coordinate descent, a closed form for two bones, or
+damped least squares.
+"""

@@ -1,8 +1,8 @@
-"""Damped least squares: all targets at once, each joint displaced as little as they allow.
+"""Damped least squares: all targets are solved at once, and joints are displaced as little as the targets allow.
 
 The unknowns are displacements of the local rotations, as rotation vectors in each joint's own frame, and of the root.
-There are many more of them than targets, so that the damped normal equations are solved in the space of the targets
-(the Woodbury identity): with a diagonal D, (JᵀJ + D)⁻¹ = D⁻¹ - D⁻¹Jᵀ(1 + J·D⁻¹·Jᵀ)⁻¹J·D⁻¹.
+There are many more unknowns than targets, so the damped normal equations are solved in the space of the targets (the
+Woodbury identity): with a diagonal D, (JᵀJ + D)⁻¹ = D⁻¹ - D⁻¹Jᵀ(1 + J·D⁻¹·Jᵀ)⁻¹J·D⁻¹.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def _fill_step(work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _block(work, v, over):  # type: ignore[no-untyped-def]
-    """Exclude a direction from the steps of movable joint v; return whether this is new.
+    """Exclude a direction from the steps of movable joint v; return whether it was not excluded before.
 
     `work.outward` is the excluded direction, or, if two are excluded, the direction that remains free.
     """

@@ -55,7 +55,7 @@ class Targets(NamedTuple):
 
 
 class SolverResult(NamedTuple):
-    """Results of a solver: residuals (F, C), iterations and whether all targets are reached (F,)."""
+    """Results of a solver: residuals (F, C), iterations (F,), and whether all targets are reached (F,)."""
 
     before: Floats
     after: Floats

@@ -1,7 +1,7 @@
 """Inverse kinematics: joint rotations that bring points, orientations and look-at axes to their targets.
 
-There are three solvers. Each solves frames independently: a frame has the same result alone and among others. No solver
-returns a pose with a larger error than the given pose. The error is the weighted sum of squares in metres, with
+There are three solvers. Each solves frames independently: the result for a frame does not depend on other frames. No
+solver returns a pose with a larger error than the given pose. The error is the weighted sum of squares in metres, with
 `ANGLE_LENGTH_M` metres per radian. If the given pose violates limits, it is brought within them before the comparison.
 """
 
@@ -92,7 +92,7 @@ class _LimbKernel(NamedTuple):
 def limb_ending_at(
     skeleton: Skeleton, mapping: JointMapping, joint: int, axes: Mapping[str, JointAxes] | None = None
 ) -> TwoBoneLimb | None:
-    """Find the arm or leg that ends at a joint, which must be its wrist or ankle.
+    """Find the arm or leg whose wrist or ankle is a given joint.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def limb_ending_at(
 
     Returns
     -------
-    TwoBoneLimb or None    None for other joints
+    TwoBoneLimb or None    None if the joint is neither
     """
     for side in ("left", "right"):
         for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
@@ -129,7 +129,7 @@ def solve(
     solver: Solver = "auto",
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Solve inverse kinematics by a given solver or the one that suits the targets.
+    """Solve inverse kinematics with a given solver, or with the solver that suits the targets.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def solve_ccd(
     freedom: Freedom = _ANYWHERE,
     options: SolverOptions = _OPTIONS,
 ) -> SolvedPoses:
-    """Solve by cyclic coordinate descent: joint after joint, from the targets to the root, takes the best rotation.
+    """Solve by cyclic coordinate descent: each joint in turn, from the targets to the root, gets its best rotation.
 
     The best rotation is, for one target, the shortest rotation that aims at it (Wright 2015); for several targets, the
     solution of Wahba's problem for all of them (Davenport's q-method); for a hinge, the best angle within its limits.
@@ -228,8 +228,8 @@ def solve_least_squares(
 ) -> SolvedPoses:
     """Solve by damped least squares over all targets, with the analytic Jacobian of rotation-vector displacements.
 
-    Minimises the weighted squares of the errors plus those of the displacements (`regularisation_m` metres per radian),
-    so that directions without a target stay unchanged. Joints at a limit slide along it.
+    Minimises the sum of the weighted squared errors and of the squared displacements (`regularisation_m` metres per
+    radian), so that rotations that do not affect a target stay unchanged. Joints at a limit slide along it.
 
     Parameters
     ----------
@@ -282,8 +282,8 @@ def solve_two_bone(
     orientation : OrientationTarget, optional    orientation of the end
     ending : str    without an orientation, "carried" keeps the end's local rotation and "held" its orientation in the
         world
-    damping_zone_rad : float    radians before straight in which the middle joint's change is damped, so that it does
-        not snap (Kovar, Schreiner and Gleicher 2002); a target there is missed by a little
+    damping_zone_rad : float    angle from the straight limb, in radians, within which the change of the middle joint is
+        damped, so that the joint does not snap (Kovar, Schreiner and Gleicher 2002); a target there is missed slightly
     options : SolverOptions    tolerances
 
     Returns
@@ -346,7 +346,7 @@ def _kernel_limb(
 
 
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
-    """Restore the frames whose error the closed form increased, such as by an orientation that moves a tool away."""
+    """Restore the frames in which the closed form increased the error, such as by turning a tool away from a target."""
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
     problem.rotations[worse] = before[worse]

@@ -20,7 +20,7 @@ from marey_motion.skeleton import Skeleton
 from marey_schemas.editing.constraints import Axes
 
 ANGLE_LENGTH_M = 0.01 / math.radians(5.0)
-"""Metres that a radian counts for beside positions: five degrees are as bad as a centimetre."""
+"""Weight of angles against positions, in metres per radian: an error of five degrees counts as much as a centimetre."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,6 @@
-"""Inverse kinematics of limbs with two bones: the target's distance gives the bend, then the limb is aimed at it."""
+"""Inverse kinematics of limbs with two bones: the distance of the target determines the bend; then the limb is aimed at
+the target.
+"""
 
 from __future__ import annotations
 
@@ -154,7 +156,9 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """Compute the longest distance (F,) that limbs, now `starts` metres from start to end, reach without damping."""
+    """Compute the longest distances (F,) that limbs reach without damping; `starts` are their present lengths, in
+    metres.
+    """
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]

@@ -20,7 +20,8 @@ from marey_schemas.options.evaluation import EvaluationOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 200
-"""Most frames of a candidate that are compared with the set; of more frames in holes, every k-th is taken."""
+"""Maximum number of frames of a candidate that are compared with the set; if more lie in holes, every k-th is compared.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,12 @@ class Filling:
     seconds : duration of the clip
     cells : the cells that it helps to fill, most seconds first
     filled_s : seconds that it fills, summed over the cells
-    blendable_share : share of its frames in these cells that can be blended with a frame of the set; None for another
-        skeleton
+    blendable_share : share of its frames in these cells that can be blended with a frame of the set; None if the source
+        has another skeleton
     measured : number of frames compared
     needs_retarget : whether it has another skeleton and must be retargeted before its share can be measured
-    score : filled_s times blendable_share, by which candidates are ranked; those without a share follow, by filled_s
+    score : filled_s times blendable_share, by which candidates are ranked; candidates without a share follow, ranked by
+        filled_s
     coverage_index : coverage index of the set with this candidate
     """
 
@@ -128,7 +130,7 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates: each step adds the best for the data that is still missing, until no candidate helps.
+    """Order candidates: each step adds the best candidate for the still missing data, until no candidate provides any.
 
     Candidates of another skeleton come after all others.
 

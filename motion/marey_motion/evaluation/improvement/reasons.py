@@ -104,7 +104,7 @@ def why_filling(filling: Filling) -> str:
 
 
 def why_addition(addition: Addition) -> str:
-    """Explain the gain of a clip beside those added before it.
+    """Explain the gain of a clip in addition to the clips added before it.
 
     Parameters
     ----------
