@@ -173,9 +173,7 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
 
 
 def _surely_unit(rotations: NDArray[np.float32]) -> bool:
-    """Return whether rotations (F, J, 4) have unit length with a margin for rounding, in half the time of the full
-    check.
-    """
+    """Return whether rotations (F, J, 4) certainly have unit length, in half the time of the full check."""
     with np.errstate(over="ignore"):  # the check names the rotation
         squares = rotations * rotations
     lengths = squares[..., 0] + squares[..., 1]

@@ -76,7 +76,7 @@ def write_motion_file(
     time: Literal["canonical", "source"] = "canonical",
     skeleton: Skeleton | None = None,
 ) -> ExportedFile:
-    """Write the motion of a clip, or of an aligned clip, as a file; server and worker both export by this function.
+    """Write the motion of a clip, or of an aligned clip, as a file. Server and worker both use this function.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def write_motion_file(
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
-    """Read the rotation orders of the file a clip was imported from, if the clip still has that file's skeleton."""
+    """Read the rotation orders of the file from which a clip was imported, if the clip still has its skeleton."""
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))
     if len(channels) != clip.skeleton.joint_count:

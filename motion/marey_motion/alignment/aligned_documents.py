@@ -132,8 +132,7 @@ def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
 
 
 def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
-    """Restore the source clip of a stored example: its frames at the set's rate, with their original timing and
-    position.
+    """Restore the source clip of a stored example at the set's rate, with its original timing and position.
 
     Parameters
     ----------

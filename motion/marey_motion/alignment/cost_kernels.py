@@ -12,8 +12,7 @@ from marey_motion.kernels import compiled
 
 @compiled
 def _products(points, others, real, imaginary, heights):  # type: ignore[no-untyped-def]
-    """Sum horizontal products h·h̄' and squared height differences over the points, for each frame of `others` (P, 3,
-    m).
+    """Sum horizontal products h·h̄' and squared height differences over P points, for each frame of `others` (P, 3, m).
 
     h = x + i·z are horizontal positions as complex numbers.
     """

@@ -125,8 +125,7 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill a row of totals from the row before; row r of `runs` (max_run, m) has the totals after r + 1 steps 1-0 in a
-    row.
+    """Fill a row of totals from the row before; row r of `runs` (max_run, m) is for runs of r + 1 steps 1-0.
 
     A run of steps 0-1 starts from totals that depend only on the row before. No cell therefore waits for its left
     neighbour, and every loop runs over whole vectors.

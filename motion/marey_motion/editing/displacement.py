@@ -190,8 +190,7 @@ def _curve(frames: AnyInts, values: Floats, window: Window, swing: float) -> Flo
 
 
 def _energy(count: int, window: Window, swing: float) -> Floats:
-    """Compute the lower diagonals (4, count) of the quadratic form that measures bending and tension of `count` control
-    points.
+    """Compute lower diagonals (4, count) of the quadratic form of bending and tension of `count` control points.
 
     Beyond a smooth end all control points are zero; beyond an end that is not smooth there are no control points.
     """

@@ -121,8 +121,9 @@ def _same_rate(take: Take, source: str) -> Take:
 
 
 def _seam(before: Take, after: Take, overlap: int) -> LoopSeam:
-    """Find the rotation and shift on the ground that attach one clip to the end of the other; overlapping clips are
-    matched at the middle of the overlap.
+    """Find the rotation and shift on the ground that attach one clip to the end of the other.
+
+    Overlapping clips are matched at the middle of the overlap.
     """
     if overlap:
         there, here = before.frame_count - overlap + overlap // 2, overlap // 2

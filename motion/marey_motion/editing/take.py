@@ -48,9 +48,7 @@ class EditedBody:
 
     @cached_property
     def partners(self) -> NDArray[np.int32]:
-        """Index (J,) of each joint's partner on the other side of the body; joints in the middle of the body have their
-        own index.
-        """
+        """Index (J,) of each joint's partner on the other side of the body; joints in the middle are their own."""
         return symmetric_joints(self.skeleton, self.mapping)
 
     @cached_property

@@ -26,7 +26,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """Ratio of each of a trial's three errors to its limit; above 1 exceeds the limit, infinite if not defined."""
+    """Ratios of a trial's three errors to their limits: above 1 beyond the limit, infinite if undefined."""
 
     place: float
     speed: float
@@ -46,7 +46,7 @@ class Judgement:
     ----------
     grade : str    one of `GRADES`
     followed, trials : int    number of followed trials, and of all trials
-    worst : TrialResult, optional    the trial farthest beyond its limits, or nearest to them; None without trials
+    worst : TrialResult, optional    the trial with the largest ratio of an error to its limit; None without trials
     """
 
     grade: str
@@ -108,7 +108,7 @@ def strain(outcome: TrialResult) -> Strain:
 
 
 def mean_speed_m_s(trial: Trial) -> float:
-    """Compute the mean desired speed over the circle; a switching trial begins the circle at its base speed.
+    """Compute the mean desired speed over the circle; a trial with switching speed begins the circle at its base speed.
 
     Parameters
     ----------

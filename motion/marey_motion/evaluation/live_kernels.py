@@ -11,7 +11,7 @@ import numpy as np
 from marey_motion.kernels import compiled
 
 RECEIVED, SMOOTHED = 0, 1
-"""Places in `take.counters`."""
+"""Indices in `take.counters`."""
 
 
 @compiled
@@ -27,7 +27,7 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
-    """Replace the oldest step of the ring buffer. Sums are recomputed once per turn, so that rounding stays bounded."""
+    """Replace the oldest step of the ring buffer. Sums are recomputed once per cycle of the buffer to bound errors."""
     for column, value in enumerate((length, ahead, left)):
         take.sums[column] += value - take.steps[place, column]
         take.steps[place, column] = value

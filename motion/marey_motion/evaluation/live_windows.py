@@ -57,7 +57,7 @@ class Filters(NamedTuple):
 
 
 class LiveWindows:
-    """Windows of one second of a performance at `rate_hz`, take by take."""
+    """Windows of one second of a performance at `rate_hz`, computed for one take after another."""
 
     def __init__(self, rate_hz: float) -> None:
         if not LEAST_FRAME_RATE_HZ <= rate_hz <= MOST_FRAME_RATE_HZ:
@@ -142,7 +142,7 @@ class LiveWindows:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> LiveWindows:
-        """Restore a state saved by `as_tree`, to the same bits.
+        """Restore a state saved by `as_tree`, bit by bit.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class LiveWindows:
 
         Returns
         -------
-        LiveWindows    continues with the next frame
+        LiveWindows    windows that continue with the next frame
         """
         live = cls(tree["rate_hz"])
         for name, own in live._take._asdict().items():

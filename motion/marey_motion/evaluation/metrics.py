@@ -24,9 +24,9 @@ from marey_schemas.options.evaluation import EvaluationOptions, Grid
 
 REGIMES = ("approach", "base", "switched")
 RESPONSE_SHARE = 0.1
-"""A speed has responded when its error is below this share of the speed asked for..."""
+"""Share of the desired speed below which the error of the speed must fall for the speed to count as reached."""
 RESPONSE_HOLD_S = 0.5
-"""...for so long."""
+"""Seconds for which the error must stay below `RESPONSE_SHARE` for the speed to count as reached."""
 LEAST_TRAVEL_M_S = 0.05
 """Speed below which the direction of travel of a step is not defined."""
 
@@ -145,7 +145,7 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Compute turn rates from the step before; NaN if a step is too short or only one of both is in the approach."""
+    """Compute turn rates from the step before; NaN if a step is too short or only one of the two is in the approach."""
     turned = np.diff(np.arctan2(steps[:, 0], steps[:, 1]))
     turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
     moving = speeds >= LEAST_TRAVEL_M_S
@@ -243,7 +243,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
 
 
 def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Compute the metrics of transitions that were chosen; jumps forced by the end of a clip do not count."""
+    """Compute the metrics of chosen transitions; jumps forced by the end of a clip do not count."""
     status = record.status[1:][window]
     transitions = float(np.count_nonzero(status == Status.REPLACING))
     return {
@@ -272,8 +272,9 @@ def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]
 
 
 def _literal_metrics(series: TrialSeries, window: Flags, grid: Grid) -> Metrics:
-    """Compute equations 1 to 4 as printed: a sum of m + 1 terms divided by m, and the square of a sum divided by a
-    count.
+    """Compute equations 1 to 4 of the paper as printed.
+
+    There, a sum of m + 1 terms is divided by m, and the square of a sum is divided by a count.
     """
     metrics: dict[str, float | None] = {}
     for name, recorded, wanted, settings in (
@@ -309,7 +310,7 @@ def _p95(values: Floats) -> float:
 
 
 SUMMED = ("transitions", "clip_ends", "response_missed")
-"""Counts: a suite has their sums."""
+"""Metrics that are counts; those of a suite are the sums over its trials."""
 
 
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:

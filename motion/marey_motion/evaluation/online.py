@@ -32,18 +32,20 @@ from marey_motion.motion import Motion
 from marey_schemas.options.evaluation import COVERAGE_LEAST_S, MOST_CELLS, TARGET_PATH_S, Grid
 
 FARTHEST_M = 1e6
-"""Distance from the origin beyond which positions are broken, or too inexact to give speeds."""
+"""Distance from the origin, in metres, beyond which positions are invalid or too inexact to compute speeds."""
 
 PATH_RATE_HZ = 5.0
 AWAY_DECIMALS = 1
-"""A tenth of a cell is no difference between two targets; of such two, the one that lacks more comes first."""
+"""Decimals to which distances between cells are compared; of equally distant targets, the one that lacks more is first.
+"""
 
 
 @dataclass(frozen=True)
 class PerformerState:
-    """Position of the performer in the newest frame, and motion in the newest window, which is None at first.
+    """Position of the performer in the newest frame, and mean motion in the newest window.
 
-    Ground position in metres, heading in radians, strafe positive to the left.
+    The motion is None until a window exists. Ground position in metres, heading in radians, strafe positive to the
+    left.
     """
 
     x_m: float
@@ -155,7 +157,7 @@ class OnlineCoverage:
         return self._add(positions, np.stack((np.sin(headings), np.cos(headings)), axis=-1))
 
     def end_take(self) -> Windows:
-        """End the take, as for a pause or lost frames: no window continues across it.
+        """End the take, such as at a pause or after lost frames. No window spans the end of a take.
 
         Returns
         -------
@@ -220,7 +222,7 @@ class OnlineCoverage:
 
         Returns
         -------
-        tuple of Target    each with a path at its speed and turn rate
+        tuple of Target    each target with a path at its speed and turn rate
         """
         seconds, deficits = self.seconds, self.deficit_s
         speeds, turn_rates = np.unique(self.grid.speeds_m_s), np.unique(self.grid.turn_rates_deg_s)
@@ -258,7 +260,7 @@ class OnlineCoverage:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OnlineCoverage:
-        """Restore a state saved by `as_tree`, to the same bits.
+        """Restore a state saved by `as_tree`, bit by bit.
 
         Parameters
         ----------
@@ -266,7 +268,7 @@ class OnlineCoverage:
 
         Returns
         -------
-        OnlineCoverage    continues with the next frame
+        OnlineCoverage    coverage that continues with the next frame
         """
         grid = Grid(speeds_m_s=tree["speeds_m_s"], turn_rates_deg_s=tree["turn_rates_deg_s"])
         online = cls(tree["live"]["rate_hz"], grid, least_s=tree["least_s"], seconds=tree["before_s"])

@@ -47,11 +47,11 @@ def provenance_of(database: MatchingDatabase, options: EvaluationOptions, trials
 
 
 def require_comparable(before: Provenance, after: Provenance) -> None:
-    """Check that costs, options and scenarios of two evaluations agree.
+    """Check that the cost functions, options and scenarios of two evaluations agree.
 
     Parameters
     ----------
-    before, after : Provenance    of the evaluations
+    before, after : Provenance    digests of the two evaluations
 
     Raises
     ------

@@ -14,7 +14,7 @@ from marey_motion.matching.database import DatabaseClip
 from marey_motion.matching.record import Status, TrialRecord
 
 TREADING_S = 1 / 3
-"""A switch back to a moment so near the one that was left goes nowhere."""
+"""Seconds; a jump to a moment of the same clip at most this far away makes the character tread on the spot."""
 
 
 class Jumps(NamedTuple):
@@ -141,7 +141,7 @@ class SourceUsage:
 
     Parameters
     ----------
-    uid, name : str    of the source clip
+    uid, name : str    uid and name of the source clip
     clips : tuple of int    indices of the one or two clips made from it
     ticks, share, entries    sums over these clips
     popularity : (frames,) int64    ticks of each frame, summed
@@ -215,7 +215,7 @@ def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
 
 
 def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> float | None:
-    """Compute the share of chosen jumps that land within `TREADING_S` of their start, in the same clip.
+    """Compute the share of chosen jumps that stay in the same clip and lead at most `TREADING_S` away.
 
     A character without suitable data returns to nearly the same frame at every search, so it slides on the ground.
 

@@ -14,7 +14,9 @@ from marey_motion.matching.record import TrialRecord
 from marey_schemas.options.evaluation import EvaluationOptions
 
 Metrics = Mapping[str, float | None]
-"""Value by name, in the unit the name ends with; None where it is not defined, as a response time that never came."""
+"""Value of each metric by name, in the unit in which the name ends. None if it is undefined, as a response time is when
+there is no response.
+"""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class ClipUsage:
 
     Parameters
     ----------
-    ticks, entries : ticks in which it was displayed; number of jumps to it, chosen or forced by the end of a clip
+    ticks, entries : number of ticks that displayed the clip; number of jumps to it, chosen or forced by the end of a
+        clip
     popularity : (frames,) int64    number of ticks in which each frame was displayed
     trials : number of trials that displayed it
     """

@@ -43,7 +43,7 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Name such as "circle v=1.25 w=-50": stable, and unique within a suite."""
+        """Stable name, unique within a suite, such as "circle v=1.25 w=-50"."""
         return f"{self.family} v={self.speed_m_s:g} w={np.degrees(self.turn_rate_rad_s):g}"
 
 
@@ -56,7 +56,7 @@ def demand(trial: Trial) -> str:
 
     Returns
     -------
-    str    for people
+    str    a phrase for people
     """
     turn = float(np.degrees(trial.turn_rate_rad_s))
     speed = f"{trial.speed_m_s:g} m/s"

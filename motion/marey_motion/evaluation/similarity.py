@@ -23,7 +23,9 @@ from marey_motion.matching.record import Status, TrialRecord
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000
-"""Most frames of a cell that are measured; of more, every k-th is taken. All of them are candidates for matches."""
+"""Maximum number of frames of a cell that are measured; if there are more, every k-th is. All are candidates for
+matches.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,8 @@ class PoseSimilarity:
     Parameters
     ----------
     threshold_m : largest distance at which frames can be blended: sum over the pose joints, metres
-    frames, sources : (V, O) int64    numbers in the cell; a clip and its mirrored copy are one source
+    frames, sources : (V, O) int64    numbers of frames and of sources in the cell; a clip and its mirrored copy are one
+        source
     measured : (V, O) int64    number of frames compared; evenly chosen if there are more than `MOST_FRAMES`
     distance_m : (V, O) median distance; NaN with fewer than two sources
     blendable_share : (V, O) share of the measured frames within the threshold; 0 with one source, NaN without frames
@@ -203,7 +206,8 @@ def nearest_poses(
 
     Returns
     -------
-    (Q,) float64    metres, summed over the points like the pose cost of a transition; infinite without another group
+    (Q,) float64    metres, summed over the points like the pose cost of a transition; infinite if there is no other
+        group
     """
     from marey_motion.evaluation import similarity_kernels as kernels
 

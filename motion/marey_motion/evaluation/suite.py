@@ -1,6 +1,6 @@
 """A suite of trials over a database: run on several threads, measured, and assembled.
 
-The result depends on the database, the options and the trials alone, not on threads or the order of work.
+The result depends only on the database, the options and the trials, not on the threads or the order of work.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def run_suite(
 
     Raises
     ------
-    EvaluationCancelled    if cancelled, after the trials that were running are finished
+    EvaluationCancelled    if cancelled; trials that are running are finished first
     MotionError    if two trials have the same name, such as with speeds that differ by less than a millionth
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
@@ -288,7 +288,7 @@ def evaluate_baseline(
 
 
 def baseline_clips(options: EvaluationOptions) -> tuple[list[SourceClip], list[str]]:
-    """Generate a gait for each pair of the grid, and for the speed that trials switch to.
+    """Generate a gait for each pair of speed and turn rate of the grid, and for the speed to which trials switch.
 
     Parameters
     ----------

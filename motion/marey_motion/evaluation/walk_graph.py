@@ -1,7 +1,7 @@
 """Directed graph of the frames that characters display and of the jumps between them.
 
 The terms are those of Kovar et al. (2002): clips that lead to each other and back form a strongly connected component;
-a dead end is a component that is never left again.
+a dead end is a component that is entered and never left.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class WalkGraph:
 
     Parameters
     ----------
-    rows : (N,) int64    database rows displayed, ascending: the nodes
-    ticks : (N,) int64    number of ticks in which each was displayed
+    rows : (N,) int64    the nodes: displayed database rows, ascending
+    ticks : (N,) int64    number of ticks in which each row was displayed
     edges : (E, 3) int64    row left, row entered and count; ordered by the first two
     walks : for each record (R, 3) int64    first tick, first row and number of frames of each run without a jump
     """
@@ -58,7 +58,7 @@ def walk_graph(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) ->
 
 
 def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
-    """Find the first tick, first row and length of each run of consecutive frames of one clip."""
+    """Find each run of consecutive frames of one clip: its first tick, first row and length."""
     rows = record.rows.astype(np.int64)
     owners = clips_of_rows(clips, rows)
     firsts = np.concatenate(([0], np.flatnonzero((np.diff(rows) != 1) | (np.diff(owners) != 0)) + 1))
@@ -67,7 +67,7 @@ def _runs(clips: Sequence[DatabaseClip], record: TrialRecord) -> Ints:
 
 
 def graph_to_tree(graph: WalkGraph) -> dict[str, Any]:
-    """Convert a graph to plain values for JSON; edges name their nodes by index.
+    """Convert a graph to plain values for JSON; edges identify their nodes by index.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class ClipGraph:
 
     Parameters
     ----------
-    counts : number of jumps by (clip left, clip entered), in ascending order; a clip may follow itself
+    counts : number of jumps by (clip left, clip entered), in ascending order; both may be the same clip
     components : strongly connected components of the clips that were displayed, largest first, then by lowest index
     dead_ends : components that were entered and never left
     """
@@ -183,7 +183,7 @@ class ClipGraph:
 
 
 def clip_graph(clips: Sequence[DatabaseClip], switches: Ints, used: Sequence[int]) -> ClipGraph:
-    """Reduce the graph of frames to one of clips.
+    """Reduce the graph of frames to a graph of clips.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ def read_motion(
     ----------
     data : bytes    the content of the file
     name : str    its name, which helps to detect the format and appears in messages
-    companion : bytes, optional    the ASF of an AMC, the skeleton document of a predecessor's clip
+    companion : bytes, optional    the ASF of an AMC, or the skeleton document of a clip of the predecessor
     companion_name : str    its name, for messages
     options : ImportOptions, optional    facts that the user knows better than the file
 
@@ -62,7 +62,7 @@ def read_motion(
     ------
     UnknownFormat    if no reader knows the file
     AmbiguousUnits    if the unit of length or the upward axis cannot be determined and must be given in `options`
-    FormatError    with file, line and joint, if the file is wrong
+    FormatError    if the file is invalid; the error names file, line and joint
 
     Examples
     --------
@@ -105,7 +105,7 @@ def read_source(
     Raises
     ------
     UnknownFormat    if no reader knows the file
-    FormatError    with file, line and joint, if the file is wrong
+    FormatError    if the file is invalid; the error names file, line and joint
     """
     content = bytes(data)
     row = detect_format(content, name)

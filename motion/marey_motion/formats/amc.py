@@ -46,7 +46,7 @@ def read_amc(
 
     Raises
     ------
-    FormatError    with the line, and the bone if there is one
+    FormatError    naming the line, and the bone if there is one
     """
     if companion is None:
         message = "an AMC holds angles alone; import it together with its ASF"
@@ -74,9 +74,9 @@ def read_amc(
 
 
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
-    """Read the unit of angles and the frame rate, if given; leave `lines` before the first frame.
+    """Read the header, up to the first frame; return whether angles are in degrees, and the frame rate if given.
 
-    Returns whether angles are in degrees; if the AMC does not say, `degrees`, which is the unit of its skeleton.
+    If the AMC gives no unit of angles, `degrees` applies, which is the unit of its skeleton.
     """
     rate_hz = None
     while True:

@@ -1,6 +1,7 @@
 """Scanner of the frames of an AMC file.
 
-A frame is a line with its number, then one line per bone, in any order: its name and one value per degree of freedom.
+A frame is a line with its number, then one line per bone, in any order: the bone's name and one value per degree of
+freedom.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _LONG_TOKENS_PER_CALL = 1 << 14
 
 @dataclass(frozen=True)
 class BoneTable:
-    """Bones of the skeleton as arrays for the scanner: concatenated names with their ends, and columns of each bone."""
+    """Bones of the skeleton as arrays for the scanner: concatenated names, ends of names, columns of bones."""
 
     names: NDArray[np.uint8]
     name_ends: NDArray[np.int64]
@@ -67,7 +68,7 @@ def scan_frames(lines: TextLines, skeleton: AsfSkeleton) -> tuple[NDArray[np.flo
 
     Raises
     ------
-    FormatError    with line and bone
+    FormatError    naming line and bone
     """
     text = ending_in_a_line(np.frombuffer(lines.data, np.uint8))
     table = BoneTable.of(skeleton.bones)
@@ -131,7 +132,7 @@ def _scan(text, names, name_ends, first_columns, values, seen, long_tokens, stat
 
 @compiled
 def _next_word(text, state):  # type: ignore[no-untyped-def]
-    """Find the first byte of the next word, counting the lines on the way."""
+    """Find the first byte of the next word, and count the lines that are passed."""
     i = state[_POSITION]
     while i < text.size and text[i] <= 32:
         if text[i] == 10 or (text[i] == 13 and not (i + 1 < text.size and text[i + 1] == 10)):

@@ -1,10 +1,10 @@
-"""ASF (Acclaim skeleton file): reading.
+"""Reader of ASF (Acclaim skeleton files).
 
 In an ASF, a bone has a direction and a length in world axes at rest, and an `axis`: the frame in which its angles are
 measured. With C the rotation of that frame and M the rotation by the angles, the bone turns by C · M · C⁻¹ relative to
-its parent. The joints that are made of the bones have world-aligned frames at rest (identity rest rotations, as in
-BVH). Each joint is at the start of its bone, so its offset is its parent's bone vector; the end of a bone without
-children becomes an end site.
+its parent. The joints made from the bones have world-aligned frames at rest (identity rest rotations, as in BVH). Each
+joint is at the start of its bone, so its offset is its parent's bone vector; the end of a bone without children becomes
+an end site.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class Bone:
 
 @dataclass
 class AsfSkeleton:
-    """An ASF file: bones in depth-first order, the root first.
+    """The content of an ASF file: bones in depth-first order, the root first.
 
-    `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None when it gives none;
-    `degrees` is false where its angles are radians; `root_position` is the root's position in the rest pose.
+    `parents` are indices; `length_unit` is the file's `units length` (CMU: 0.45), None if the file has none; `degrees`
+    is false if the file's angles are in radians; `root_position` is the root's position in the rest pose.
     """
 
     bones: list[Bone]
@@ -143,7 +143,9 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
 
 _LONGEST_KEPT = 1 << 18
 _KNOWN: LruCache[bytes, AsfSkeleton] = LruCache(max_entries=32)
-"""Skeletons parsed last, by the digest of their file; nothing changes them. Many AMC files share one ASF."""
+"""Cache of the skeletons parsed last, by digest of their file, since many AMC files share one ASF. They must not
+change.
+"""
 
 
 def parse_asf(data: bytes, file: str) -> AsfSkeleton:
@@ -168,7 +170,7 @@ def parse_asf(data: bytes, file: str) -> AsfSkeleton:
 
 
 class _AsfReader:
-    """Reader of the sections of an ASF file; a section is a keyword that begins with a colon and the lines after it."""
+    """Reader of the sections of an ASF file. A section is a keyword with a leading colon, and the lines after it."""
 
     def __init__(self, lines: TextLines) -> None:
         self.lines = lines

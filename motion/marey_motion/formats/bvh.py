@@ -1,4 +1,4 @@
-"""BVH (Biovision hierarchy): reading; writing is in `bvh_writer`.
+"""Reader of BVH (Biovision hierarchy); the writer is in `bvh_writer`.
 
 Rotations are intrinsic, in degrees, in the order of a joint's CHANNELS; a joint may have any number of rotation
 channels, before or after its position channels. A position channel replaces the joint's OFFSET on its axis.
@@ -32,10 +32,10 @@ _PRINTED_DIGITS = 1e-6
 
 @dataclass(frozen=True)
 class ChannelColumns:
-    """Columns of the number table in which each channel is.
+    """Column of each channel in the table of numbers.
 
     `turns` and `axes` (J, 3) are the column and the axis of each joint's rotations; `positions` (J, 3) are the columns
-    of x, y and z. `NO_COLUMN` marks a channel that the joint lacks. `labels` name each column for messages.
+    of x, y and z. `NO_COLUMN` marks a channel that the joint lacks. `labels` are names of the columns for messages.
     """
 
     turns: NDArray[np.int64]
@@ -51,7 +51,7 @@ def read_bvh(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
     ----------
     data : bytes    content of the file
     file : str    its name, for messages
-    frame_rate_hz : float, optional    replaces the rate that follows from the file's Frame Time
+    frame_rate_hz : float, optional    replaces the rate computed from the file's Frame Time
 
     Returns
     -------
@@ -205,10 +205,10 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
 
 
 def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Add offsets to position channels below the root that are displacements from them, as some exporters write.
+    """Add offsets to position channels below the root that contain displacements from the offsets.
 
-    Such channels are detected by their size: those of most joints stay within a tenth of the bone's length of zero.
-    Taken as positions, they would give every bone nearly no length.
+    Some exporters write such channels. They are detected by their size: for most joints, the values stay within a tenth
+    of the bone's length from zero. If they were positions, every bone would have nearly no length.
     """
     offsets = source.offsets[list(source.translated_joints)]
     lengths = np.linalg.norm(offsets, axis=1)
@@ -229,7 +229,7 @@ def _resolve_displacements(source: SourceMotion, translations: NDArray[np.float6
 
 
 def _drop_redundant_translations(source: SourceMotion, translations: NDArray[np.float64]) -> None:
-    """Keep only joints whose positions differ from their OFFSET by more than the rounding of files."""
+    """Keep only translations of joints whose positions differ from their OFFSET by more than the rounding of files."""
     offsets = source.offsets[list(source.translated_joints)]
     size = np.abs(source.offsets).max()
     farthest = np.maximum(translations.max(axis=0) - offsets, offsets - translations.min(axis=0))

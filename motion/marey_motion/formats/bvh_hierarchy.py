@@ -33,7 +33,7 @@ class BvhHeader:
     """Everything in a BVH file before its numbers.
 
     `offsets[joint]`, `channels[joint]` follow the order of the joints in the file; `data_start` is the byte and
-    `data_line` the line where the numbers begin; `frame_time_s` is None if the file leaves it out.
+    `data_line` the line where the numbers begin; `frame_time_s` is None if the file does not contain it.
     """
 
     names: list[str] = field(default_factory=list)
@@ -49,7 +49,7 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """A parsed HIERARCHY, and the position and line number after it. Its lists are never changed."""
+    """A parsed HIERARCHY, and the position and line number after it. The lists must not be changed."""
 
     header: BvhHeader
     position: int
@@ -57,7 +57,7 @@ class _KeptHierarchy:
 
 
 _KNOWN: LruCache[bytes, _KeptHierarchy] = LruCache(max_entries=64)
-"""Hierarchies read last, by the digest of their text."""
+"""Cache of the hierarchies read last, by the digest of their text."""
 
 
 def read_header(lines: TextLines) -> BvhHeader:
@@ -73,7 +73,7 @@ def read_header(lines: TextLines) -> BvhHeader:
 
     Raises
     ------
-    FormatError    with the line that is wrong
+    FormatError    naming the invalid line
     """
     header = _read_hierarchy(lines)
     _read_motion_header(lines, header)
@@ -99,7 +99,7 @@ def _read_hierarchy(lines: TextLines) -> BvhHeader:
 
 
 class _HierarchyReader:
-    """Reader of joints, token by token; open joints are in a list, not on the call stack, so depth does not matter."""
+    """Reader of joints, token by token. Open joints are in a list, not on the call stack, so any depth is possible."""
 
     def __init__(self, lines: TextLines) -> None:
         self.lines = lines

@@ -1,4 +1,4 @@
-"""BVH: writing.
+"""Writer of BVH.
 
 The root and every joint with translations have six channels, positions before rotations; all other joints have three
 rotation channels. This is the most common layout. Positions replace offsets, as most readers expect.
@@ -70,7 +70,7 @@ def _axes_of(skeleton: Skeleton, joint: int, rotation_order: str, source: Source
 
 
 def _depth_first(skeleton: Skeleton) -> list[int]:
-    """List joints in depth-first order: the order of the skeleton if it is depth-first."""
+    """List the joints in depth-first order, which is the order of the skeleton if that is depth-first."""
     order, waiting = [], [0]
     while waiting:
         joint = waiting.pop()

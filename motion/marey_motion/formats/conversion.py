@@ -37,7 +37,9 @@ _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
 _CONVERTED: LruCache[tuple[Anatomy, tuple[tuple[int, bytes], ...], bytes, float], Skeleton] = LruCache(
     max_entries=KEPT_SKELETONS
 )
-"""Skeletons by everything that they follow from: those of their files with end sites, axes and unit."""
+"""Cache of converted skeletons, by all values from which they are computed: skeleton, end sites, axes and unit of the
+file.
+"""
 
 
 def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:
@@ -98,7 +100,7 @@ def convert(source: SourceMotion, file: str, options: ImportOptions) -> Imported
 
 
 def _check_range(source: SourceMotion, file: str) -> None:
-    """Refuse lengths whose squares or float32 values would overflow; no body or path is that long in any unit."""
+    """Refuse lengths whose squares or float32 values would overflow. No body or path is that long in any unit."""
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
@@ -156,7 +158,7 @@ def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real
 
 
 def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
-    """List the changes that the reader and the conversion made and that a user should know."""
+    """List changes made by the reader and the conversion, for the user."""
     notices = []
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"

@@ -1,4 +1,4 @@
-"""Detection of a file's format by its content, or by its name if the content is not sufficient."""
+"""Detection of a file's format by its content, or by its name if the content is not enough."""
 
 from __future__ import annotations
 

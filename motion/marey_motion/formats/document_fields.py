@@ -1,4 +1,4 @@
-"""Reading of fields of unvalidated documents; a missing or wrong value raises an error that names the field."""
+"""Reading of fields of unvalidated documents; a missing or invalid value raises an error that names the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Conversion between Euler angles of files and quaternions; each joint has its own order of axes.
+"""Conversion between quaternions and the Euler angles of files; each joint has its own order of axes.
 
 Angles are intrinsic: channels Z, X, Y mean R = Rz · Rx · Ry.
 """
@@ -51,7 +51,8 @@ def rotations_from_euler(values, columns, axes, rotations):  # type: ignore[no-u
     Parameters
     ----------
     values : (F, C) float64    degrees in the rotation columns
-    columns : (J, 3) int64    column of the first, second and third turn of each joint, `NO_COLUMN` where it has fewer
+    columns : (J, 3) int64    column of the first, second and third turn of each joint; `NO_COLUMN` if the joint has
+        fewer turns
     axes : (J, 3) int64    axis of each turn: 0, 1, 2 for x, y, z
     rotations : (F, J, 4) float32    filled with unit quaternions (w, x, y, z)
     """

@@ -24,12 +24,12 @@ def frame_rate_of(frame_time_s: float | None, file: str, warnings: list[CheckWar
     """Compute the rate of a file from its frame time.
 
     Files round frame times: .0083333 means 120 Hz. If a common rate is within a relative difference of 1e-4 of the
-    reciprocal, it is used instead, with a warning if the two differ by more than the last bits. If the difference is
-    larger, as for .0333 and 30 Hz, the reciprocal is used and a warning names the rate that may be meant.
+    reciprocal, the common rate is used, with a warning if the two differ by more than the last bits. If the difference
+    is larger, as for .0333 and 30 Hz, the reciprocal is used and a warning names the rate that may be meant.
 
     Parameters
     ----------
-    frame_time_s : float or None    seconds between frames; None if the file does not say
+    frame_time_s : float or None    seconds between frames; None if the file does not contain it
     file : str    name of the file, for messages
     warnings : list of CheckWarning    receives the warnings
 

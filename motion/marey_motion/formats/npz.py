@@ -60,7 +60,7 @@ _ARCHIVE_ERRORS = (
 
 
 def write_npz(motion: Clip | Skeleton) -> bytes:
-    """Write a clip, or a skeleton alone.
+    """Write a clip, or only a skeleton.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def write_npz(motion: Clip | Skeleton) -> bytes:
 
 
 def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> SourceMotion:
-    """Read an archive written by `write_npz`, or any other with the same members.
+    """Read an archive written by `write_npz`, or any other archive with the same members.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def read_npz(data: bytes, file: str, *, frame_rate_hz: float | None = None) -> S
 
     Raises
     ------
-    FormatError    naming the member that is missing or wrong; nothing larger than `MOST_UNPACKED_BYTES` is unpacked
+    FormatError    naming the missing or invalid member; also if the content is larger than `MOST_UNPACKED_BYTES`
     """
     arrays = _read_members(data, file)
     if "format" not in arrays or str(arrays["format"]) != MARK:
@@ -202,7 +202,7 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one array, and check that the size in its header is the size of its data."""
+    """Read one array, and check that its data have the size given in its header."""
     content = archive.read(info)
     stream = io.BytesIO(content)
     version = np.lib.format.read_magic(stream)

@@ -2,7 +2,7 @@
 
 A number whose digits form an integer of at most 2**53, scaled by a power of ten up to 10**22, needs one correctly
 rounded multiplication or division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI
-1990). All other numbers, which are rare in real files, are parsed by `float`. `plain_numbers` reads the usual ones
+1990). All other numbers, which are rare in real files, are parsed by `float`. `plain_numbers` reads the usual numbers
 faster, with the same results.
 """
 
@@ -31,8 +31,9 @@ _POSITION, _LINE, _VALUES, _IN_LINE, _ROWS, _RAGGED_LINE, _RAGGED_COUNT, _LONG_T
 class NumberTable:
     """Numbers of a text block, row after row.
 
-    `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the first line (from 1) with another
-    number of values than expected, namely `ragged_count`; 0 if there is none. `last_line` is the last line read.
+    `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the number, from 1, of the first line
+    that does not have the expected number of values, or 0 if there is none; that line has `ragged_count` values.
+    `last_line` is the last line read.
     """
 
     values: NDArray[np.float64]
@@ -57,7 +58,7 @@ class BadNumber(ValueError):
 def parse_number(text, start):  # type: ignore[no-untyped-def]
     """Read one decimal number at `text[start:]`, which must end in a line feed, since the end of text is not checked.
 
-    Positions are unsigned, because signed ones cost a test for negative indices at every byte.
+    Positions are unsigned, because signed positions would need a test for negative indices at every byte.
 
     Parameters
     ----------
@@ -186,7 +187,8 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     Parameters
     ----------
     text : (bytes,) uint8    the text
-    width : int    number of values expected in a line; the first line with another number is reported, not an error
+    width : int    expected number of values in a line; the first line with another number is returned and raises no
+        error
     first_line : int    number of the first line of `text`, from 1
 
     Returns

@@ -72,7 +72,7 @@ def _length(first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _digits(word):  # type: ignore[no-untyped-def]
-    """Return how many of the eight bytes are digits, up to the first that is none, and the number that they form."""
+    """Count the digits at the start of the eight bytes, and return their number and the integer that they form."""
     digits = word ^ _ZERO_DIGITS
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     count = _EIGHT
@@ -87,10 +87,10 @@ def _digits(word):  # type: ignore[no-untyped-def]
 
 @compiled
 def read_plain_numbers(text, values, i, count):  # type: ignore[no-untyped-def]
-    """Read numbers separated by spaces, up to the first byte of anything else, or of a number near the end of the text.
+    """Read plain numbers separated by spaces, up to the first other byte or to a number near the end of the text.
 
-    A plain number has digits, at most 15 of them and 8 before and after the point, and fits in 15 bytes. It may have a
-    minus before it and a negative power of ten after it.
+    A plain number has at most 15 digits, with at most 8 before and 8 after the point, and fits in 15 bytes. It can have
+    a minus sign before it and a negative power of ten after it.
 
     Parameters
     ----------

@@ -205,10 +205,10 @@ def _bend_leg(
     freedom: AnyFloats,
     rotations: dict[str, AnyFloats],
 ) -> None:
-    """Solve a leg by two-bone inverse kinematics; knees bend towards the heading `facing` (n,), in radians, which is
-    between those of pelvis and foot.
+    """Solve a leg by two-bone inverse kinematics; the knee bends towards the heading `facing` (n,), in radians.
 
-    A swinging foot that trails out of reach is drawn along by the leg, the more softly the higher `freedom` (n,).
+    That heading is between those of pelvis and foot. A swinging foot that is out of reach is pulled along by the leg;
+    the pull is softer where `freedom` (n,) is higher.
     """
     thigh, shank = _thigh_m(skeleton), _shank_m(skeleton)
     reach = ankle - hip

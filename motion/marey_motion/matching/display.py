@@ -102,9 +102,7 @@ def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArra
 def _inertialised(
     database: MatchingDatabase, rows: NDArray[np.int32], joints: NDArray[np.int64], half_life_s: float
 ) -> tuple[Floats, Floats]:
-    """Compute displayed poses (T, 3 + 4·K) of K joints in the frame of the root, and their local translations (T, M,
-    3).
-    """
+    """Compute displayed poses (T, 3 + 4·K) of K joints in the root's frame, and local translations (T, M, 3)."""
     from marey_motion.matching import display_kernels
 
     rate_hz = database.options.rate_hz

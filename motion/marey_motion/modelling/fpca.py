@@ -134,9 +134,7 @@ def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: I
 def _inner_products(
     basis: SplineBasis, deviations: Floats, mean: Floats, weights: Floats, inner_product: InnerProduct
 ) -> tuple[Floats, float]:
-    """Compute the inner products (m, m) of weighted deviations (m, n, D), the size of all examples, and their mean (n,
-    D).
-    """
+    """Compute inner products (m, m) of weighted deviations (m, n, D), the size of all examples, and mean (n, D)."""
     weighted, weighted_mean = deviations * weights, mean * weights
     if inner_product == "l2":
         root = np.linalg.cholesky(basis.products).T

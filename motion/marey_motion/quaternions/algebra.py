@@ -285,8 +285,7 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 
 
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
-    """Compute rotations between nearly opposite vectors (n, 3): half a turn about a normal of `start`, then the
-    rest."""
+    """Find rotations between nearly opposite vectors (n, 3): half a turn about a normal of `start`, then the rest."""
     candidates = [cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:
         candidates.insert(1, np.asarray(wished, dtype=np.float64))

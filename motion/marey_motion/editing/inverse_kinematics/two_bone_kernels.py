@@ -156,9 +156,7 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """Compute the longest distances (F,) that limbs reach without damping; `starts` are their present lengths, in
-    metres.
-    """
+    """Compute the longest distances (F,) that limbs reach undamped; `starts` are their present lengths, in metres."""
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]

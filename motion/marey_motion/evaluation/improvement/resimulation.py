@@ -1,14 +1,14 @@
-"""A suite of trials over parts of one database, simulated no more often than needed.
+"""A suite of trials over parts of one database, in which only affected trials are simulated again.
 
 Clips are removed by making their rows unselectable. The trials are then the same as with a database without these
 clips: a row is displayed only if it was chosen or follows a chosen row of the same clip; a trial depends only on the
-displayed and chosen rows and on the least cost among selectable rows; and since the order of rows stays, ties are
-decided the same way.
+displayed and chosen rows and on the least cost among selectable rows; and since the order of the rows does not change,
+ties are decided the same way.
 
-For the same reason, removing clips of which a trial neither displays nor chooses a row leaves the trial identical to
-the bit: at every search the cheapest row is still available and still the first of the cheapest, and the trial up to
-the search is the same by induction. So only the trials that need a clip are run again without it. The same is true
-between any part of the database and a smaller part, so results are shared between parts.
+For the same reason, removing clips of which a trial neither displays nor chooses a row leaves the trial bit-identical:
+at every search the cheapest row is still available and still the first of the cheapest, and the trial up to the search
+is the same by induction. So only the trials that need a clip are run again without it. The same is true between any
+part of the database and a smaller part, so results are shared between parts.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NONE: Sources = frozenset()
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial over some clips, and the sources whose rows it displayed or chose."""
+    """Result of a trial over some clips, and the sources whose rows the trial displayed or chose."""
 
     result: TrialResult
     needed: Sources

@@ -1,7 +1,7 @@
-"""Parts of a matching database: with fewer clips, with fewer frames, or joined with another one.
+"""Matching databases made from others: parts with fewer clips or fewer frames, and two databases joined.
 
-Nothing is recomputed: rows keep their features, and the normaliser stays. A clip and its mirrored copy are selected
-together, by the uid of the source.
+Features and normaliser are not computed again but copied. A clip and its mirrored copy are selected together, by the
+uid of the source.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:
-    """Return the uid of the source: the recorded clip, also for its mirrored copy.
+    """Return the uid of a clip's source, which is the recorded clip, for a mirrored copy as well.
 
     Parameters
     ----------

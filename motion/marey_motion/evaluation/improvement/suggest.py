@@ -1,6 +1,6 @@
 """Suggestions after an evaluation: unused and redundant clips, duplicates, and clips that fill holes.
 
-Everything is a proposal with its predicted effect; nothing is changed.
+Each suggestion is a proposal with its predicted effect; the data set is not changed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ from marey_schemas.options.improvement import SuggestionOptions
 ProgressCallback = Callable[[int, int, str], None]
 
 USUAL_BLENDABLE_M = 0.5
-"""Pose cost summed over seven joints; the default where a suite made no transition to measure it by."""
+"""Default of the largest blendable distance, a pose cost in metres summed over seven joints, used if a suite made no
+transition from which the distance could be measured.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +42,10 @@ class Suggestions:
 
     Parameters
     ----------
-    unused : data that can be removed without changing a trial
-    redundant : every clip tried, ranked by the harm of its removal per second saved
+    unused : data whose removal changes no trial
+    redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals, starting from the set without its unused clips
-    spared : near-duplicates to remove, each with the pair whose other clip stays
+    spared : near-duplicates to remove, each with its pair, whose other clip stays
     fillings, additions : clips of other collections, each alone and as a sequence of additions
     tried : number of needed clips that were left out one at a time, and number of all needed clips
     """

@@ -53,7 +53,7 @@ class Influence:
 
 
 def vary_each_group(options: DatabaseOptions, factors: Sequence[float]) -> tuple[FeatureWeights, ...]:
-    """List the given weights, then variants in which one group's weight is multiplied by one factor.
+    """List the given weights, then variants in each of which the weight of one group is multiplied by one factor.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def sweep_weights(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[SweepRow, ...]:
-    """Run the suite with each setting; features and the normaliser's spreads are those of the database.
+    """Run the suite with each setting, with the features and the normaliser's spreads of the database.
 
     Progress counts trials over all settings.
 
@@ -97,7 +97,7 @@ def sweep_weights(
     options : EvaluationOptions    options of the evaluation
     settings : sequence of FeatureWeights    weights to try
     objective : ObjectiveOptions    measure of the result
-    trials : sequence of Trial, optional    the suite's when None
+    trials : sequence of Trial, optional    trials to run; those of the suite if None
     threads : int, optional    trials at once
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop

@@ -1,6 +1,6 @@
 """Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
 
-Both can be removed from the database without changing any trial, to the bit, as long as the normaliser stays;
+Both can be removed from the database and leave every trial bit-identical, as long as the normaliser stays the same;
 `resimulation` explains why for whole clips. A frame of a used clip is unneeded if it is far from every frame that a
 trial displayed or chose: at least `MARGIN_BEFORE_S` before it, or the look-ahead plus `MARGIN_AFTER_S` after it, and
 outside the window in which a search at that frame may not choose. Removing the rows of unneeded frames changes neither
@@ -36,7 +36,7 @@ MARGIN_AFTER_S = MARGIN_BEFORE_S
 
 @dataclass(frozen=True)
 class UnusedClip:
-    """A source, with its mirrored copy, that no trial needs."""
+    """A source that no trial needs, including its mirrored copy."""
 
     source: str
     name: str
@@ -66,7 +66,7 @@ class UnusedRange:
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """Data that can be removed without changing a trial: whole sources, frames of others, and the rows (N,) of both."""
+    """Data whose removal changes no trial: whole sources, ranges of other sources, and the rows (N,) of both."""
 
     clips: tuple[UnusedClip, ...]
     ranges: tuple[UnusedRange, ...]
@@ -86,7 +86,7 @@ def find_unused(
     *,
     index: SearchIndex | None = None,
 ) -> Unused:
-    """Find the sources and frames that no trial needs, the longest first. Loops that wrap are kept or removed whole.
+    """Find the sources and frames that no trial needs, the longest first. Loops that wrap are only removed as a whole.
 
     Parameters
     ----------

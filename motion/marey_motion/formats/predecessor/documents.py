@@ -27,8 +27,7 @@ def read_predecessor(
     companion_name: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion | SourceDocument:
-    """Read a file that contains a motion, which stays in its own unit and axes, or another document; the file is
-    decoded once.
+    """Read a file with a motion, which stays in its own unit and axes, or with another document.
 
     Parameters
     ----------

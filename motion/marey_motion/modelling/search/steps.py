@@ -48,8 +48,9 @@ DEFAULT_TRANSITIONS = TransitionOptions()
 
 
 class CarriedOn(NamedTuple):
-    """Start of a step that continues the previous one: its canonical frame, and the positions of the transition joints
-    by standard name.
+    """Start of a step that continues the previous step.
+
+    It consists of its canonical frame, and of the positions of the transition joints by standard name.
     """
 
     placement: Placement
