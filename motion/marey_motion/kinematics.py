@@ -140,10 +140,10 @@ def forward_kinematics(
 
 
 class _Chain(NamedTuple):
-    """Arguments of the kernel that follow from a skeleton: P points, which are J joints and then end sites.
+    """Arguments of the kernel that depend only on the skeleton, with P points: J joints and then the end sites.
 
-    `no_slots` is -1 for each point, which means that no translation replaces its offset; `turned` says of each joint
-    whether its rotation moves another point, which that of a leaf does not.
+    `no_slots` is -1 for each point, which means that no translation replaces its offset; `turned` is True for each
+    joint whose rotation moves another point, and False for leaves.
     """
 
     offsets: AnyFloats
@@ -178,7 +178,7 @@ def as_global_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
 
     Raises
     ------
-    MotionError    if the shape is another one
+    MotionError    if `rotations` has another shape
     """
     from marey_motion import kinematics_kernels
 
@@ -266,8 +266,8 @@ def ground_projection(positions: AnyFloats) -> AnyFloats:
 def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequence[int]) -> NDArray[np.float64]:
     """Compute the direction that the body faces on the ground.
 
-    The sum of the left-minus-right vectors is crossed with up. If that axis is vertical, a frame has no direction of
-    its own and takes that of the frame before it; frames before the first direction take that one.
+    The sum of the left-minus-right vectors is crossed with up. If the sum is vertical, a frame has no direction of its
+    own, and the direction of the frame before it is used. Frames before the first direction have the first direction.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def forward_vectors(positions: AnyFloats, left: Sequence[int], right: Sequence[i
 
     Raises
     ------
-    MotionError    without a pair of joints
+    MotionError    if there is no pair of joints
     """
     if not left or len(left) != len(right):
         raise MotionError(

@@ -144,7 +144,7 @@ def number_problem(word: str) -> str:
 
     Returns
     -------
-    str    for an error message
+    str    the explanation, for an error message
     """
     if _NOT_FINITE.match(word):
         return f"{word} is not finite; repair or cut these frames"
@@ -156,7 +156,7 @@ def number_problem(word: str) -> str:
 
 
 def decode_name(name: bytes) -> str:
-    """Decode a joint name: UTF-8, or Latin-1 if it is not, without control characters.
+    """Decode a joint name as UTF-8, or else as Latin-1; unprintable characters become blanks.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class GaitMoments:
     Parameters
     ----------
     times_s : (n,)    seconds
-    phases : (n,)    strides done
+    phases : (n,)    number of strides done
     root : RootState    the exact path
     """
 
@@ -228,7 +228,7 @@ def _bend_leg(
 
 
 def _pose_trunk(style: GaitStyle, moments: GaitMoments, rotations: dict[str, AnyFloats]) -> None:
-    """Pose the trunk: lean into speed and turns, shoulders against the legs, a head that looks ahead."""
+    """Pose the trunk: it leans into speed and turns, the shoulders swing against the legs, the head looks ahead."""
     root = moments.root
     forward = moments.settled(root.speeds * np.cos(root.travel_angles))
     bank = style.lean * moments.settled(styles.bank_rad(root.speeds, root.turn_rates))

@@ -65,7 +65,7 @@ class Cadence:
 
     @cached_property
     def _pieces(self) -> AnyFloats:
-        """Table (4, pieces): start time, and at that time phase, stride rate and slope of the stride rate."""
+        """Table (4, pieces) of start times, and of phase, stride rate and slope of the stride rate at these times."""
         pieces = self.path.pieces
         turn_rates = np.array([piece.turn_rate_rad_s for piece in pieces])
         travels = np.array([piece.travel_angle_rad for piece in pieces])
@@ -136,7 +136,7 @@ class _Foot(NamedTuple):
 
     Parameters
     ----------
-    ground : (n,) complex    place of the ball of the foot on the floor, z + i·x in metres
+    ground : (n,) complex    ground position of the ball of the foot, z + i·x in metres
     heights : (n,)    metres that the ball is higher than in the rest pose
     pitches, toe_pitches, yaws, freedom : (n,)    as in `FootMotion`
     """
@@ -168,7 +168,7 @@ class Footfalls:
 
     @cached_property
     def centre_phases(self) -> AnyFloats:
-        """Phase in the middle of each stance: whole for the left foot, half a stride later for the right."""
+        """Phase in the middle of each stance: a whole number for the left foot, half a stride more for the right."""
         first, last = self.cadence.phase_at(np.array(self.span_s))
         return np.arange(np.floor(first) - 2.0, np.ceil(last) + 3.0) + (0.0 if self.side > 0 else 0.5)
 

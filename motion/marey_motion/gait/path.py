@@ -93,7 +93,7 @@ class RootState:
 class RootPath:
     """Segments one after the other, starting at the origin and heading along +Z at time 0.
 
-    Outside [0, duration_s] the path continues as it begins and ends: same turn rate, constant speed.
+    Before time 0 and after `duration_s` the path continues with the speed and turn rate of its start and of its end.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class RootPath:
 
     @cached_property
     def starts_s(self) -> AnyFloats:
-        """Start of each piece of `pieces` in seconds; the first is where its formula is anchored."""
+        """Start of each of `pieces`, in seconds; for the endless first piece, the time to which its formula refers."""
         ends = np.cumsum([segment.duration_s for segment in self.segments])
         return np.concatenate(([0.0, 0.0], ends))
 
@@ -135,7 +135,7 @@ class RootPath:
 
         Returns
         -------
-        RootPath    the same course
+        RootPath    the scaled path
         """
         return RootPath(
             tuple(

@@ -21,7 +21,7 @@ Point = tuple[float, float, float]
 
 
 class _Bone(NamedTuple):
-    """A joint in the table of a skeleton: its parent and where it is in the rest pose, metres."""
+    """A joint in the table of a skeleton: its parent, and its position in the rest pose in metres."""
 
     parent: str | None
     position: Point

@@ -1,4 +1,4 @@
-"""Style of generated gaits: how it depends on the speed, and how walkers differ.
+"""Style of generated gaits: its dependence on the speed, and the differences between walkers.
 
 The curves are fits by eye to typical adult values (Winter, Biomechanics and Motor Control of Human Movement, 2009);
 they shape steps and swings and never change the root's path.
@@ -101,7 +101,7 @@ def running_share(speed_m_s: AnyFloats | float) -> AnyFloats:
 
     Returns
     -------
-    (...)    0 for a walk, 1 for a run, between them where people change over
+    (...)    0 for a walk, 1 for a run, and in between at speeds at which people change from one to the other
     """
     return eased((np.asarray(speed_m_s) - 1.9) / 0.5)
 
@@ -201,7 +201,7 @@ def clearance_m(speed_m_s: AnyFloats) -> AnyFloats:
 
 
 def bank_rad(speeds: AnyFloats, turn_rates: AnyFloats) -> AnyFloats:
-    """Compute the lean into a turn that balances the centrifugal force, to a limit.
+    """Compute the lean into a turn that balances the centrifugal force, up to a limit.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ def generate_gait(
     stature_m: float = STUDIO_STATURE_M,
     style: GaitStyle | None = None,
 ) -> Clip:
-    """Generate a walk, run, turn on the spot or idle on an exact arc from the origin along +Z.
+    """Generate a walk, a run, a turn on the spot or an idle motion, on an exact arc from the origin along +Z.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def generate_along(
 
     Raises
     ------
-    MotionError    as `generate_gait`
+    MotionError    for the same reasons as `generate_gait`
     """
     skeleton, style = studio_skeleton(stature_m), style or GaitStyle()
     frames = _frame_count(path, frame_rate_hz)
@@ -118,7 +118,7 @@ def foot_motions(
 ) -> dict[str, FootMotion]:
     """Compute the motion of both feet of `generate_along`, as ground truth for contacts.
 
-    Swinging feet may be drawn nearer to the body in the clip, where the leg would be too short.
+    In the clip, swinging feet are nearer to the body where the leg would otherwise be too short.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def _feet(path: RootPath, style: GaitStyle, times_s: AnyFloats) -> dict[str, Foo
 def generate_dataset(seed: int = 0, frame_rate_hz: float = 60.0) -> list[GeneratedTake]:
     """Generate twenty-four takes of walks, runs, turns, side steps, starts and stops.
 
-    Each is by a walker of its own style, so that no two takes of a speed look the same.
+    Each take has a walker with a different style, so that two takes at the same speed never look the same.
 
     Parameters
     ----------

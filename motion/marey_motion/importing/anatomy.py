@@ -1,4 +1,6 @@
-"""Anatomy of a skeleton: standard joints, landmarks, axes and document, found once for files of equal skeletons."""
+"""Anatomy of a skeleton: standard joints, landmarks, axes and document, computed once for all files with equal
+skeletons.
+"""
 
 from __future__ import annotations
 
@@ -91,8 +93,8 @@ def anatomy_of(skeleton: Skeleton | SourceMotion) -> Anatomy:
 
     Parameters
     ----------
-    skeleton : Skeleton or SourceMotion    J joints; skeletons are equal when every name and number is. The skeleton of
-        a motion in its file's unit is made only if no equal one is known.
+    skeleton : Skeleton or SourceMotion    J joints; two skeletons are equal if all their names and numbers are equal.
+        From a `SourceMotion`, a skeleton is made only if the cache has no equal one.
 
     Returns
     -------

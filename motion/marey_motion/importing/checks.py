@@ -74,7 +74,7 @@ class CheckWarning:
     message : str    the finding, as a sentence with its numbers
     joints : tuple of str    names of the joints concerned
     frames : (int, int), optional    half-open range of the frames concerned, None for all of them
-    values : dict    the numbers behind the sentence
+    values : dict    the numbers in the message
     """
 
     code: str
@@ -140,7 +140,7 @@ def on_the_floor(clip: Clip) -> tuple[Clip, float]:
 
     Returns
     -------
-    clip : Clip    the moved clip; unchanged without feet
+    clip : Clip    the moved clip; the same clip if its skeleton has no feet
     shift_m : float    metres added to every height
     """
     tracks = track(clip)
@@ -198,7 +198,7 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
 
 
 def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:
-    """Count the true values before the first false one; blocks after that are not computed."""
+    """Count the true values before the first false value; blocks after that value are not computed."""
     total = 0
     for block in blocks:
         if not block.all():
@@ -295,7 +295,7 @@ def _lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _travel_speed(hips: NDArray[np.float32], frame_rate_hz: float) -> float:
-    """Compute the mean speed (m/s) of hips (F, 3) on the ground over seconds, which excludes their swaying."""
+    """Compute the mean speed (m/s) of hips (F, 3) on the ground, over spans so long that swaying does not count."""
     span = min(max(1, round(frame_rate_hz)), len(hips) - 1)
     ways = _lengths(hips[span:, ::2] - hips[:-span, ::2])
     return float(ways.mean()) / span * frame_rate_hz
@@ -356,7 +356,7 @@ def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
 
 
 def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:
-    """Return whether all steps are shorter than a jump beyond any rounding; takes half as long as `_step_cosines`."""
+    """Return whether all steps are certainly shorter than a jump, in half the time of `_step_cosines`."""
     products = rotations[1:] * rotations[:-1]
     cosines = products[..., 0] + products[..., 1]
     cosines += products[..., 2]

@@ -37,7 +37,7 @@ _LONGEST_COLLECTION = 1024
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry of a file that is not read itself: a companion of others, or one refused by its name.
+    """Make the entry of a file that is not read by itself: a companion of other files, or a file with a refused name.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def planned_entry(planned: PlannedFile) -> ImportEntry | None:
 
     Returns
     -------
-    ImportEntry or None    None for a file to read
+    ImportEntry or None    None if the file is to be read
     """
     if planned.role == "companion":
         return ImportEntry(name=planned.name, status="companion")

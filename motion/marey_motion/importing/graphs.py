@@ -16,23 +16,23 @@ from marey_schemas.kinds import Kind
 
 SCHEMA = "marey/model-graph@1"
 FEW = 3
-"""Models of one name that are listed where there are several."""
+"""Maximum number of models that an error lists if several have the same name."""
 
 
 @dataclass(frozen=True)
 class NamedModel:
-    """A model of the project, or one that is being imported: its path and the reference that documents hold."""
+    """A model of the project or of the same import: its path, and the reference to it in documents."""
 
     path: str
     ref: dict[str, Any]
 
 
 FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
-"""Counts the models of a name directly in a collection, or anywhere in the project, and gives the first `FEW`."""
+"""Function that counts the models of a name in a collection or in the whole project, and returns the first `FEW`."""
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
-    """Make the item of a graph: each node gets the model of its name, preferably the one beside the graph.
+    """Make the item of a graph: each node gets the model of its name, preferably from the graph's collection.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
 
 
 def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
-    """Find the model beside the graph, else the only one of that name."""
+    """Find the model of a name in the graph's collection, or else the only model of that name."""
     count, models = find(name, collection)
     if count != 1:
         count, models = find(name, None)

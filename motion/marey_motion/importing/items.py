@@ -31,7 +31,7 @@ class GivenSkeleton:
 
     @property
     def ref(self) -> Tree:
-        """The reference that documents hold."""
+        """Reference to the stored skeleton, as documents contain it."""
         return {"item": self.item, "revision": self.revision}
 
 
@@ -58,13 +58,13 @@ class FileToImport:
 
     @property
     def collection(self) -> str:
-        """The collection of the items that the file becomes."""
+        """Collection in which the items made from the file are stored."""
         return "/".join(part for part in (self.options.collection, self.planned.folder) if part)
 
 
 @dataclass(frozen=True)
 class ImportedItem:
-    """An item to store: its place and its documents.
+    """An item to store: its name, collection, tags and documents.
 
     `name` identifies it within the import: other items refer to it as `{"output": name}` until it is stored.
     """
@@ -96,8 +96,8 @@ class ImportedFile:
 
     Parameters
     ----------
-    items : a skeleton, then a clip or a model that uses it; a skeleton alone; a clip or a model alone. The skeleton has
-        no part `mapping` yet: see `mapping_part`
+    items : a skeleton followed by a clip or model that uses it, or one of these alone. The skeleton has no part
+        `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
     frames : number of frames of the clip
     graph : content of a file that holds a graph instead of items

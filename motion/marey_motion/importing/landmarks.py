@@ -18,9 +18,9 @@ KEPT_SKELETONS = 256
 class Landmarks:
     """Indices of joints, None if none was found.
 
-    `hips` is the last joint that both feet hang from; the pairs are (left, right), `feet` being the ankles and `hands`
-    the wrists. `by_names` is false where the joints were found by the skeleton's build alone, which also finds joints
-    of animals.
+    `hips` is the lowest joint from which both feet descend. The pairs are (left, right); `feet` are the ankles and
+    `hands` the wrists. `by_names` is false if the joints were found by the skeleton's build alone; this also finds
+    joints of animals.
     """
 
     hips: int | None = None
@@ -32,7 +32,7 @@ class Landmarks:
 
     @property
     def ground_joints(self) -> tuple[int, ...]:
-        """The joints that touch the ground first: toes, else feet."""
+        """The joints that touch the ground: the toes, or the feet if there are no toes."""
         return self.toes or self.feet or ()
 
 
@@ -69,7 +69,7 @@ def find_landmarks(skeleton: Skeleton, mapping: JointMapping | None = None) -> L
 
 
 def path_length(skeleton: Skeleton, top: int, end: int) -> float:
-    """Measure the bones between two joints.
+    """Measure the total length of the bones between two joints.
 
     Parameters
     ----------

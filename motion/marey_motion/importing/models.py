@@ -46,7 +46,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
     Raises
     ------
-    FormatError    if the file is wrong
+    FormatError    if the file is invalid
     """
     name = file.planned.name
     if source.subject == "tree":

@@ -23,11 +23,11 @@ class PlannedFile:
 
     Parameters
     ----------
-    name : as given
+    name : name of the file, as given
     role : a `motion` or `skeleton` to import, the `companion` of others, or `refused`
-    companion : the file that it needs
+    companion : name of the companion file that it needs
     folder, item_name : folder below the target and name of the clip
-    reason : why it is refused
+    reason : reason for its refusal
     """
 
     name: str
@@ -41,7 +41,7 @@ class PlannedFile:
 
 @dataclass(frozen=True)
 class Pairing:
-    """A file and the companion it needs; `code` and `reason` say why there is none."""
+    """A file and the companion it needs; if there is none, `code` and `reason` explain why."""
 
     file: str
     companion: str | None

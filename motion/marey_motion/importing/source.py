@@ -1,4 +1,4 @@
-"""Input and output of the conversion of a file: its content in its own units, and the record of the changes."""
+"""Input and output of the conversion of a file: the content in the file's units, and the record of the changes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SourceMotion:
     frame_rate_hz, declared_frame_time_s : float, optional    rate to use, and the frame time as written
     unit_scale_m : float, optional    metres per unit of the file; None if format and file do not state it
     up_axis : str, optional    axis that points up; None if format and file do not state it
-    declared : tuple of str    sentences that say where the file states its unit; kept as evidence in `SourceInfo`
+    declared : tuple of str    sentences that say where the file states its unit; they become evidence in `SourceInfo`
     channels : tuple of tuples of str    names of each joint's channels in the file's order
     warnings : list of CheckWarning    defects that the reader tolerated
     """
@@ -85,7 +85,7 @@ class SourceInfo:
     unit_scale_m : float    metres per unit of the file
     up_axis, handedness : str    axes of the file
     frame_rate_hz, declared_frame_time_s : float, optional    the rate used and the frame time as written
-    channels : tuple of tuples of str    per joint the file's channel names in their order; empty for formats without
+    channels : tuple of tuples of str    names of each joint's channels in the file's order; empty for formats without
         channels
     trimmed_frames : (int, int)    frames dropped at the start and at the end
     floor_shift_m : float    metres added to every height

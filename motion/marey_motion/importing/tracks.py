@@ -1,4 +1,4 @@
-"""Positions of the joints that the checks of a motion look at, and the measures of its skeleton."""
+"""Positions of the joints that the checks of a motion use, and measures of its skeleton."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _FRAMES_PER_BLOCK = 4096
 
 @dataclass(frozen=True)
 class BodyPoints:
-    """Points of a skeleton that the checks look at, and lengths between them.
+    """Points of a skeleton that the checks use, and lengths between them.
 
-    `points` are joints, and end sites after the joints; `column` is the place of each in them; `soles` and `all_soles`
+    `points` are joints, followed by end sites, and `column` is the index of each point in them; `soles` and `all_soles`
     are the columns of the joints and end sites from each ankle down. `limbs` are the joints of arms and legs, `span_m`
     is the length of both arms and `leg_m` of the left leg; they are empty and zero without hands or feet.
     """

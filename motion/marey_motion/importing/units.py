@@ -174,7 +174,7 @@ def _choose_up_axis(source: SourceMotion, body: _Measurements, options: ImportOp
 
 
 def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tuple[UpAxis, str] | None) -> UpAxis:
-    """Choose the upward axis if the body is not upright along y: it may lie or climb, or the axis is another one."""
+    """Choose the upward axis if the body is not upright along y: it may lie or climb, or another axis may point up."""
     rest_axis, rest_cosine = _body_axis(body.rest[:, None], body.landmarks)
     standing, resting = f"mean direction from feet to head is {axis} with cosine {cosine:.2f}", _FOLDED
     if rest_cosine > 0.0:
@@ -203,7 +203,7 @@ def _settle_up_axis(body: _Measurements, axis: UpAxis, cosine: float, flat: tupl
 
 
 def _likely_axes(*axes: tuple[UpAxis, float]) -> str:
-    """List the axes with evidence, in words, and the usual ones if none has any."""
+    """List in words the axes for which there is evidence, or the usual axes if there is no evidence."""
     likely = list(dict.fromkeys(axis for axis, cosine in axes if cosine > 0.0))
     return " or ".join(likely if len(likely) > 1 else dict.fromkeys((*likely, "y", "z")))
 
@@ -405,7 +405,7 @@ def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: ImportOptions, up_axis: UpAxis) -> None:
-    """Warn if left and right are exchanged: when facing where the feet point, the left foot must be on the left."""
+    """Warn if left and right are exchanged: seen in the direction of the feet, the left foot must be on the left."""
     landmarks = body.landmarks
     if landmarks.feet is None or landmarks.toes is None or options.handedness == "left":
         return

@@ -27,7 +27,7 @@ MOST_FRAME = 2**31 - 1
 
 @dataclass(frozen=True, eq=False)
 class PredecessorAlignment:
-    """An alignment that was read.
+    """An alignment read from a document of the predecessor.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
     Raises
     ------
-    FormatError    naming the field that is wrong
+    FormatError    naming the invalid field
     """
     document = decode_document(data, file)
     frames = number_array(_list(document, TIME_FUNCTION, file), file, TIME_FUNCTION)

@@ -50,7 +50,7 @@ def read_predecessor_annotation(
 
     Raises
     ------
-    FormatError    naming the label and section that is wrong; also if sections overlap or exceed the clip
+    FormatError    naming the invalid label and section; also if sections overlap or exceed the clip
     """
     return layer_of_document(decode_document(data, file), file, frame_count, end_index=end_index, labels=labels)
 
@@ -63,7 +63,7 @@ def layer_of_document(
     end_index: EndIndex = DEFAULT_END_INDEX,
     labels: Sequence[str] | None = None,
 ) -> Layer:
-    """Read an annotation from a decoded document, as `read_predecessor_annotation`.
+    """Read an annotation from a decoded document, as `read_predecessor_annotation` does.
 
     Parameters
     ----------

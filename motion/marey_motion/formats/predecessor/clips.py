@@ -1,8 +1,9 @@
-"""The predecessor's clip documents: reading and writing, as stored in its data base.
+"""Reader and writer of the clip documents that the predecessor stores in its data base.
 
 Lengths are centimetres. Stored clips are mirrored in x for a left-handed engine: a translation (x, y, z) is stored as
-(-x, y, z) and a rotation (w, x, y, z) as (-w, -x, y, z), so the same map reads and writes. The root's translation is
-added to the root's offset. A clip names its joints but not their hierarchy: it needs its skeleton document.
+(-x, y, z) and a rotation (w, x, y, z) as (-w, -x, y, z), so the same conversion serves for reading and writing. The
+root's translation is added to the root's offset. A clip names its joints but not their hierarchy: it needs its skeleton
+document.
 """
 
 from __future__ import annotations
@@ -173,7 +174,7 @@ def _engine_rows(frames: list[Any], file: str) -> NDArray[np.float64]:
 
 
 def _fill_motion(source: SourceMotion, names: list[str], poses: NDArray[np.float64], file: str) -> None:
-    """Put the rows into the skeleton's joints; joints that the clip leaves out keep their rest rotation."""
+    """Assign the rows to the skeleton's joints; joints that the clip does not contain get their rest rotation."""
     indices = {name: joint for joint, name in enumerate(source.joint_names)}
     unknown = next((name for name in names if name not in indices), None)
     if unknown is not None:

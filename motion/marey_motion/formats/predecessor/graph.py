@@ -29,7 +29,7 @@ class GraphNode:
 
     Parameters
     ----------
-    model_id : in the data base that the graph comes from, or goes to
+    model_id : id of the model in the predecessor's data base
     type : one of `TYPES`
     transitions : nodes that may follow
     """
@@ -75,7 +75,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
     Raises
     ------
-    FormatError    naming the node that is wrong
+    FormatError    naming the invalid node
     """
     listed: dict[tuple[str, str], Mapping[str, Any]] = {}
     names: dict[tuple[str, str], Place] = {}
@@ -96,7 +96,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
 
 
 def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "json") -> bytes:
-    """Write a graph, with its start under both names that programs read.
+    """Write a graph; its start node is written under both field names that programs read.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """The predecessor's motion primitives, in the four layouts that were published.
 
-Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat and name space
-`eigen_vectors_spatial` and time `*_temporal_semantic*` or `*_time*`; a static primitive has `spatial_coeffs` alone.
-Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Arrays
-of coefficients have the shape (coefficient, channel).
+Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat, with fields
+`eigen_vectors_spatial` for space and `*_temporal_semantic*` or `*_time*` for time; a static primitive has
+`spatial_coeffs` alone. Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's
+offset. Arrays of coefficients have the shape (coefficient, channel).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ WEIGHTS_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PredecessorModel:
-    """A model that was read.
+    """A model read from a document of the predecessor.
 
     Parameters
     ----------
-    primitive : in our convention
+    primitive : the model in Marey's units and conventions
     layout : layout of the document
     animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
-    time_form : form of its time function; None for a model without one, which runs at constant speed
+    time_form : form of its time function; None for a model without a time function, which runs at constant speed
     time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
     """
 
@@ -104,7 +104,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
 
 def model_of_document(document: Document, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
-    """Read a model from a decoded document, as `read_predecessor_model`.
+    """Read a model from a decoded document, as `read_predecessor_model` does.
 
     Parameters
     ----------
@@ -409,7 +409,7 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
 
 def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
-    """Read the time function: the first channel, since further channels contain semantics."""
+    """Read the time function from the first channel; further channels contain semantics."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:

@@ -1,4 +1,4 @@
-"""Conversion between the time functions of the predecessor's models and ours, in both directions.
+"""Conversion between the time functions of the predecessor's models and those of Marey's, in both directions.
 
 Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as functions of a score vector
 g. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
@@ -25,10 +25,10 @@ from marey_motion.modelling.splines import DEGREE, SplineBasis
 TimeForm = Literal["coefficients", "increments"]
 
 DRAWN, SEED = 512, 0
-"""Scores that a linear function is fitted over: so many, drawn with this seed."""
+"""Number of scores to which a linear function is fitted, and the seed with which they are drawn."""
 ODD_LOG_SLOPE = 20.0
 KNOTS_AT_MOST = 500
-"""Most knots of a time function that is converted: no published model has as many canonical frames."""
+"""Maximum number of knots of a converted time function; no published model has as many canonical frames."""
 WRITTEN_COEFFICIENTS = 8
 
 
@@ -82,7 +82,7 @@ def as_log_slopes(
 
     Returns
     -------
-    components : FunctionalComponents    our form
+    components : FunctionalComponents    Marey's form
     error_frames : float    largest difference over the scores
     """
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
@@ -106,7 +106,7 @@ def as_log_slopes(
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
     """Make components with the projections that invert their directions.
 
-    The variance of the examples that was left out is not known: the energy is that of the kept components.
+    The variance that the components do not explain is unknown, so the energy is that of the components alone.
 
     Parameters
     ----------
@@ -191,8 +191,8 @@ def _linear_fit(scores: Floats, values: Floats) -> tuple[Floats, Floats]:
 def _basis_over(steps: int) -> SplineBasis:
     """Make a basis with as many coefficients as steps, so that any function is represented exactly.
 
-    Knots are at steps, all but the second and the last but one: evenly spaced ones would drift from the steps to
-    between them, where interpolation amplifies rounding. Long functions have fewer.
+    Knots are at all steps but the second and the last but one. Evenly spaced knots would drift away from the steps to
+    places between them, where interpolation amplifies rounding. Long functions have fewer knots.
     """
     if steps <= DEGREE:
         return SplineBasis.clamped(steps, DEGREE + 1)

@@ -59,7 +59,7 @@ def read_predecessor_tree(data: bytes, file: str) -> SampleTree:
 
 
 def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
-    """Read a cluster tree from a decoded document, as `read_predecessor_tree`.
+    """Read a cluster tree from a decoded document, as `read_predecessor_tree` does.
 
     Parameters
     ----------
