@@ -17,6 +17,7 @@ from typing import Any
 
 from marey_client.credentials import Credential
 from marey_client.errors import MareyError
+from marey_schemas.documents.differences import Difference
 
 
 class NotInstalled(MareyError):
@@ -40,6 +41,12 @@ def database(action: str, *, data: Path | None, database_url: str | None, **opti
 def work(credential: Credential, **options: Any) -> None:
     """Run jobs until stopped."""
     room("marey_worker.commands", "worker").work(credential, **options)
+
+
+def draw_difference(difference: Difference, file_type: str) -> bytes:
+    """Return a picture of a difference as a file of the type `png` or `svg`."""
+    picture: bytes = room("marey_reports.differences.picture", "figures").draw_difference(difference, file_type)
+    return picture
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from marey_client.downloads import TakenPaths, download
 from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.documents.differences import Difference, DifferenceRequest
 from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Page, Revision, Staleness
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
@@ -93,6 +94,28 @@ class ItemHandle:
     def staleness(self) -> Staleness:
         """Return whether an input of the item has a newer revision."""
         return self.transport.get(Staleness, f"{self.url}/stale")
+
+    def difference(
+        self,
+        before: int | None = None,
+        after: int | None = None,
+        *,
+        other: ItemHandle | None = None,
+        plot: bool = False,
+        **options: float,
+    ) -> Difference:
+        """Return how the revision `after` differs from the revision `before`; by default the newest two.
+
+        With `other`, `after` is a revision of that item, and both revisions are the newest by default. `options` are
+        those of `DifferenceOptions`, such as `threshold_deg=5`; `plot` requests values to draw. Raises `NotFound` if
+        there is no such revision.
+        """
+        request = DifferenceRequest.model_validate(
+            {"from": before, "to": after, "to_item": None if other is None else other.id, "plot": plot, **options}
+        )
+        params = request.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        tree, _ = self.transport.get_tree(f"{self.url}/difference", params)
+        return Difference.model_validate(tree)
 
     def export(
         self,

@@ -1,4 +1,5 @@
 from .clip import Clip as Clip
+from .difference.clips import compare_clips as compare_clips
 from .errors import AmbiguousUnits as AmbiguousUnits
 from .errors import ClipError as ClipError
 from .errors import FormatError as FormatError

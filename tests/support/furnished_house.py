@@ -124,6 +124,8 @@ class House:
                 content = json.dumps(BODIES[name]).encode()
                 headers["Content-Type"] = "application/json"
         query = "?format=original" if template.endswith("{item}/export") else ""
+        if template.endswith("{item}/difference"):
+            query = "?from=1&to=1"
         if template.endswith("{project}/{kind}") and operation.method == "GET":
             query = f"?name={CANARY}"  # attempts may only look up names
         return Planned(operation.method, template.replace(":int", "").format(**variables) + query, headers, content)

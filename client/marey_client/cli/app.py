@@ -24,6 +24,7 @@ from marey_client.cli import (
     searches,
     skeletons,
 )
+from marey_client.cli.difference import diff
 from marey_client.cli.invocation import Invocation
 
 app = typer.Typer(
@@ -69,6 +70,7 @@ for register in (
     projects,
     files,
     organise,
+    diff,
     skeletons,
     clip_jobs,
     annotating,

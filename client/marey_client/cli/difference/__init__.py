@@ -1,0 +1,1 @@
+"""Command `diff`: the differences between two revisions."""

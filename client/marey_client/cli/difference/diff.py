@@ -1,0 +1,92 @@
+"""Command `diff`: how two revisions of an item differ, as text, JSON or a picture."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_message
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+
+if TYPE_CHECKING:
+    from marey_client.items import ItemHandle
+    from marey_client.marey import Marey
+    from marey_schemas.documents.differences import Difference
+
+_REVISION = re.compile(r"(.+)@([0-9]{1,10})")
+PICTURES = ("svg", "png")
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    add_command(app, diff, params=OptionsOf("marey_schemas.documents.differences:DifferenceOptions"))
+
+
+def diff(
+    context: typer.Context,
+    before: Annotated[str, typer.Argument(help="Item, or one of its revisions: project/folder/name[@revision].")],
+    params: Chosen,
+    after: Annotated[
+        str | None,
+        typer.Argument(
+            help="Another revision, of the same item or of one of the same kind. Absent: the first argument is "
+            "compared with the revision before it."
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the difference to this file, which ends in .svg or .png.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show how two revisions of an item differ: frames, joints, path, segments, fields."""
+    if picture is not None and picture.suffix.lower().lstrip(".") not in PICTURES:
+        raise WrongUsage(f"{picture} must end in .svg or .png")
+    with connect(context) as marey:
+        first, first_revision = _revision_at(marey, before)
+        if after is None:
+            found = first.difference(after=first_revision, plot=picture is not None, **params)
+        else:
+            second, second_revision = _revision_at(marey, after)
+            if first.item.kind is not second.item.kind:
+                raise WrongUsage(
+                    f"{before} is a {first.item.kind} and {after} is a {second.item.kind}; only items of one kind "
+                    "can be compared"
+                )
+            found = first.difference(
+                first_revision or first.item.revision,
+                second_revision or second.item.revision,
+                other=None if second.id == first.id else second,
+                plot=picture is not None,
+                **params,
+            )
+    if picture is not None:
+        _draw(found, picture)
+    if as_json:
+        return print_json(found)
+    from marey_client.cli.difference.words import described
+
+    return typer.echo("\n".join(described(found)))
+
+
+def _draw(difference: Difference, picture: Path) -> None:
+    from marey_client import embedded
+
+    if difference.plot is None and difference.annotations is None:
+        return print_message("there is nothing to draw; only changed motions and annotations have a picture")
+    picture.write_bytes(embedded.draw_difference(difference, picture.suffix.lower().lstrip(".")))
+    return print_message(f"wrote {picture}")
+
+
+def _revision_at(marey: Marey, text: str) -> tuple[ItemHandle, int | None]:
+    """Return the item at an address, and the revision after its `@`, if one is given."""
+    from marey_schemas.kinds import Kind
+
+    named = _REVISION.fullmatch(text)
+    place, revision = (named[1], int(named[2])) if named else (text, None)
+    return require_item(marey, Address.parse(place), list(Kind)), revision

@@ -1,0 +1,1 @@
+"""Differences between two revisions of an item, in terms of motion."""

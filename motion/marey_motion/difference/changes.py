@@ -1,0 +1,137 @@
+"""Changes over matched frames: of the joints' rotations, of the root's path, and of translations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.arrays import CM_PER_M, Flags, Floats, Ints
+from marey_motion.looping import rotated
+from marey_schemas.documents.differences import JointChange, PathMove, Range, RootChange
+
+NOISE_DEG = 0.01
+"""Largest change of a rotation that is attributed to rounding."""
+NOISE_CM = 0.01
+"""Largest change of a position that is attributed to rounding."""
+JOINED_S = 0.1
+"""Ranges of frames that are nearer to each other are joined."""
+MOST_SPANS = 100
+"""Most ranges of frames that are listed for a joint; beyond it, ranges further apart are joined, too."""
+
+
+class Course(NamedTuple):
+    """Frames after at which changes are known, and the frame rate.
+
+    Parameters
+    ----------
+    frames : (n,) int    increasing numbers of the matched frames after
+    frame_rate_hz : float    frames per second after
+    """
+
+    frames: Ints
+    frame_rate_hz: float
+
+
+def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
+    """List the ranges of frames in which a change exceeds a threshold.
+
+    Parameters
+    ----------
+    exceeds : (n,) bool    whether the change of each matched frame exceeds it
+    course : Course    the matched frames
+
+    Returns
+    -------
+    tuple of ranges    half open and in order; ranges less than `JOINED_S` apart are joined
+    """
+    frames = course.frames[exceeds]
+    if not len(frames):
+        return ()
+    gaps = np.diff(frames) - 1
+    greatest = JOINED_S * course.frame_rate_hz
+    if np.count_nonzero((gaps >= greatest) & (gaps > 0)) >= MOST_SPANS:
+        greatest = float(np.sort(gaps)[-MOST_SPANS]) + 1.0
+    breaks = np.flatnonzero((gaps >= greatest) & (gaps > 0))
+    starts, stops = np.concatenate(([0], breaks + 1)), np.concatenate((breaks, [len(frames) - 1]))
+    return tuple(zip(frames[starts].tolist(), (frames[stops] + 1).tolist(), strict=True))
+
+
+def joint_changes(
+    names: Sequence[str], changes: NDArray[np.floating], course: Course, *, threshold: float, noise: float
+) -> tuple[JointChange, ...]:
+    """Describe the changes of joints that exceed the noise.
+
+    Parameters
+    ----------
+    names : sequence of str    J joints
+    changes : (n, J) float    degrees or centimetres, for each matched frame
+    course : Course    the matched frames
+    threshold : float    change from which on the times are listed
+    noise : float    largest change that is ignored
+
+    Returns
+    -------
+    tuple of JointChange    the joint with the largest change first
+    """
+    if not len(changes):
+        return ()
+    largest = changes.max(axis=0)
+    order = [joint for joint in np.argsort(-largest, kind="stable").tolist() if largest[joint] > noise]
+    return tuple(
+        JointChange(joint=names[joint], **_exceeding(changes[:, joint].astype(np.float64), course, threshold))
+        for joint in order
+    )
+
+
+def root_change(before: Floats, after: Floats, course: Course, threshold_cm: float) -> RootChange | None:
+    """Describe the change of the root's path.
+
+    Parameters
+    ----------
+    before, after : (n, 3) float64    positions of the root in matched frames, metres
+    course : Course    the matched frames
+    threshold_cm : float    distance from which on the times are listed
+
+    Returns
+    -------
+    RootChange or None    None if all positions are equal
+    """
+    distances = CM_PER_M * np.linalg.norm(after - before, axis=1)
+    if not len(distances) or distances.max() <= NOISE_CM:
+        return None
+    return RootChange(**_exceeding(distances, course, threshold_cm), moved=_path_move(before, after, distances))
+
+
+def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
+    """Return the fields of `Exceeding`."""
+    at = int(np.argmax(changes))
+    return {
+        "mean": float(changes.mean()),
+        "largest": float(changes[at]),
+        "largest_at": int(course.frames[at]),
+        "spans": spans_where(changes > threshold, course),
+    }
+
+
+def _path_move(before: Floats, after: Floats, distances_cm: Floats) -> PathMove | None:
+    """Fit a turn about the vertical axis and a shift by least squares; None if they explain little of the change."""
+    centre, target = before.mean(axis=0), after.mean(axis=0)
+    a, b = before - centre, after - target
+    sine = float(np.sum(a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]))
+    cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]))
+    extent = CM_PER_M**2 * float(np.mean(np.sum(a * a, axis=1)))
+    turn = float(np.arctan2(sine, cosine)) if extent > 1.0 else 0.0  # a path of a point has no direction
+    turned = before.copy()
+    turned[:, [0, 2]] = rotated(before[:, [0, 2]], turn)
+    shift = target - turned.mean(axis=0)
+    remaining = CM_PER_M * np.linalg.norm(turned + shift - after, axis=1)
+    if remaining.mean() > 0.5 * distances_cm.mean():
+        return None
+    return PathMove(
+        turn_deg=float(np.degrees(turn)),
+        shift_cm=tuple((CM_PER_M * shift).tolist()),
+        remaining_cm=float(remaining.max()),
+    )

@@ -1,0 +1,137 @@
+"""Differences between two clips: their timing, skeletons, rotations, paths and translations."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.arrays import CM_PER_M, Ints
+from marey_motion.clip import Clip
+from marey_motion.difference.changes import NOISE_CM, NOISE_DEG, Course, joint_changes, root_change
+from marey_motion.difference.poses import Poses, rotation_changes_deg
+from marey_motion.difference.skeletons import JointPairs, compare_skeletons, pair_joints
+from marey_motion.difference.timing import SAME_PACE, Timing, compare_timing, frame_runs
+from marey_schemas.documents.differences import DifferenceOptions, DifferencePlot, JointChange, MotionDifference
+
+MOST_ROWS = 600
+"""Most rows of the plotted changes of rotations."""
+MOST_POINTS = 1000
+"""Most points of a plotted path."""
+MOST_PLOTTED_JOINTS = 256
+
+
+def compare_clips(
+    before: Clip, after: Clip, options: DifferenceOptions | None = None, *, plot: bool = False
+) -> tuple[MotionDifference, DifferencePlot | None]:
+    """Describe the differences between two clips.
+
+    Frames are matched by content, so that a removed or inserted frame does not change the frames after it. Rotations,
+    paths and translations are compared over the matched frames, of the joints that both skeletons have.
+
+    Parameters
+    ----------
+    before, after : Clip    clips of the same or of different skeletons
+    options : DifferenceOptions, optional    thresholds from which on the times of changes are listed
+    plot : bool    whether to compute values to draw
+
+    Returns
+    -------
+    difference : MotionDifference    in degrees and centimetres
+    plot : DifferencePlot or None    changes of rotations over time, and paths of the root
+
+    Examples
+    --------
+    >>> from marey_motion import compare_clips, generate_gait
+    >>> walk = generate_gait(1.2, 0.0, duration_s=4.0)
+    >>> difference, _ = compare_clips(walk, walk.sliced(12, walk.frame_count))
+    >>> [(run.change, run.before) for run in difference.runs]
+    [('removed', (0, 12)), ('matched', (12, 240))]
+    """
+    options = options or DifferenceOptions()
+    joints = pair_joints(before.skeleton, after.skeleton)
+    old, new = _poses(before, joints.before), _poses(after, joints.after)
+    timing = compare_timing(old, new, after.frame_rate_hz / before.frame_rate_hz)
+    pairs = timing.matching.pairs
+    course = Course(pairs[:, 1], after.frame_rate_hz)
+    names = [after.skeleton.joint_names[joint] for joint in joints.after]
+    rotations = rotation_changes_deg(timing.before, new, pairs)
+    paths = (timing.before.roots[pairs[:, 0]].astype(np.float64), new.roots[pairs[:, 1]].astype(np.float64))
+    found = MotionDifference(
+        frames=(before.frame_count, after.frame_count),
+        frame_rate_hz=(before.frame_rate_hz, after.frame_rate_hz),
+        duration_s=(before.duration_s, after.duration_s),
+        skeleton=compare_skeletons(before.skeleton, after.skeleton),
+        runs=frame_runs(timing, before.frame_count, after.frame_count),
+        frames_per_frame=timing.pace,
+        duration_ratio=_duration_ratio(timing, before, after),
+        rotations=joint_changes(names, rotations, course, threshold=options.threshold_deg, noise=NOISE_DEG),
+        root=root_change(*paths, course, options.threshold_cm),
+        translations=_translation_changes(before, after, joints, timing, course, options.threshold_cm),
+        translated_joints=(_translated(before), _translated(after)),
+    )
+    return found, _plot(names, rotations, pairs, old, new, after.frame_rate_hz) if plot else None
+
+
+def _poses(clip: Clip, joints: tuple[int, ...]) -> Poses:
+    """Return the poses of the joints in an order."""
+    whole = joints == tuple(range(clip.skeleton.joint_count))
+    return Poses(clip.root_translations, clip.rotations if whole else clip.rotations[:, list(joints)])
+
+
+def _duration_ratio(timing: Timing, before: Clip, after: Clip) -> float:
+    ratio = timing.pace * before.frame_rate_hz / after.frame_rate_hz
+    return 1.0 if abs(ratio - 1.0) <= SAME_PACE else ratio
+
+
+def _translated(clip: Clip) -> tuple[str, ...]:
+    return tuple(clip.skeleton.joint_names[joint] for joint in clip.translated_joints)
+
+
+def _translation_changes(
+    before: Clip, after: Clip, joints: JointPairs, timing: Timing, course: Course, threshold_cm: float
+) -> tuple[JointChange, ...]:
+    """Compare the translations of joints that are translated in either clip; the offset replaces an absent one."""
+    moved = [
+        (old, new)
+        for old, new in zip(joints.before, joints.after, strict=True)
+        if old in before.translated_joints or new in after.translated_joints
+    ]
+    if not moved or not len(timing.matching.pairs):
+        return ()
+    places = np.minimum(np.round(timing.matching.pairs[:, 0] / timing.pace), before.frame_count - 1).astype(np.int64)
+    steps = [_translations(after, new, course.frames) - _translations(before, old, places) for old, new in moved]
+    distances = CM_PER_M * np.linalg.norm(np.stack(steps, axis=1), axis=2)
+    names = [after.skeleton.joint_names[new] for _, new in moved]
+    return joint_changes(names, distances, course, threshold=threshold_cm, noise=NOISE_CM)
+
+
+def _translations(clip: Clip, joint: int, frames: Ints) -> NDArray[np.floating]:
+    """Return the positions (n, 3) of a joint in its parent's frame."""
+    if clip.translations is None or joint not in clip.translated_joints:
+        return np.broadcast_to(clip.skeleton.offsets[joint], (len(frames), 3))
+    return np.asarray(clip.translations[frames, clip.translated_joints.index(joint)])
+
+
+def _plot(
+    names: list[str], rotations: NDArray[np.float32], pairs: Ints, before: Poses, after: Poses, frame_rate_hz: float
+) -> DifferencePlot:
+    """Reduce changes and paths to what a picture can show."""
+    largest = rotations.max(axis=0, initial=0.0)
+    shown = np.sort(np.argsort(-largest, kind="stable")[:MOST_PLOTTED_JOINTS])
+    rows = min(MOST_ROWS, after.frame_count)
+    borders = np.arange(rows + 1) * after.frame_count // rows
+    degrees = np.full((rows, len(shown)), -1.0, dtype=np.float32)
+    np.maximum.at(degrees, np.searchsorted(borders, pairs[:, 1], side="right") - 1, rotations[:, shown])
+    return DifferencePlot(
+        joints=tuple(names[joint] for joint in shown),
+        frame_rate_hz=frame_rate_hz,
+        frames=tuple(borders.tolist()),
+        rotation_deg=degrees,
+        path_before_m=_path(before),
+        path_after_m=_path(after),
+    )
+
+
+def _path(poses: Poses) -> NDArray[np.float32]:
+    places = np.linspace(0, poses.frame_count - 1, min(MOST_POINTS, poses.frame_count)).astype(np.int64)
+    return np.ascontiguousarray(poses.roots[places][:, [0, 2]])

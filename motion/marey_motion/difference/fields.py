@@ -1,0 +1,148 @@
+"""Differences between documents: fields with other values, and the training of models."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from marey_schemas.documents.differences import ModelDifference
+from marey_schemas.documents.models import log_likelihoods
+
+MOST_TEXT = 2000
+"""Greatest length of a value as JSON text; longer ones are replaced by a description."""
+
+
+class ChangedValue(NamedTuple):
+    """Value of a document that differs.
+
+    Parameters
+    ----------
+    pointer : str    JSON pointer of the value
+    change : str    "added", "removed" or "changed"
+    before, after : JSON values    None if the value was added or removed
+    """
+
+    pointer: str
+    change: Literal["added", "removed", "changed"]
+    before: Any = None
+    after: Any = None
+
+
+def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[ChangedValue]:
+    """Compare two documents.
+
+    Objects are compared by field, lists of equal length by position. Of lists of different length, entries that only
+    one of them has are removed or added. Arrays are compared as a whole.
+
+    Parameters
+    ----------
+    before, after : JSON values and arrays    the documents
+    pointer : str    JSON pointer of the values in their documents
+
+    Yields
+    ------
+    ChangedValue    in the order of the documents
+    """
+    if isinstance(before, Mapping) and isinstance(after, Mapping):
+        yield from _changed_members(before, after, pointer)
+    elif _is_list(before) and _is_list(after) and len(before) == len(after):
+        for place, (old, new) in enumerate(zip(before, after, strict=True)):
+            yield from changed_values(old, new, f"{pointer}/{place}")
+    elif _is_list(before) and _is_list(after):
+        yield from _changed_entries(before, after, pointer)
+    elif not _equal(before, after):
+        yield ChangedValue(pointer, "changed", _shown(before), _shown(after))
+
+
+def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointer: str) -> Iterator[ChangedValue]:
+    for name in dict.fromkeys((*before, *after)):
+        place = f"{pointer}/{name.replace('~', '~0').replace('/', '~1')}"
+        old, new = before.get(name), after.get(name)
+        if old is None and new is not None:
+            yield ChangedValue(place, "added", after=_shown(new))
+        elif new is None and old is not None:
+            yield ChangedValue(place, "removed", before=_shown(old))
+        else:
+            yield from changed_values(old, new, place)
+
+
+def _changed_entries(before: Sequence[Any], after: Sequence[Any], pointer: str) -> Iterator[ChangedValue]:
+    old, new = [_key(one) for one in before], [_key(one) for one in after]
+    spare = Counter(old) - Counter(new)
+    for place, key in enumerate(old):
+        if spare[key]:
+            spare[key] -= 1
+            yield ChangedValue(f"{pointer}/{place}", "removed", before=_shown(before[place]))
+    spare = Counter(new) - Counter(old)
+    for place, key in enumerate(new):
+        if spare[key]:
+            spare[key] -= 1
+            yield ChangedValue(f"{pointer}/{place}", "added", after=_shown(after[place]))
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list | tuple)
+
+
+def _equal(before: Any, after: Any) -> bool:
+    if isinstance(before, np.ndarray) and isinstance(after, np.ndarray):
+        return before.shape == after.shape and np.array_equal(before, after, equal_nan=before.dtype.kind == "f")
+    if isinstance(before, np.ndarray) or isinstance(after, np.ndarray):
+        return False
+    return type(before) is type(after) and bool(before == after)
+
+
+def _key(value: Any) -> str:
+    return json.dumps(value, sort_keys=True, default=lambda array: array.tolist())
+
+
+def _shown(value: Any) -> Any:
+    """Return a value for the difference; arrays and long values are replaced by a description in words."""
+    if isinstance(value, np.ndarray):
+        return f"array of {' x '.join(str(size) for size in value.shape)} numbers"
+    text = json.dumps(value, default=_shown)
+    if len(text) <= MOST_TEXT:
+        return json.loads(text)
+    if isinstance(value, str):
+        return f"{value[:MOST_TEXT]}…"
+    return f"{'list' if _is_list(value) else 'object'} of {len(value)} values"
+
+
+def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> ModelDifference:
+    """Describe the differences between the trainings of two models.
+
+    Parameters
+    ----------
+    before, after : mapping    parts `model` of any age
+
+    Returns
+    -------
+    ModelDifference    examples, and the mean likelihood if it is stored
+    """
+    old, new = _examples(before), _examples(after)
+    return ModelDifference(
+        examples=(len(old), len(new)),
+        examples_added=tuple(name for key, name in new.items() if key not in old),
+        examples_removed=tuple(name for key, name in old.items() if key not in new),
+        mean_log_likelihood=(_mean_likelihood(before), _mean_likelihood(after)),
+    )
+
+
+def _examples(model: Mapping[str, Any]) -> dict[Any, str]:
+    """Return the names of the training examples by their revisions, or by their names in models without revisions."""
+    provenance = model.get("provenance") or {}
+    aligned = provenance.get("aligned") or ()
+    if all(isinstance(one, Mapping) and {"item", "revision"} <= one.keys() for one in aligned) and aligned:
+        return {(one["item"], one["revision"]): str(one.get("name", one["item"])) for one in aligned}
+    examples = (model.get("training") or {}).get("examples") or ()
+    names = [str(one["name"]) for one in examples if isinstance(one, Mapping) and "name" in one]
+    return dict(zip(names, names, strict=True))
+
+
+def _mean_likelihood(model: Mapping[str, Any]) -> float | None:
+    values = log_likelihoods(model)
+    return float(np.mean(values)) if values else None

@@ -1,0 +1,125 @@
+"""Candidates for the shift in time between two clips: which frame after may correspond to a frame before."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from marey_motion.arrays import AnyInts, Complexes, Floats
+from marey_motion.difference.poses import Poses
+
+MOST_LAGS = 16
+"""Most candidates, of each of the two methods."""
+WINDOWS = 12
+"""Windows of frames before that are searched in the whole clip after."""
+SHORTEST_WINDOW = 8
+SIMILAR = 4.0
+"""Factor of the least squared distance up to which the second-best place of a window is a candidate, too."""
+NEGLIGIBLE = 1e-3
+"""Squared distance of two frames that is attributed to noise."""
+CHANNELS = 8
+"""Number of random projections of a pose in which windows are searched."""
+
+
+def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
+    """Find shifts at which many frames are equal, by hashing frames.
+
+    Frames that occur once in each clip vote for their shift. Of frames that repeat, as in still motion, the first and
+    the last occurrence vote. Frames are hashed twice, the second time without the root, because a clip may have been
+    moved in space.
+
+    Parameters
+    ----------
+    before, after : Poses    frames of the same joints
+
+    Returns
+    -------
+    tuple of int    frame after minus frame before, the most frequent first
+    """
+    votes: Counter[int] = Counter()
+    for hashed in (_hashes, _body_hashes):
+        _, where_before, where_after = np.intersect1d(hashed(before), hashed(after), return_indices=True)
+        _, last_before, last_after = np.intersect1d(hashed(before)[::-1], hashed(after)[::-1], return_indices=True)
+        first = where_after - where_before
+        last = (after.frame_count - 1 - last_after) - (before.frame_count - 1 - last_before)
+        for lags in (first, last):
+            votes.update(dict(zip(*(part.tolist() for part in np.unique(lags, return_counts=True)), strict=True)))
+    return tuple(lag for lag, _ in sorted(votes.items(), key=lambda one: (-one[1], abs(one[0]))[:2])[:MOST_LAGS])
+
+
+def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
+    """Find shifts at which windows of frames before are most similar to frames after.
+
+    Each window is compared with every place of the other clip at once, by correlation in the frequency domain.
+
+    Parameters
+    ----------
+    before, after : Poses    frames of the same joints
+    unmatched : (n,) int    frames before that the windows are centred on
+
+    Returns
+    -------
+    tuple of int    frame after minus frame before
+    """
+    length = min(before.frame_count, after.frame_count, max(SHORTEST_WINDOW, before.frame_count // WINDOWS))
+    size = 1 << int(np.ceil(np.log2(after.frame_count + length)))
+    source, target = _features(before), _features(after)
+    spectrum = np.fft.rfft(target, size, axis=0)
+    energy = np.concatenate(([0.0], np.cumsum(np.einsum("fc,fc->f", target, target))))
+    centres = np.unique(unmatched[np.linspace(0, len(unmatched) - 1, WINDOWS).astype(np.int64)])
+    found: list[int] = []
+    for start in np.unique(np.clip(centres - length // 2, 0, before.frame_count - length)).tolist():
+        distances = _window_distances(source[start : start + length], spectrum, energy, size)
+        best = int(np.argmin(distances))
+        nearby = slice(max(0, best - length // 2), best + length // 2 + 1)
+        others = distances.copy()
+        others[nearby] = np.inf
+        second = int(np.argmin(others))
+        found.append(best - start)
+        if others[second] <= SIMILAR * max(distances[best], 0.0) + NEGLIGIBLE * length:
+            found.append(second - start)
+    return tuple(dict.fromkeys(found))[: 2 * WINDOWS]
+
+
+def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size: int) -> Floats:
+    """Return the squared distances of a window to every place where it fits entirely into the other clip."""
+    length = len(window)
+    places = len(energy) - length
+    products = np.fft.irfft(spectrum * np.conj(np.fft.rfft(window, size, axis=0)), size, axis=0)[:places]
+    squares = energy[length:] - energy[:-length]
+    return np.asarray(squares - 2.0 * products.sum(axis=1) + np.sum(window * window), dtype=np.float64)
+
+
+def _features(poses: Poses) -> Floats:
+    """Return random projections (F, `CHANNELS`) of the rotations, with the root's height and its steps."""
+    rotations = poses.rotations * np.where(poses.rotations[..., :1] < 0.0, -1.0, 1.0)
+    flat = rotations.reshape(poses.frame_count, -1).astype(np.float64)
+    projection = np.random.default_rng(0).normal(size=(flat.shape[1], CHANNELS)) / np.sqrt(CHANNELS)
+    steps = np.diff(poses.roots.astype(np.float64), axis=0, prepend=poses.roots[:1])
+    return np.concatenate((flat @ projection, poses.roots[:, 1:2], steps), axis=1)
+
+
+def _hashes(poses: Poses) -> NDArray[np.uint64]:
+    return _hashed_rows(np.concatenate((poses.roots, _one_sided(poses.rotations)), axis=1))
+
+
+def _body_hashes(poses: Poses) -> NDArray[np.uint64]:
+    return _hashed_rows(_one_sided(poses.rotations[:, 1:]))
+
+
+def _one_sided(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return rotations as rows (F, 4·J) with a sign of each quaternion that depends on the rotation alone."""
+    signs = np.where(rotations[..., :1] < 0.0, np.float32(-1.0), np.float32(1.0))
+    return np.asarray(rotations * signs, dtype=np.float32).reshape(len(rotations), -1)
+
+
+def _hashed_rows(rows: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Hash rows of numbers: a scalar product of their bits with random odd numbers, modulo 2^64."""
+    bits = np.ascontiguousarray(rows + np.float32(0.0)).view(np.uint32)  # the addition makes -0 equal to 0
+    factors = np.random.default_rng(1).integers(0, 2**63, bits.shape[1], dtype=np.uint64) * 2 + 1
+    hashes = np.zeros(len(rows), dtype=np.uint64)
+    for column, factor in zip(bits.T, factors, strict=True):
+        hashes += column * factor
+    return hashes

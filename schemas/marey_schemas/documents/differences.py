@@ -1,0 +1,241 @@
+"""Differences between two revisions, in terms of motion, annotations, skeletons, models and fields.
+
+Pairs have the value before and the value after. Ranges of frames are half open. Frames are those of the revision after,
+unless a description names the other revision.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from marey_schemas.base import Answer, Options
+from marey_schemas.documents.annotations import Annotation, KeyframeDocument, SegmentDocument
+from marey_schemas.documents.skeletons import Vector3
+from marey_schemas.encoding.arrays import ArrayOf
+from marey_schemas.kinds import Kind
+
+Range = tuple[int, int]
+Change = Literal["added", "removed", "changed"]
+MatchedFloats = Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)]
+
+
+class DifferenceOptions(Options):
+    """Options of a difference: which changes of motion have their times listed."""
+
+    threshold_deg: float = Field(
+        1.0, ge=0.01, le=180, description="List the times at which a joint's rotation changed by more, in degrees."
+    )
+    threshold_cm: float = Field(
+        1.0, ge=0.001, le=1e6, description="List the times at which a position changed by more, in centimetres."
+    )
+
+
+class DifferenceRequest(DifferenceOptions):
+    """Query of a difference: the two revisions, and what the answer contains."""
+
+    from_: int | None = Field(
+        None,
+        alias="from",
+        ge=1,
+        lt=2**31,
+        description="Revision before. Absent: the one before `to`; with `to_item`, the newest.",
+    )
+    to: int | None = Field(None, ge=1, lt=2**31, description="Revision after. Absent: the newest.")
+    to_item: str | None = Field(
+        None, max_length=64, description="Another item of the same kind in the project, whose revision is `to`."
+    )
+    plot: bool = Field(False, description="Include values to draw.")
+
+
+class ComparedRevision(Answer):
+    """One of the two revisions of a difference."""
+
+    item: str
+    name: str = Field(description="Name of the item.")
+    revision: int
+
+
+class FrameRun(Answer):
+    """Frames that correspond to each other, or that only one revision has."""
+
+    change: Literal["matched", "removed", "inserted"]
+    before: Range = Field(description="Range of frames before; empty for inserted frames.")
+    after: Range = Field(description="Range of frames after; empty for removed frames.")
+
+
+class Exceeding(Answer):
+    """Size of a change over the matched frames, and the times at which it exceeds the threshold."""
+
+    mean: float = Field(description="Mean over all matched frames.")
+    largest: float
+    largest_at: int = Field(description="Frame with the largest change.")
+    spans: tuple[Range, ...] = Field(
+        (),
+        description="Ranges of frames in which the change exceeds the threshold; ranges less than 0.1 s apart "
+        "are joined.",
+    )
+
+
+class JointChange(Exceeding):
+    """Change of a joint's local rotation or translation: degrees or centimetres."""
+
+    joint: str = Field(description="Name of the joint after.")
+
+
+class PathMove(Answer):
+    """Movement of a whole path: a turn about the vertical axis through the origin, then a shift."""
+
+    turn_deg: float = Field(description="Turn about the vertical axis, left positive.")
+    shift_cm: Vector3
+    remaining_cm: float = Field(description="Largest distance between the paths after this movement.")
+
+
+class RootChange(Exceeding):
+    """Change of the root's path: distances in centimetres."""
+
+    moved: PathMove | None = Field(
+        None, description="Movement that explains most of the change; absent if there is none."
+    )
+
+
+class RestChange(Answer):
+    """Changes of a joint in the rest pose."""
+
+    joint: str = Field(description="Name of the joint after.")
+    parent: tuple[str | None, str | None] | None = Field(None, description="Names of the parents, if they differ.")
+    offset_cm: float = Field(0.0, description="Length of the change of the offset.")
+    rotation_deg: float = Field(0.0, description="Angle of the change of the rest rotation.")
+
+
+class SkeletonDifference(Answer):
+    """Differences between two hierarchies of joints."""
+
+    joint_count: tuple[int, int]
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    renamed: tuple[tuple[str, str], ...] = Field((), description="Names before and after.")
+    joints: tuple[RestChange, ...] = Field((), description="Joints of both whose rest pose or parent differs.")
+    reordered: bool = Field(False, description="Whether the joints of both are in a different order.")
+    end_sites_changed: bool = False
+
+
+class MotionDifference(Answer):
+    """Differences between two motions."""
+
+    frames: tuple[int, int]
+    frame_rate_hz: tuple[float, float]
+    duration_s: tuple[float, float]
+    skeleton: SkeletonDifference | None = Field(None, description="Absent if the skeletons are equal.")
+    runs: tuple[FrameRun, ...] = Field(description="All frames of both revisions, in order.")
+    frames_per_frame: float = Field(
+        1.0, description="Frames after for each matched frame before; 1 unless the frames were resampled."
+    )
+    duration_ratio: float = Field(
+        1.0, description="Duration after of matched motion, divided by its duration before; 1 unless it was re-timed."
+    )
+    rotations: tuple[JointChange, ...] = Field((), description="Changed local rotations, largest first, degrees.")
+    root: RootChange | None = Field(None, description="Absent if the path of the root is equal.")
+    translations: tuple[JointChange, ...] = Field(
+        (), description="Changed translations of joints other than the root, largest first, centimetres."
+    )
+    translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
+        ((), ()), description="Joints other than the root whose translations are stored."
+    )
+
+
+class SegmentChange(Answer):
+    """Change of a segment: added or removed if one of the two is absent, otherwise moved, relabelled or both."""
+
+    before: SegmentDocument | None = None
+    after: SegmentDocument | None = None
+
+
+class KeyframeChange(Answer):
+    """Change of a keyframe: added or removed if one of the two is absent, otherwise moved, relabelled or both."""
+
+    before: KeyframeDocument | None = None
+    after: KeyframeDocument | None = None
+
+
+class AnnotationDifference(Answer):
+    """Differences between two annotations; frames are those of the annotated clips."""
+
+    segment_count: tuple[int, int]
+    segments: tuple[SegmentChange, ...] = Field((), description="Changed segments, in the order of their frames.")
+    keyframe_count: tuple[int, int]
+    keyframes: tuple[KeyframeChange, ...] = Field((), description="Changed keyframes, in the order of their frames.")
+
+
+class MappedJoint(Answer):
+    """Joint of a skeleton that stands for a standard joint, before and after."""
+
+    standard: str
+    before: str | None = None
+    after: str | None = None
+
+
+class MappingDifference(Answer):
+    """Differences between two mappings of joints."""
+
+    joints: tuple[MappedJoint, ...] = ()
+    axes: tuple[str, ...] = Field((), description="Joints whose anatomical axes differ.")
+
+
+class ModelDifference(Answer):
+    """Differences between the trainings of two models. Changed options are among the changed fields."""
+
+    examples: tuple[int, int] = Field(description="Numbers of training examples.")
+    examples_added: tuple[str, ...] = ()
+    examples_removed: tuple[str, ...] = ()
+    mean_log_likelihood: tuple[float | None, float | None] = Field(
+        (None, None), description="Mean log-likelihood of each model's own examples; null if it is not stored."
+    )
+
+
+class FieldChange(Answer):
+    """Change of a value in a document that no other member of the difference describes."""
+
+    part: str
+    pointer: str = Field(description="JSON pointer of the value in the document of the part.")
+    change: Change
+    before: Any = None
+    after: Any = None
+
+
+class DifferencePlot(Answer):
+    """Values to draw: the change of rotations over time, and the paths of the root."""
+
+    joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
+    frame_rate_hz: float = Field(description="Frame rate of the revision after.")
+    frames: tuple[int, ...] = Field(description="First frame of each row of `rotation_deg`, and the end of the last.")
+    rotation_deg: MatchedFloats = Field(
+        description="[rows, joints]: largest change within the row's frames; -1: no frame is matched."
+    )
+    path_before_m: MatchedFloats = Field(description="[points, 2]: x and z of the root before, metres.")
+    path_after_m: MatchedFloats = Field(description="[points, 2]: x and z of the root after, metres.")
+
+
+class Difference(Answer):
+    """Difference between two revisions of an item, or of two items of the same kind."""
+
+    schema_: Literal["marey/difference@1"] = Field("marey/difference@1", alias="schema")
+    kind: Kind
+    before: ComparedRevision
+    after: ComparedRevision
+    options: DifferenceOptions
+    parts: dict[str, Change] = Field(description="Parts that differ; a difference without any is empty.")
+    motion: MotionDifference | None = None
+    skeleton: SkeletonDifference | None = None
+    mapping: MappingDifference | None = None
+    annotation: AnnotationDifference | None = None
+    model: ModelDifference | None = None
+    fields: tuple[FieldChange, ...] = ()
+    more_fields: int = Field(0, description="Number of changed values beyond those in `fields`.")
+    plot: DifferencePlot | None = Field(None, description="Values of two motions to draw, if they were requested.")
+    annotations: tuple[Annotation, Annotation] | None = Field(
+        None, description="The compared annotations, if values to draw were requested."
+    )

@@ -1,0 +1,256 @@
+"""Differences between revisions: both are read in one transaction and compared in a child process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from marey_schemas.documents.annotations import Annotation
+from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.documents.differences import (
+    Change,
+    ComparedRevision,
+    Difference,
+    DifferenceOptions,
+    DifferenceRequest,
+    FieldChange,
+    SkeletonDifference,
+)
+from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
+from marey_schemas.items import Item, PartSummary
+from marey_schemas.kinds import Kind
+from marey_server.errors import NotFoundProblem, TooLargeProblem
+from marey_server.motions.child import AnswerEncoding, Message, pack_tree, unpack_tree
+from marey_server.store import items
+from marey_server.store.transaction import Transaction
+
+if TYPE_CHECKING:  # numeric modules are loaded by children alone
+    from marey_motion.clip import Clip
+    from marey_motion.skeleton import Skeleton
+
+Tree = dict[str, Any]
+
+MAKE_DIFFERENCE = "marey_server.motions.comparing:make_difference"
+"""Function that child processes run."""
+MOST_NUMBERS = 30_000_000
+"""Greatest number of values in the poses of both revisions."""
+MOST_FIELDS = 1000
+"""Most changed values that an answer lists."""
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedSide:
+    """A revision with the documents of its differing parts; `hierarchy` is the skeleton of a motion."""
+
+    place: ComparedRevision
+    parts: Mapping[str, PartSummary]
+    trees: dict[str, Tree]
+    hierarchy: Tree | None
+
+
+@dataclass(frozen=True, slots=True)
+class DifferenceSource:
+    """The two sides of a difference."""
+
+    kind: Kind
+    before: ComparedSide
+    after: ComparedSide
+
+
+class SideOrder(Message):
+    """One side of an order: its documents as bytes."""
+
+    place: ComparedRevision
+    parts: dict[str, bytes]
+    hierarchy: bytes | None
+
+
+class DifferenceOrder(Message):
+    """Order to compare two revisions."""
+
+    kind: Kind
+    before: SideOrder
+    after: SideOrder
+    options: DifferenceOptions
+    plot: bool
+    encoding: AnswerEncoding
+
+
+def read_difference(
+    tx: Transaction, project: str, kind: Kind, item_id: str, request: DifferenceRequest
+) -> DifferenceSource:
+    """Read the parts that differ between two revisions. Raises `NotFoundProblem` and `TooLargeProblem`."""
+    item = items.read_item(tx, project, kind, item_id)
+    other = item if request.to_item is None else items.read_item(tx, project, kind, request.to_item)
+    after = request.to or other.revision
+    before = request.from_ or (after - 1 if other.id == item.id else item.revision)
+    if before < 1:
+        raise NotFoundProblem(
+            "The item has no revision before this one; name two revisions, or another item.", code="no-revision"
+        )
+    numbers = {"before": (item, before), "after": (other, after)}
+    parts = {side: items.read_revision(tx, project, kind, one.id, n).parts for side, (one, n) in numbers.items()}
+    digests = {side: {(name, part.document) for name, part in found.items()} for side, found in parts.items()}
+    differing = {name for name, _ in digests["before"] ^ digests["after"]}
+    found = DifferenceSource(
+        kind,
+        *(_side(tx, project, one, n, parts[side], differing) for side, (one, n) in numbers.items()),
+    )
+    _require_room(found)
+    return found
+
+
+def _side(
+    tx: Transaction, project: str, item: Item, revision: int, parts: Mapping[str, PartSummary], differing: set[str]
+) -> ComparedSide:
+    trees = {
+        name: items.read_part(tx, project, item.kind, item.id, name, revision=revision).tree
+        for name in sorted(differing & parts.keys())
+    }
+    hierarchy = None
+    if "motion" in trees:
+        ref = trees["motion"]["skeleton"]
+        hierarchy = items.read_part(tx, project, Kind.SKELETON, ref["item"], "hierarchy", revision=ref["revision"]).tree
+    place = ComparedRevision(item=item.id, name=item.name, revision=revision)
+    return ComparedSide(place, parts, trees, hierarchy)
+
+
+def _require_room(source: DifferenceSource) -> None:
+    motions = [side.trees["motion"] for side in (source.before, source.after) if "motion" in side.trees]
+    if sum(int(motion["poses"].shape[0] * motion["poses"].shape[1]) for motion in motions) > MOST_NUMBERS:
+        raise TooLargeProblem(
+            f"The motions have more than {MOST_NUMBERS:,} values together, which is too much to compare at once; "
+            "download both revisions, or compare parts of the clip.",
+            code="difference-too-large",
+        )
+
+
+def difference_order(source: DifferenceSource, request: DifferenceRequest, encoding: AnswerEncoding) -> bytes:
+    """Return the order to compare two revisions."""
+    return DifferenceOrder(
+        kind=source.kind,
+        before=_side_order(source.before),
+        after=_side_order(source.after),
+        options=DifferenceOptions.of(request),
+        plot=request.plot,
+        encoding=encoding,
+    ).pack()
+
+
+def _side_order(side: ComparedSide) -> SideOrder:
+    return SideOrder(
+        place=side.place,
+        parts={name: pack_tree(tree) for name, tree in side.trees.items()},
+        hierarchy=None if side.hierarchy is None else pack_tree(side.hierarchy),
+    )
+
+
+# -- in the child ------------------------------------------------------------------------------------------------------
+
+
+def make_difference(packed: bytes) -> bytes:
+    """Carry out a `DifferenceOrder` and return the document of the difference. Raises `TooLargeProblem`."""
+    from marey_motion.errors import MotionError
+
+    order = DifferenceOrder.unpack(packed)
+    try:
+        difference = _difference(order)
+    except MotionError as error:
+        raise TooLargeProblem(f"The revisions cannot be compared: {error}.", code="difference-too-large") from error
+    return order.encoding.encode(difference.model_dump(by_alias=True, exclude_none=True))
+
+
+def _difference(order: DifferenceOrder) -> Difference:
+    before = {name: unpack_tree(part) for name, part in order.before.parts.items()}
+    after = {name: unpack_tree(part) for name, part in order.after.parts.items()}
+    fields = _changed_fields(before, after)
+    return Difference(
+        kind=order.kind,
+        before=order.before.place,
+        after=order.after.place,
+        options=order.options,
+        parts={name: _part_change(before, after, name) for name in sorted({*before, *after})},
+        fields=tuple(fields[:MOST_FIELDS]),
+        more_fields=max(0, len(fields) - MOST_FIELDS),
+        **_described(order, before, after),
+    )
+
+
+def _part_change(before: Mapping[str, Tree], after: Mapping[str, Tree], name: str) -> Change:
+    if name not in before:
+        return "added"
+    return "changed" if name in after else "removed"
+
+
+DESCRIBED: dict[str, frozenset[str]] = {
+    "motion": frozenset({"frame_rate_hz", "joints", "poses", "translations", "translated_joints"}),
+    "hierarchy": frozenset({"joints", "end_sites"}),
+    "mapping": frozenset({"joints", "axes"}),
+    "annotation": frozenset({"segments", "keyframes"}),
+}
+"""Members of parts that the difference describes in other words than by fields."""
+
+
+def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> list[FieldChange]:
+    """List the changed values of parts that both revisions have, as far as no other member describes them."""
+    from marey_motion.difference.fields import changed_values
+
+    found: list[FieldChange] = []
+    for part in sorted(before.keys() & after.keys()):
+        left_out = DESCRIBED.get(part, frozenset())
+        old, new = (
+            {name: value for name, value in tree[part].items() if name not in left_out} for tree in (before, after)
+        )
+        found += (FieldChange(part=part, **value._asdict()) for value in changed_values(old, new))
+    return found
+
+
+def _described(order: DifferenceOrder, before: Mapping[str, Tree], after: Mapping[str, Tree]) -> dict[str, Any]:
+    """Compare the parts that have a description of their own; return members of `Difference`."""
+    from marey_motion.difference import fields, layers, skeletons
+
+    found: dict[str, Any] = {}
+    for part in before.keys() & after.keys():
+        old, new = before[part], after[part]
+        if part == "motion":
+            found |= _compared_motions(order, old, new)
+        elif part == "hierarchy":
+            found["skeleton"] = _compared_skeletons(old, new)
+        elif part == "mapping":
+            pair = [SkeletonMapping.model_validate(tree) for tree in (old, new)]
+            found["mapping"] = skeletons.compare_mappings(*pair)
+        elif part == "annotation":
+            annotations = [Annotation.model_validate(tree) for tree in (old, new)]
+            found["annotation"] = layers.compare_annotations(*annotations)
+            found["annotations"] = tuple(annotations) if order.plot else None
+        elif part == "model":
+            found["model"] = fields.compare_models(old, new)
+    return found
+
+
+def _compared_motions(order: DifferenceOrder, before: Tree, after: Tree) -> dict[str, Any]:
+    from marey_motion.difference.clips import compare_clips
+
+    clips = [_clip(tree, side.hierarchy) for tree, side in ((before, order.before), (after, order.after))]
+    motion, plot = compare_clips(clips[0], clips[1], order.options, plot=order.plot)
+    return {"motion": motion, "plot": plot}
+
+
+def _compared_skeletons(before: Tree, after: Tree) -> SkeletonDifference | None:
+    from marey_motion.difference.skeletons import compare_skeletons
+
+    return compare_skeletons(_skeleton(before), _skeleton(after))
+
+
+def _clip(motion: Tree, hierarchy: bytes | None) -> Clip:
+    from marey_motion.documents import clip_from_document
+
+    assert hierarchy is not None
+    return clip_from_document(MotionDocument.model_validate(motion), _skeleton(unpack_tree(hierarchy)))
+
+
+def _skeleton(hierarchy: Tree) -> Skeleton:
+    from marey_motion.documents import skeleton_from_document
+
+    return skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
