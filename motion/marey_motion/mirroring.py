@@ -29,8 +29,8 @@ class _Mirror:
 
     Parameters
     ----------
-    sources : (J,) the joint that each joint takes its motion from
-    frames : (J, 3, 3) improper; takes the partner's local axes to the joint's own
+    sources : (J,) index of the joint from which each joint gets its motion
+    frames : (J, 3, 3) improper matrices that map the partner's local axes to the joint's own
     outer, inner : (J, 4) rotations to multiply the source's local rotation with, from the left and from the right
     carried : (J,) joints that have no counterpart and keep their local motion
     """
@@ -45,14 +45,14 @@ class _Mirror:
 def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
     """Reflect a motion in x, which exchanges the motion of left and right limbs.
 
-    Exact where both sides have the same bone lengths, whatever the rest pose and the joints' local axes; reflecting
-    twice gives the original motion. A joint that has no counterpart, such as a prop in one hand, moves with its parent
-    as before.
+    The result is exact if both sides have the same bone lengths, whatever the rest pose and the joints' local axes;
+    reflecting twice gives the original motion. A joint that has no counterpart, such as a prop in one hand, moves with
+    its parent as before.
 
     Parameters
     ----------
     clip : Clip    F frames of J joints
-    partners : (J,) int    each joint's partner on the other side, itself for joints of the centre
+    partners : (J,) int    each joint's partner on the other side; joints of the centre are their own partners
         (`rigs.symmetric_joints`)
 
     Returns

@@ -24,13 +24,15 @@ class MatchingBody:
     Parameters
     ----------
     hips : the joint whose velocity is matched
-    carrier : the last joint that all standard joints hang from, mostly the hips. Those above it, such as a static
-        reference, only move the whole body about.
-    torso : the joint whose ground projection carries the simulation root: the upper spine, else the hips
-    feet, toes : (left, right); the ankles, and what touches the ground (the ankles where there are no toes)
-    lefts, rights : matching joints of both sides, hips and shoulders; their difference shows where the body faces
+    carrier : the lowest joint from which all standard joints descend, usually the hips. Joints above it, such as a
+        static reference, only move the body as a whole.
+    torso : the joint whose position on the ground is smoothed to make the simulation root: the upper spine, or else the
+        hips
+    feet, toes : (left, right) ankles, and (left, right) toes; without toe joints, the ankles again
+    lefts, rights : matching joints of both sides, hips and shoulders, from whose differences the facing direction is
+        computed
     pose_joints : joints of the pose cost: those of `POSE_JOINTS` that the skeleton has, in that order
-    partners : (J,) each joint's partner on the other side, its own index for joints of the centre
+    partners : (J,) each joint's partner on the other side; joints of the centre have their own index
     standard_joints : joint index by standard name, for all joints of the mapping
     """
 

@@ -37,7 +37,7 @@ def build_database(
     normaliser: Normaliser | None = None,
     progress: Progress | None = None,
 ) -> MatchingDatabase:
-    """Build a matching database from clips of one skeleton, independent of their order.
+    """Build a matching database from clips of one skeleton; the result does not depend on their order.
 
     Parameters
     ----------
@@ -54,8 +54,8 @@ def build_database(
 
     Raises
     ------
-    MotionError    naming the clip that has another skeleton, no facing direction or too few frames; when uids repeat,
-        options are invalid, or the normaliser has other dimensions
+    MotionError    if a clip has another skeleton, no facing direction or too few frames (the error names it), if uids
+        repeat, if options are invalid, or if the normaliser has other dimensions
     """
     layout = feature_layout(options, body)
     if normaliser is not None:
@@ -119,7 +119,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
 
     Raises
     ------
-    MotionError    when they match different joints or horizons, or with different weights
+    MotionError    if the databases have different joints, horizons or weights
     """
     if not databases:
         raise MotionError("no databases were given to fit the normaliser to", code="no-features")
@@ -252,7 +252,7 @@ def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
 def _joined_translations(
     built: Sequence[_Built], body: MatchingBody
 ) -> tuple[NDArray[np.float32] | None, tuple[int, ...]]:
-    """Collect translations of all joints that any clip translates; other clips repeat its offset."""
+    """Collect translations of all joints that any clip translates; in other clips, they equal the joint's offset."""
     joints = np.array(sorted({joint for row in built for joint in row[1].translated_joints}), dtype=np.int64)
     if not len(joints):
         return None, ()

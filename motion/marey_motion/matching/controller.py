@@ -23,11 +23,11 @@ class Trajectory(Protocol):
 
     @property
     def rate_hz(self) -> float:
-        """Ticks per second; the database's."""
+        """Ticks per second, as in the database."""
 
     @property
     def tick_count(self) -> int:
-        """T, ticks to play; the arrays have at least as many rows."""
+        """Number T of ticks to simulate; the arrays have at least T rows."""
 
     @property
     def positions(self) -> Floats:
@@ -74,7 +74,7 @@ class ControllerConstants(NamedTuple):
 
 
 class DatabaseArrays(NamedTuple):
-    """Arrays of a database that a controller needs beside the index: steps of the root, pose joints and normaliser."""
+    """Arrays of a database that a controller needs besides the index: steps of the root, pose joints, normaliser."""
 
     successors: NDArray[np.int64]
     steps: Floats
@@ -200,7 +200,7 @@ def trajectory_arrays(guide: Trajectory) -> TrajectoryArrays:
 
     Raises
     ------
-    MotionError    when they are shorter than its ticks
+    MotionError    if an array has fewer than T rows
     """
     arrays = (guide.positions, guide.headings, guide.speeds_m_s, guide.turn_rates_rad_s)
     positions, headings, speeds, turn_rates = (np.ascontiguousarray(array, dtype=np.float64) for array in arrays)

@@ -62,7 +62,7 @@ def _wished(wish, when):  # type: ignore[no-untyped-def]
 
 @compiled
 def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
-    """Find the point of the desired path nearest to (x, z), in ticks, near the last one `when`."""
+    """Find the moment, in ticks, at which the desired path is nearest to (x, z); search near the last moment `when`."""
     window = int(PATH_WINDOW_S / wish.tick_s)
     best, best_square = 0, np.inf
     for tick in range(max(0, int(when) - window), int(when) + window + 1):
@@ -164,7 +164,7 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
     """Choose the next row; return it, its cost, and the cost of continuing from `row`, NaN if its clip has ended.
 
-    The pose of the query is that of `row`, so that continuing costs only what its trajectory costs.
+    The pose of the query is that of `row`, so continuing has only the cost of the trajectory.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:
@@ -184,7 +184,7 @@ def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_row(index, playback, rules, wish, root, query):  # type: ignore[no-untyped-def]
-    """Find the row that a trial starts with: nearest to the desired trajectory, whatever its pose."""
+    """Find the first row of a trial: the row nearest to the desired trajectory, whatever its pose."""
     fill_query(index, playback, rules, wish, 0, 0.0, root[0], root[1], root[2], query)
     weights = np.ones(query.shape[0])
     weights[: query.shape[0] - 4 * playback.horizons_s.shape[0]] = 0.0

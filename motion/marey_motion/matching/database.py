@@ -28,7 +28,7 @@ NOTES = {
 
 
 class RootMotion(NamedTuple):
-    """The step that follows each row: a tuple of arrays, so that compiled code takes it as it is.
+    """The step that follows each row, as a tuple of arrays that can be passed to compiled code.
 
     Parameters
     ----------
@@ -81,11 +81,12 @@ class SourceClip:
 
     Parameters
     ----------
-    uid : permanent identifier of the clip, for example "clip_01J…@3"; ties between equal costs go to the lower uid
+    uid : permanent identifier of the clip, for example "clip_01J…@3"; of rows with equal costs, the row of the clip
+        with the lower uid is chosen
     name : name for people
     content : digest of its motion document, or "" when unknown
-    loop : the last frame leads into the first one
-    frames : the half-open range of frames to use, all when None
+    loop : whether the last frame leads into the first one
+    frames : the half-open range of frames to use; all frames if None
     """
 
     uid: str
@@ -99,7 +100,7 @@ class SourceClip:
 
 @dataclass(frozen=True)
 class DatabaseClip:
-    """A clip in a database. Its rows are [start, stop); a mirrored one has the uid of its source plus "~mirrored".
+    """A clip in a database. Its rows are [start, stop); a mirrored copy has the uid of its source plus "~mirrored".
 
     `in_place` clips walk without travelling, as on a treadmill: their speeds are meaningless. `first_s` is the time of
     the first row in the recording, in seconds; it is above 0 if a range of frames was chosen or a rest pose was left
@@ -137,13 +138,13 @@ class DatabaseNote:
 
 @dataclass(frozen=True, eq=False)
 class MatchingDatabase:
-    """N rows, D feature dimensions, P pose joints, C clips in ascending order of uid: the lowest row wins a tie.
+    """A database of N rows, D feature dimensions, P pose joints and C clips, which are in ascending order of uid.
 
-    The pose of a row is relative to its root: with p and theta the position and heading of the root, wherever it is
-    put, and R(theta) the turn about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation
-    R(theta)·poses[3:7]. All other joints follow by their local rotations, offsets and translations. With the clip's own
-    root that gives the clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in
-    clips may be left behind at an origin, are at rest under the body and have the heading of the root.
+    The pose of a row is relative to its root. If the root is placed at position p with heading theta, and R(theta) is
+    the rotation about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7]. All
+    other joints follow by their local rotations, offsets and translations. With the clip's own root, the result is the
+    clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in clips may be left
+    behind at an origin, are at rest under the body and have the heading of the root.
 
     Parameters
     ----------
@@ -157,7 +158,7 @@ class MatchingDatabase:
     contacts : (N, 2) bool    whether the left and the right foot touch the ground
     translations : (N, k, 3) float32    local translations in metres that replace the offsets of the k
         `translated_joints`, as in a clip; None if no clip has any
-    notes : what was left out or looks doubtful
+    notes : remarks on data that were left out or look doubtful
     """
 
     body: MatchingBody

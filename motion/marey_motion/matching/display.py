@@ -18,7 +18,7 @@ from marey_schemas.options.matching import ControllerOptions
 
 
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:
-    """Make a clip of a trial: every joint inertialised at every switch, the root at its recorded place.
+    """Make a clip of a trial: joints are inertialised at every switch, and the root has its recorded positions.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: Con
 def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: ControllerOptions) -> Floats:
     """Compute the distances between the displayed pose and the next one.
 
-    Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches; the next
-    one is the row that was chosen for the next tick as it is in the database. At the last tick, the next one is the row
-    that would follow.
+    Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches. The next
+    pose is that of the row chosen for the next tick, without offsets; at the last tick, that of the row that would
+    follow.
 
     Parameters
     ----------

@@ -121,11 +121,11 @@ def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
 def inertialised(  # type: ignore[no-untyped-def]
     poses, places, successors, joints, moved, rows, cuts, decay, rate_hz, out, out_places
 ):
-    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with the displayed poses of K joints, M of which have places.
+    """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with the poses of K joints, M of them translated.
 
-    poses (N, 3 + 4·J) and places (N, L, 3), local translations, of the database; joints (K,) and moved (M,), which of J
-    and of L are wanted; rows (T,) displayed at each tick; cuts (T,) the row that takes the place of the displayed one
-    after its tick, or -1; decay (2, 2) of offsets and velocities in one tick.
+    poses (N, 3 + 4·J) and places (N, L, 3), local translations, of the database; joints (K,) and moved (M,), indices of
+    the wanted ones of the J joints and of the L translations; rows (T,) displayed at each tick; cuts (T,), the row that
+    replaces the displayed row after each tick, or -1; decay (2, 2) of offsets and velocities in one tick.
     """
     offsets = np.zeros((1 + moved.shape[0] + joints.shape[0], 3))
     velocities = np.zeros_like(offsets)

@@ -27,7 +27,7 @@ from marey_schemas.options.matching import ControllerOptions
 Reason = Literal["started", "not_searched", "continued", "switched", "clip_ended"]
 
 POSE_DISTANCE = "pose_distance"
-"""The group of the summed distance of the pose joints, in metres, where that is what is compared."""
+"""Name of the group with the summed distance of the pose joints, in metres, for options that compare poses by it."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class Explanation:
     Parameters
     ----------
     shown : row displayed at the tick
-    chosen : row that the next tick follows; `shown` itself when its clip was continued
+    chosen : row after which the motion continues at the next tick; `shown` itself if its clip was continued
     sentence : the reason with its numbers, for a person
     going_on : `shown` as a candidate; None at the start of a trial and at the end of a clip
     candidates : the cheapest rows that could be chosen, cheapest first
-    others : the rows asked for, in the order asked
+    others : the further rows that the caller requested, in that order
     """
 
     tick: int
@@ -84,7 +84,7 @@ def explain_choice(
 ) -> Explanation:
     """List the cheapest candidates at a tick of a trial and the reason why one of them, or none, was chosen.
 
-    At ticks without a search the candidates are those that it would have had.
+    At ticks without a search, the candidates are those that a search would have had.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def explain_choice(
     record : TrialRecord    result of `run_trial` for these arguments
     tick : int    tick to explain
     count : int    number of candidates
-    others : sequence of int    rows to list beside them
+    others : sequence of int    further rows to list
 
     Returns
     -------
@@ -199,7 +199,7 @@ def _sentence(reason: Reason, cost: float, going_on: Candidate | None, options: 
 
 
 class _Costs:
-    """Compute the cost of every row at one tick."""
+    """Costs of all rows at one tick."""
 
     def __init__(
         self,

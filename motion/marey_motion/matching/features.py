@@ -142,13 +142,13 @@ def turned_to_root(vectors: Floats, root: SimulationRoot) -> Floats:
 def look_ahead(root: SimulationRoot, ticks: NDArray[np.int64], *, wraps: bool) -> SimulationRoot:
     """Look up the root some frames ahead of each frame.
 
-    Beyond the end a clip stays at its end, and a loop that wraps continues with its next rounds.
+    After its last frame, a clip stays at that frame, and a loop that wraps continues with its next rounds.
 
     Parameters
     ----------
     root : SimulationRoot    F frames
     ticks : (H,) int64    frames to look ahead
-    wraps : bool    the root is a loop that wraps
+    wraps : bool    whether the root belongs to a loop that wraps
 
     Returns
     -------

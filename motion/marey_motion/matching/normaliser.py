@@ -23,14 +23,14 @@ UNMATCHED_SCALE = 1e30
 
 @dataclass(frozen=True, eq=False)
 class Normaliser:
-    """Offset and scale per feature dimension, named by a digest.
+    """Offset and scale of each feature dimension, identified by a digest.
 
     Parameters
     ----------
     offset, scale : (D,) float64    `apply` gives (features - offset) / scale; weights are part of the scale
     fitted_on : str    digest of the data it was fitted on
     names : tuple of str    names of the D dimensions; empty when they are not known
-    floored : tuple of str    groups whose scale was raised to the least one
+    floored : tuple of str    groups whose scale was raised to `LEAST_SCALE`
     """
 
     offset: NDArray[np.float64]
@@ -119,7 +119,7 @@ class Normaliser:
 
         Raises
         ------
-        MotionError    naming the member that is wrong or was changed
+        MotionError    naming the member that is invalid or was altered
         """
         try:
             offset, scale = (np.asarray(tree[name], dtype=np.float64) for name in ("offset", "scale"))
@@ -167,7 +167,7 @@ def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> N
 
     Raises
     ------
-    MotionError    without rows
+    MotionError    if there are no rows
     """
     if not len(features):
         raise MotionError("no features were given to fit the normaliser to", code="no-features")

@@ -59,7 +59,7 @@ class PreparedClip:
 def prepare_clip(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks
 ) -> PreparedClip:
-    """Select the frames of a source clip that belong into a database, at its rate.
+    """Select the frames of a source clip that belong in a database, and resample them to the database's rate.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def prepare_clip(
 
     Raises
     ------
-    MotionError    when it has another skeleton or lacks its range of frames
+    MotionError    if the clip has another skeleton or does not contain the range of frames
     """
     notes: list[DatabaseNote] = []
 
@@ -98,7 +98,7 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
     ----------
     clip : PreparedClip    the clip
     body : MatchingBody    pairs of joints
-    keep_notes : bool    copy the notes, too
+    keep_notes : bool    whether to copy the notes, too
 
     Returns
     -------
@@ -133,7 +133,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Check that a clip can move this skeleton: tips, and offsets that translations replace, may differ."""
+    """Check that a clip can move this skeleton. Tips may differ, and so may offsets that translations replace."""
     own = clip.skeleton
     if own is skeleton:
         return True

@@ -17,9 +17,9 @@ class Status(IntEnum):
     REPLACING = 1
     """A search chose another frame: the displayed row is the first after a switch."""
     REPLACED = 2
-    """The last row before a switch, unless that row was itself the first after one, or forced."""
+    """The displayed row is the last before a switch, and neither the first after another switch nor forced."""
     FORCED = 3
-    """The first row of the trial, after the end of a clip, or of a loop's next round: there was nothing to go on."""
+    """The displayed row is the first of the trial, after the end of a clip, or of a loop's next round."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class TrialRecord:
     positions : (T, 2) float64    root on the ground, metres
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
-    match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN where nothing was searched
-    continuing_cost : (T,) float64    the same for continuing the displayed clip; NaN where nothing was searched or the
-        clip had ended
+    match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN at ticks without a search
+    continuing_cost : (T,) float64    the same for continuing the displayed clip; NaN at ticks without a search and
+        after the end of the clip
     pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, including the
         remaining offsets of earlier switches, and the row displayed next; at the last tick, the row that would follow
     """

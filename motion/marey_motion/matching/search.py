@@ -1,7 +1,7 @@
 """Exact nearest neighbours among the rows of a matching database.
 
 Consecutive rows of a clip are near each other, so sixteen of them fit into a small box; sixteen boxes of a clip make a
-group with a box of its own. A search passes over every group and box that is farther away than the best row so far.
+group with a box of its own. A search skips every group and box that is farther away than the best row so far.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from marey_motion.errors import MotionError
 Method = Literal["auto", "boxes", "scan"]
 
 LARGEST = 1e18
-"""Values and queries may not be larger, or their squares would leave float32."""
+"""Largest magnitude allowed in rows and queries; squares of larger values would overflow float32."""
 
 _SIXTEEN = 16
 _PROBES = 32
@@ -26,10 +26,10 @@ _SCAN_ABOVE = 0.35
 
 
 class SearchIndex(NamedTuple):
-    """A database made ready for search: a tuple of arrays, so that compiled code takes it as it is.
+    """A database prepared for search, as a tuple of arrays that can be passed to compiled code.
 
-    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D made even. A
-    block or group of fewer than sixteen is padded with copies of its last element.
+    B blocks of up to 16 selectable rows of one clip, G groups of up to 16 blocks of one clip; D' is D rounded up to an
+    even number. A block or group of fewer than sixteen elements is padded with copies of its last element.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class SearchIndex(NamedTuple):
     group_blocks : (G + 1,) int32    first block of each group, and B
     group_boxes : (⌈G / 16⌉, D', 2, 16) float32    sides of the boxes about groups
     radius : the largest norm of a row
-    boxed : whether a search uses the boxes, or goes through all blocks; the answer is the same
+    boxed : whether a search uses the boxes, or goes through all blocks; the result is the same
     """
 
     rows: NDArray[np.float64]
@@ -137,7 +137,7 @@ def _check(rows: NDArray[np.float64], starts: NDArray[np.int64], selectable: NDA
 def _arranged(
     starts: NDArray[np.int64], selectable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Arrange rows of each block (B, 16), block of each row (N,), and first block of each group (G + 1,)."""
+    """List the rows of each block (B, 16), the block of each row (N,), and the first block of each group (G + 1,)."""
     chosen = np.flatnonzero(selectable)
     bounds = np.searchsorted(chosen, starts)
     blocks_per_clip = -(-np.diff(bounds) // _SIXTEEN)
@@ -164,7 +164,7 @@ def _by_sixteen(count: int) -> NDArray[np.int32]:
 
 
 def _boxes(low: NDArray[np.float32], high: NDArray[np.float32], starts: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Compute the sides (K, D') of boxes in groups of sixteen (M, D', 2, 16), which begin at the starts (M + 1,)."""
+    """Pack the sides (K, D') of K boxes into groups of up to sixteen (M, D', 2, 16), which begin at `starts`."""
     lanes = np.minimum(starts[:-1, None] + np.arange(_SIXTEEN), starts[1:, None] - 1)
     return np.ascontiguousarray(np.stack([low[lanes], high[lanes]], axis=2).transpose(0, 3, 2, 1))
 
@@ -190,7 +190,7 @@ def find_nearest(
     warm_rows: NDArray[np.int64] | None = None,
     skips: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the nearest selectable row of each query, the lowest among equals, and its squared distance.
+    """Find the nearest selectable row of each query, and its squared distance; of equally near rows, the lowest.
 
     Parameters
     ----------
@@ -202,8 +202,8 @@ def find_nearest(
 
     Returns
     -------
-    rows : (Q,) int64    -1 where all are skipped
-    costs : (Q,) float64    infinite where all are skipped
+    rows : (Q,) int64    -1 where all rows are skipped
+    costs : (Q,) float64    infinite where all rows are skipped
     """
     from marey_motion.matching import search_kernels as kernels
 
@@ -224,7 +224,7 @@ def find_best(
     weights: NDArray[np.float64] | None = None,
     skip: tuple[int, int] = (0, 0),
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Find the selectable rows nearest to a query, nearest first and the lowest first among equals.
+    """Find the selectable rows nearest to a query, the nearest first; of equally near rows, the lowest first.
 
     Parameters
     ----------

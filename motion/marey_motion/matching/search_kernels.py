@@ -11,11 +11,11 @@ addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rou
     c32 ≤ (1 + u)^(D + 8) (√c + reach)²
 
 If a row's cost is at most `best`, its c32 is at most the right side with c = best, which is what `_limit` returns, with
-four times the margin of each term. So a row above the limit cannot be nearer than the best one, nor as near, and need
-not be looked at; all others are costed again in float64, in the order of the dimensions. A box's float32 bound obeys
-the same inequality, because in exact arithmetic it is at most the cost of every rounded row in the box.
-This is proven for all magnitudes; a fixed slack of 1e-5 relative and 1e-6 absolute is enough only while the norms
-of row and query add up to less than about 40.
+four times the margin of each term. So a row above the limit is farther away than the best one and can be skipped; the
+costs of all others are computed again in float64, in the order of the dimensions. A box's float32 bound obeys the same
+inequality, because in exact arithmetic it is at most the cost of every rounded row in the box. This is proven for all
+magnitudes; a fixed slack of 1e-5 relative and 1e-6 absolute is enough only while the norms of row and query add up to
+less than about 40.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SMALLEST = 1e-36
 
 
 class _Query(NamedTuple):
-    """A query under way: float64 as asked, float32 padded to the index's dimensions, and room for sixteen sums."""
+    """A query during its search: in float64, in float32 padded to the index's dimensions, with space for 16 sums."""
 
     exact: Any
     exact_weights: Any
@@ -222,14 +222,14 @@ def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ign
 
 @compiled
 def nearest_of_each(index, queries, weights, warm_rows, skips, rows, costs):  # type: ignore[no-untyped-def]
-    """Fill rows and costs (Q,) with the nearest of each query (Q, D); warm_rows (Q,), skips (Q, 2)."""
+    """Fill `rows` and `costs` (Q,) with the nearest row of each query (Q, D); warm_rows (Q,), skips (Q, 2)."""
     for q in range(queries.shape[0]):
         rows[q], costs[q] = _nearest(index, queries[q], weights, warm_rows[q], skips[q, 0], skips[q, 1])
 
 
 @compiled
 def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
-    """Fill costs (N,) with every row's, selectable or not."""
+    """Fill `costs` (N,) with the cost of every row, selectable or not."""
     for row in range(costs.shape[0]):
         costs[row] = _cost(index.rows[row], query, weights)
 

@@ -1,7 +1,7 @@
 """Sixteen squared distances at a time, written for vector registers.
 
 A compiler cannot keep sixteen running sums in registers when they live in an array that might overlap its inputs, so
-this loop is given to it as vector instructions; they become whatever width the processor has. Each sum is made in
+this loop is written as vector instructions, which the compiler fits to the width of the processor. Each sum is made in
 the same order everywhere, without contraction, so that equal inputs give equal bits on every machine.
 """
 
@@ -96,4 +96,6 @@ All are float32 and D is even. Fills `sums` for block `number`; the integer retu
 sums[l] <= limit."""
 
 box_costs = _summed(_from_box, 2)
-"""box_costs(boxes (G, D, 2, 16), …): the same to the nearest point of each of 16 boxes, of low and high sides."""
+"""box_costs(boxes (G, D, 2, 16), …): the same for squared distances to the nearest points of 16 boxes, given by their
+low and high sides.
+"""

@@ -14,7 +14,7 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
-"""Singular values below this share of the largest one are rounding: the Gram matrix holds their squares."""
+"""Share of the largest singular value below which others are rounding errors: the Gram matrix has their squares."""
 
 SMALLEST_RELATIVE_SPREAD = 1e-11
 """Examples that differ from their mean by less than this share of their size are copies of one example."""
@@ -24,7 +24,7 @@ SMALLEST_RELATIVE_SPREAD = 1e-11
 class Keep:
     """Number of components to keep: the fewest that hold `share` of the variance, at most `most`; or exactly `count`.
 
-    A count beyond the rank of the examples gives as many as there are.
+    If `count` exceeds the rank of the examples, all components are kept.
     """
 
     share: float = 0.95
@@ -81,10 +81,10 @@ def find_components(
 
     Notes
     -----
-    Fewer examples than coefficients: the eigenvectors u of the (m, m) matrix of the examples' inner products are those
-    of the covariance, at a fraction of the cost. A direction is the sum of the deviations weighted by u, whatever the
-    inner product; the product enters with the projections that compute scores. The share of variance is of all
-    components. The largest entry of each direction is positive.
+    There are fewer examples than coefficients. The eigenvectors u of the (m, m) matrix of the examples' inner products
+    therefore give those of the covariance at a fraction of the cost. A direction is the sum of the deviations weighted
+    by u, whatever the inner product; the inner product matters only for the projections that compute scores. The share
+    of variance is of all components. The largest entry of each direction is positive.
     """
     examples = len(coefficients)
     if coefficients.shape[1] != basis.count or weights.shape != coefficients.shape[2:]:

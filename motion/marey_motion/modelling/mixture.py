@@ -13,7 +13,7 @@ from marey_motion.errors import MotionError
 
 @dataclass(frozen=True, eq=False)
 class LatentMixture:
-    """K normal distributions with full covariances in L dimensions; L may be 0, where nothing varies.
+    """K normal distributions with full covariances in L dimensions; L is 0 if nothing varies.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class LatentMixture:
         ----------
         count : int    number of vectors
         seed : int    the same seed gives the same vectors
-        attempt : int    each attempt gives others
+        attempt : int    each attempt gives other vectors
 
         Returns
         -------

@@ -22,7 +22,7 @@ LEAST_EXAMPLES_PER_COMPONENT = 5
 LEAST_FOLDS = 2
 SEEDS = 2**32
 MOST_ITERATIONS = 500
-"""Most iterations of each start of expectation maximisation."""
+"""Maximum number of iterations from each start of expectation maximisation."""
 TOLERANCE = 1e-3
 """Change of the mean log-likelihood between iterations below which the fit has converged; without unit."""
 
@@ -38,8 +38,8 @@ class MixtureCandidate:
     log_likelihood : float    of all examples, natural logarithm
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
-    refusal : str    reason for not taking it whatever its criterion: "small-component" where a component has too few
-        examples, "held-out" where it makes unseen examples less likely than one component does
+    refusal : str    reason for excluding the mixture whatever its criterion: "small-component" if a component has too
+        few examples, "held-out" if unseen examples are less likely than with one component
     """
 
     components: int
@@ -61,8 +61,8 @@ class FittedMixture:
     method : str    "em": expectation maximisation; "shrunk": one component of shrunk covariance, for few examples;
         "point": examples that do not vary
     candidates : tuple of MixtureCandidate    by number of components; empty unless the method is "em"
-    held_out : (n,) float64, optional    ln p of each example under mixtures of as many components fitted without its
-        fold
+    held_out : (n,) float64, optional    ln p of each example under a mixture with the same number of components that
+        was fitted without the example's fold
     """
 
     mixture: LatentMixture
@@ -128,7 +128,7 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
 
 @dataclass(frozen=True, eq=False)
 class _Fitting:
-    """Latent vectors of unit mean variance."""
+    """Fit of a mixture to latent vectors of unit mean variance."""
 
     latents: Floats
     options: MixtureOptions

@@ -17,13 +17,15 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 MOST_FRAMES = 100_000
-"""Most frames of one motion."""
+"""Maximum number of frames of one motion."""
 
 MOST_LOG_SLOPE = 12.0
-"""Bound of ln(slope) where the examples are unknown; sums of steps between e^-12 and e^12 frames still increase."""
+"""Bound of |ln(slope)| for a model whose examples are unknown; sums of steps between e^-12 and e^12 frames still
+increase.
+"""
 
 MOST_ATTEMPTS = 100
-"""Most draws of a sample before its duration, too short or too long, is accepted."""
+"""Maximum number of draws of a sample; the last one is accepted even if its duration is too short or too long."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +36,10 @@ class FunctionalComponents:
     ----------
     basis : splines of the functions
     mean : (n, D) coefficients
-    directions : (k, n, D) what one unit of each score adds to the coefficients; any scaling is undone in them
-    projections : (k, n, D) functions whose inner products with coefficients give scores; with the directions they give
-        the identity
-    variances : (k,) of the training examples' scores
+    directions : (k, n, D) change of the coefficients per unit of each score, after undoing the scaling of the analysis
+    projections : (k, n, D) functions whose inner products with coefficients are scores; their inner products with the
+        directions are the identity matrix
+    variances : (k,) variances of the training examples' scores
     energy : (k,) cumulative share of the total variance in the first 1, 2, ... components
     """
 
