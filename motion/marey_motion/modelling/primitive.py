@@ -99,24 +99,25 @@ class FunctionalComponents:
 class MotionPrimitive:
     """A model of one action (Min and Chai 2012; Herrmann et al. 2019, section 3).
 
-    A latent vector holds the scores of the spatial components, then `temporal_weight` times those of the temporal ones.
+    A latent vector contains the scores of the spatial components, followed by `temporal_weight` times the scores of the
+    temporal components.
 
     Parameters
     ----------
     name : name of the action
     skeleton : skeleton of the motions, J joints
-    frame_rate_hz : of canonical frames
+    frame_rate_hz : rate of the canonical frames
     spatial : 3 + 4·J channels over canonical frames 0 to N - 1: root translation in metres in the canonical frame, then
         local quaternions, not of unit length until they are evaluated
-    temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of how many frames of
-        real time, at `frame_rate_hz`, pass in each
-    temporal_weight : positive
+    temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of the number of frames
+        of real time, at `frame_rate_hz`, that pass in each step
+    temporal_weight : positive factor of the temporal scores in latent vectors
     mixture : distribution of latent vectors
     keyframes : canonical frame by label
-    duration_range_s : shortest and longest duration of a motion, or None; normal distributions of logarithms have long
-        tails
+    duration_range_s : shortest and longest duration of a motion, or None for no limits; limits matter because normal
+        distributions of logarithms have long tails
     log_slope_range : limits of the temporal function, or None if the examples are not known; without limits, splines
-        swing out at their ends, and a motion would stop there
+        overshoot at their ends, and a motion would stop there
     """
 
     name: str
@@ -202,7 +203,7 @@ class MotionPrimitive:
         Parameters
         ----------
         latents : (m, L) float64    latent vectors
-        times : (T,) float, optional    canonical frames; every one when None
+        times : (T,) float, optional    canonical frames; all of them if None
 
         Returns
         -------

@@ -19,7 +19,7 @@ from marey_motion.skeleton import Skeleton
 Progress = Callable[[int, int, str], None]
 
 MOST_DIMENSIONS = 200
-"""Most dimensions for leaving examples out; with more examples than that, the smallest components are dropped."""
+"""Maximum number of components used when examples are left out; if there are more, the smallest are dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,10 +28,11 @@ class ReconstructionErrors:
 
     Parameters
     ----------
-    components : (c,) 0, 1, 2, ...
-    training_cm : (c,) of examples that the components were found in, mean over the examples
-    left_out_cm : (c,) of examples reconstructed from the components and the mean of all others, mean over the examples
-    left_out_each_cm : (m, c)
+    components : (c,) numbers of components: 0, 1, 2, ...
+    training_cm : (c,) mean error of the examples from which the components were computed
+    left_out_cm : (c,) mean error of examples that are reconstructed from the components and the mean of all other
+        examples
+    left_out_each_cm : (m, c) the error of each of these examples
     """
 
     components: NDArray[np.int64]
@@ -66,9 +67,9 @@ def reconstruction_errors(
 
     Notes
     -----
-    Leaving example i out of a principal component analysis takes c sᵢsᵢᵀ from the diagonal covariance of the scores s,
-    with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1): each is an eigenproblem of the size of the score space,
-    without going back to the coefficients.
+    Leaving example i out of a principal component analysis subtracts c sᵢsᵢᵀ from the diagonal covariance of the scores
+    s, with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1). Each left-out example therefore is an eigenproblem of
+    the size of the score space, without going back to the coefficients.
     """
     basis = principal.functions.basis
     frames = comparison_frames(basis)

@@ -41,7 +41,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
 
 @compiled
 def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), of poses (B, T, D) of any length."""
+    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for poses (B, T, D) not normalised."""
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))
     lengths, positions = np.empty(joints), np.empty((joints, 3))
@@ -62,8 +62,8 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
     """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) by the poses.
 
-    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they stand for.
-    The gradients of the joints below each joint add up to a force and a torque on it, from the leaves to the root.
+    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they represent. The
+    gradients of the joints below each joint add up to a force and a torque on it, from the leaves to the root.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

@@ -20,8 +20,8 @@ class FootQuality:
     Parameters
     ----------
     below_floor_share : share of frames in which at least one foot is under height 0
-    below_floor_mean_cm : how deep the lowest foot is in those frames; 0 if there are none
-    lowest_cm : mean over the motions of their lowest foot
+    below_floor_mean_cm : mean depth of the lowest foot in those frames; 0 if there are none
+    lowest_cm : lowest height of a foot in a motion, mean over the motions
     slide_m_s : mean speed on the ground of feet in the frames where the same feet of most training examples are on the
         ground
     """

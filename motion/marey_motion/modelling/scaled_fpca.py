@@ -20,10 +20,10 @@ SMALLEST_WEIGHT = 1e-2
 LARGEST_WEIGHT = 1e3
 MOST_ITERATIONS = 60
 TOLERANCE = 1e-5
-"""Change of the error, as a share of the first one, below which the optimisation stops."""
+"""Change of the error, as a share of the first error, below which the optimisation stops."""
 
 MOST_POSES = 6000
-"""Poses at which joints are compared; more examples are compared at fewer frames."""
+"""Maximum number of poses in which joints are compared; the more examples there are, the fewer frames of each."""
 
 
 def optimised_weights(
@@ -36,7 +36,7 @@ def optimised_weights(
 ) -> tuple[Floats, Keep]:
     """Optimise weights, one for each root axis and each joint, that minimise the squared distance of joints.
 
-    `keep` gives the number of components under the first starting weights; that number is then fixed.
+    The number of components is determined by `keep` with the first starting weights, and is then fixed.
 
     Parameters
     ----------
@@ -55,8 +55,9 @@ def optimised_weights(
     Notes
     -----
     Reconstructing examples from their leading components projects their matrix of coefficients from the left, on the
-    leading eigenvectors of the Gram matrix K = Σ wᵍ² Kᵍ over the channels g. So the weights enter by an (m, m) matrix
-    alone, and the derivative of its eigenprojector gives the gradient: all of it costs one pass of forward kinematics.
+    leading eigenvectors of the Gram matrix K = Σ wᵍ² Kᵍ over the channels g. So the weights matter only through an (m,
+    m) matrix, and the derivative of its eigenprojector gives the gradient. Value and gradient together cost one pass of
+    forward kinematics.
     """
     from scipy.optimize import minimize
 

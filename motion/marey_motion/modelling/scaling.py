@@ -9,19 +9,19 @@ from marey_motion.arrays import Floats
 from marey_motion.skeleton import Skeleton
 
 LEAST_ROOT_EXTENT_M = 1e-3
-"""A root axis that stays within a millimetre is not blown up to the size of the others."""
+"""Extent of a root axis, in metres, below which the axis is not scaled up to the size of the others."""
 
 LEAST_WEIGHT_M = 0.01
 """Least weight of a joint, so that the rotation of a joint without children, such as a hand, counts a little."""
 
 MOST_DIFFERENCES = 1_000_000
-"""Most differences of positions in memory at once."""
+"""Maximum number of differences of positions in memory at once."""
 
 
 def root_max_weights(poses: Floats) -> Floats:
     """Compute weights that bring each root axis to a maximum of 1, as the published code does.
 
-    Each axis by itself; one that hardly moves keeps its unit.
+    Each axis is scaled by itself; an axis that hardly moves keeps its unit.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def root_max_weights(poses: Floats) -> Floats:
 
 
 def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
-    """Compute weights that scale each channel by how far a unit step of it moves the body.
+    """Compute weights that scale each channel by the distance that a unit step of the channel moves the body.
 
     A unit step of a joint's quaternion rotates the joints below it by 2 radians. The joint's weight is the root mean
     square, over all joints of the body, of their displacement: twice their lever arms, and 0 for those that are not
@@ -47,7 +47,7 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     Parameters
     ----------
     skeleton : Skeleton    J joints
-    poses : (F, D) float64    typical ones, as those of the mean motion
+    poses : (F, D) float64    typical poses, such as those of the mean motion
 
     Returns
     -------

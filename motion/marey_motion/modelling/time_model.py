@@ -14,8 +14,9 @@ from marey_motion.modelling.splines import SplineBasis
 def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
     """Fit splines to the logarithms of the slopes of time functions.
 
-    Least squares on the logarithms; then each is shifted as a whole, so that the motion keeps its exact duration.
-    (Smoothing logarithms would shorten it: the logarithm of a mean is above the mean of logarithms.)
+    The logarithms are fitted by least squares. Then each function is shifted as a whole, so that the motion keeps its
+    exact duration. (Smoothing of logarithms would otherwise shorten it: the logarithm of a mean is above the mean of
+    logarithms.)
 
     Parameters
     ----------
@@ -28,7 +29,7 @@ def fit_log_slopes(basis: SplineBasis, time_functions: Floats) -> Floats:
 
     Raises
     ------
-    MotionError    naming the example whose time function does not rise strictly
+    MotionError    naming the example whose time function is not strictly increasing
     """
     slopes = np.diff(time_functions, axis=1)
     if not (np.isfinite(slopes).all() and (slopes > 0.0).all()):
@@ -52,7 +53,7 @@ def equalising_weight(spatial_variances: Floats, temporal_variances: Floats) -> 
 
     Returns
     -------
-    float    1 if either has none
+    float    the factor; 1 if either part has no variance
     """
     spatial, temporal = float(spatial_variances.sum()), float(temporal_variances.sum())
     return float(np.sqrt(spatial / temporal)) if spatial > 0.0 and temporal > 0.0 else 1.0

@@ -77,7 +77,7 @@ def train_primitive(
     options : ModelOptions    options
     name : str    name of the action
     seed : int    seed of the mixture's starts, the folds and the samples of the report
-    threads : int    threads for leaving examples out; the result does not depend on it
+    threads : int    threads for leaving examples out; the result does not depend on their number
     progress : callable    called as progress(steps done, total where known, name of the step)
 
     Returns
@@ -113,7 +113,7 @@ def check_examples(aligned: AlignedSet) -> None:
 
     Raises
     ------
-    ModelError    naming the example that is wrong
+    ModelError    naming the invalid example
     """
     if not 1 <= len(aligned.clips) <= MOST_EXAMPLES:
         raise ModelError(
@@ -241,7 +241,7 @@ def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
     """Compute the range of the logarithms of the examples' time steps, extended by a twentieth of a step.
 
-    Examples rebuilt from the kept components count as well, so that each example is rebuilt as it is.
+    Examples rebuilt from the kept components count as well, so that the limits change no rebuilt example.
     """
     functions = temporal.functions
     rebuilt = functions.basis.at_frames @ functions.coefficients(_kept_scores(temporal))[..., 0].T

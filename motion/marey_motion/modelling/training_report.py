@@ -21,7 +21,7 @@ Progress = Callable[[int, int | None, str], None]
 
 MORE_COMPONENTS_SHOWN = 10
 OUTLIER_DEVIATIONS = 5.0
-"""Robust standard deviations below the median from which on an example's likelihood stands out."""
+"""Number of robust standard deviations below the median at which an example's likelihood makes it an outlier."""
 
 DEVIATION_OF_MEDIAN = 1.4826
 DURATION_SLACK = 0.05
@@ -34,8 +34,9 @@ class ExampleReport:
     Parameters
     ----------
     log_likelihood : natural logarithm of its density
-    held_out_log_likelihood : under a mixture fitted without it; None if that was not asked for
-    left_out_error_cm : mean distance of its joints when the other examples' components reconstruct it, as many as kept
+    held_out_log_likelihood : the same under a mixture fitted without the example; None if it was not requested
+    left_out_error_cm : mean distance of its joints after reconstruction by the other examples' components, of the same
+        number as in the model
     outlier : whether its likelihood is much lower than those of the others
     """
 
@@ -65,9 +66,9 @@ class TrainingReport:
 
     Parameters
     ----------
-    spatial_energy, temporal_energy : cumulative share of the variance, of all components there are
+    spatial_energy, temporal_energy : cumulative share of the variance, over all components of the examples
     mixture_method : see `FittedMixture`
-    candidates : the curve of the criterion
+    candidates : mixtures compared, with their criteria
     log_likelihood : mean over the examples
     held_out_log_likelihood : mean over the examples of their density under mixtures fitted without them
     examples : in the order of the aligned set

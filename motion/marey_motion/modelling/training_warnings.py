@@ -28,7 +28,7 @@ class Warned:
 
 
 def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[Warned, ...]:
-    """List the warnings about a model, gravest first.
+    """List the warnings about a model, the most serious first.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Check of a model's search: distances to positions that unseen examples reached."""
+"""Check of the search for motions of a model: remaining distances to positions that left-out examples reached."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from marey_schemas.options.searching import RefineOptions
 from marey_schemas.search_constraints import JointPositionConstraint
 
 REACHING = ("left_wrist", "right_wrist", "left_ankle", "right_ankle")
-"""Standard joints."""
+"""Standard joints for whose positions the check searches."""
 
 HELD_OUT_EVERY = 5
 LEAST_EXAMPLES = 10
 MOST_TARGETS = 60
 SAMPLES = 2000
 REFINING = RefineOptions(likelihood_weight=0.01)
-"""Options with little weight on likelihood, because the check measures how near the model can come."""
+"""Options with little weight on likelihood, because the check measures the smallest distance that the model allows."""
 
 
 @dataclass(frozen=True, eq=False)
 class SearchCheck:
-    """Searches for places that examples reached, by a model of the other examples.
+    """Errors of searches for positions that left-out examples reached, with a model of the other examples.
 
     Parameters
     ----------
     examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
-    frames : (n,) canonical frame: where the places of that joint differ most between examples
+    frames : (n,) canonical frame at which the positions of that joint differ most between the examples
     searched_cm, refined_cm : (n,) error of the best sample of the tree, and after refining it
     """
 
@@ -62,7 +62,7 @@ def check_search(
 
     Returns
     -------
-    SearchCheck or None    None for fewer than ten examples, and without known hands and feet
+    SearchCheck or None    None if there are fewer than ten examples, or if hands and feet are not known
     """
     joints = {name: standard_joints[name] for name in REACHING if name in standard_joints}
     if len(aligned.clips) < LEAST_EXAMPLES or not joints:

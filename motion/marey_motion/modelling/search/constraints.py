@@ -22,7 +22,7 @@ START, END = "start", "end"
 
 
 class InvalidConstraint(MotionError):
-    """The model cannot meet the constraint, or lacks the joint or keyframe it names."""
+    """The model cannot meet the constraint, or lacks the joint or keyframe that the constraint names."""
 
     default_code = "constraint-invalid"
 

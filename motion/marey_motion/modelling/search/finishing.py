@@ -1,4 +1,4 @@
-"""Inverse kinematics that removes the remaining errors of a motion which a search found."""
+"""Inverse kinematics that removes the remaining errors of a motion found by a search."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from marey_schemas.search_constraints import (
 )
 
 FAR_AWAY_M = 1000.0
-"""Looking at a point so far away is looking in its direction."""
+"""Distance of a point to look at, in metres, that represents a direction to look in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Finished:
 def finish_motion(steps: Sequence[Step], found: FoundMotion, mapping: JointMapping) -> Finished:
     """Bring joints exactly to their targets at the frames nearest to the constraints' moments.
 
-    Only the limb, or the chain up to the pelvis, moves; the place of the body and its timing stay the same.
+    Only the limb, or the chain up to the pelvis, moves; the position of the body and the timing stay the same.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from marey_schemas.search_constraints import Moment
 
 @dataclass(frozen=True, eq=False)
 class FoundMotion:
-    """Steps in a row.
+    """One motion over consecutive steps.
 
     Parameters
     ----------

@@ -41,14 +41,14 @@ AT_ORIGIN = Placement(0.0, 0.0, 0.0)
 
 
 class Rows(NamedTuple):
-    """Constraints, one a row.
+    """Constraints as arrays, with one row per constraint.
 
     Parameters
     ----------
-    kinds : (m,) see `objective_kernels`
+    kinds : (m,) kinds of constraints, numbered in `objective_kernels`
     items : (m,) index of the tracked point or of the clock
-    targets : (m, 4) place, quaternion, direction, heading or time
-    axes : (m, 3) for positions 1 where the coordinate counts, for directions the joint's own axis
+    targets : (m, 4) position, quaternion, direction, heading or time
+    axes : (m, 3) for positions, 1 for each coordinate that counts; for directions, the axis in the joint's frame
     """
 
     kinds: Ints
@@ -58,7 +58,7 @@ class Rows(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """Constraints linearised at one latent vector; W counts the numbers of the latent vectors of all steps.
+    """Constraints linearised at one latent vector; W is the total length of the latent vectors of all steps.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ class Objective:
 
     Parameters
     ----------
-    constraints : m of them
-    placement : where the canonical frame lies in the world that targets are in
+    constraints : the m constraints
+    placement : position and heading of the canonical frame in the world of the targets
     """
 
     primitive: MotionPrimitive
@@ -108,7 +108,7 @@ class Objective:
         return out
 
     def costs(self, latents: Floats) -> Floats:
-        """Compute Equation 1: the sum of weight times error, each in its tolerance.
+        """Compute Equation 1: the sum over the constraints of weight · error / tolerance.
 
         Parameters
         ----------
@@ -128,13 +128,13 @@ class Objective:
         Parameters
         ----------
         stacked : (W,) float64    latent vectors one after the other, this step's from `first` on
-        first : int    first number of this step
-        placement : (3,) float64    heading, x and z of the canonical frame, in place of that of this objective
+        first : int    index in `stacked` of the first number of this step
+        placement : (3,) float64    heading, x and z of the canonical frame; replaces the placement of this objective
         moved : (3, W) float64    derivatives of the placement
 
         Returns
         -------
-        LinearisedConstraints    residuals and derivatives
+        Linearised    residuals and derivatives
         """
         width, items, clocks = len(stacked), len(self.chains.turned), len(self.clocks.weights)
         points, turns = np.empty((items, 3)), np.empty((items, 4))
@@ -269,7 +269,7 @@ def _row(
 
 
 def _require_possible(primitive: MotionPrimitive, constraint: KeyframeTimeConstraint, frame: float) -> None:
-    """Raise `InvalidConstraint` for a time that no motion of the primitive reaches, at a canonical frame."""
+    """Raise `InvalidConstraint` if no motion of the primitive can reach the canonical frame at the required time."""
     if primitive.duration_range_s is None:
         return
     least, most = primitive.duration_range_s

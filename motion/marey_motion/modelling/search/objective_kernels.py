@@ -68,7 +68,8 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
     """Fill the seconds since the beginning at each clock, and `log_steps` with the steps that they add up.
 
-    Returns the factor of the times that keeps the whole motion within its range, and its seconds without that factor.
+    Returns the factor of the times that keeps the whole motion within its range, and the motion's seconds without that
+    factor.
     """
     log_steps[:] = clocks.mean
     for component in range(clocks.directions.shape[0]):
@@ -191,7 +192,7 @@ def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-un
 
 @compiled
 def costs(prices, errors, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n,) with sums of errors (n, rows) times their prices (rows,), in the order of the rows."""
+    """Fill `out` (n,) with sums of errors (n, rows) times `prices` (rows,), which are weights over tolerances."""
     for n in range(out.shape[0]):
         total = 0.0
         for row in range(prices.shape[0]):

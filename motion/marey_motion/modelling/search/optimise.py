@@ -2,8 +2,8 @@
 
 The cost is ½ Σ w (e / σ)² - λ Σ ln p(s): errors in their tolerances, and the likelihood of the motions. For the steps,
 the mixture is replaced by its most likely component at the current vector, whose whitened distance is a residual like
-any other (max-mixture, Olson and Agarwal 2013); the constant that belongs to it moves no step and is left out. A step
-is accepted by the cost under the whole mixture.
+any other (max-mixture, Olson and Agarwal 2013); the constant of that component does not change the step and is left
+out. A step is accepted if it decreases the cost under the whole mixture.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Refined:
 
     Parameters
     ----------
-    latents : (W,)
+    latents : (W,) refined latent vectors, one after the other
     cost : the minimised cost at `latents`
     start_cost : the cost at the start
-    iterations, evaluations : steps that were tried; motions that were evaluated, slopes included
+    iterations, evaluations : number of steps that were tried; number of motions that were evaluated, also for slopes
     """
 
     latents: Floats

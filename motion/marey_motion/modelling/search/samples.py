@@ -15,7 +15,7 @@ from marey_motion.modelling.search.tree import SampleTree
 from marey_schemas.options.searching import CANDIDATES, PASSES
 
 NARROWING = 0.25
-"""Factor of the distances between samples for each further pass."""
+"""Factor by which each further pass shrinks the distances between samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +24,10 @@ class FoundSamples:
 
     Parameters
     ----------
-    samples : (t,) their places in the tree; -1 for what a further pass found between them
-    latents : (t, L)
-    costs : (t,) Equation 1
-    evaluations : motions that were evaluated
+    samples : (t,) indices of the samples in the tree; -1 for latent vectors that a further pass found between samples
+    latents : (t, L) latent vectors
+    costs : (t,) costs by Equation 1
+    evaluations : number of motions that were evaluated
     """
 
     samples: Indices
@@ -39,10 +39,10 @@ class FoundSamples:
 def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, top: int = 1) -> FoundSamples:
     """Descend a tree with the best nodes of each level, and keep the best samples.
 
-    All children of all candidates of a level are evaluated at once, nodes by the mean of their samples, nodes of one
-    sample and the samples of leaves by themselves. The result is samples, never means, which need not be likely
-    motions. Of samples with equal costs, the first in the tree is preferred. With as many candidates as there are nodes
-    it is an exhaustive search.
+    All children of all candidates of a level are evaluated at once: a node by the mean of its samples, a leaf by each
+    of its samples. The result consists of samples and never of means, because a mean need not be a likely motion. Of
+    samples with equal costs, the first in the tree is preferred. With as many candidates as there are nodes it is an
+    exhaustive search.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def search_closely(
 def _descend(
     objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
 ) -> FoundSamples:
-    """Go down a tree whose latent vectors are where `drawn` puts them."""
+    """Descend a tree in which `drawn` replaces each latent vector by another one."""
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
     while frontier.size:
@@ -130,7 +130,7 @@ def _best(tree: SampleTree, samples: Indices, costs: Floats, top: int, evaluatio
 
 
 def _smallest(costs: Floats, places: Indices, count: int) -> Indices:
-    """Find the places of the smallest costs, in order; of equal costs the first places."""
+    """Find the entries of `places` with the smallest costs, in order; of equal costs, the first ones."""
     order: Indices = np.lexsort((places, costs))[:count]
     return order
 

@@ -34,9 +34,9 @@ class Sequel:
 
     Parameters
     ----------
-    latents : one vector (L,) a step
+    latents : one latent vector (L,) per step
     measured : their placements and errors
-    joints : standard names of the transition joints, whose jumps were measured after that of the pelvis
+    joints : standard names of the transition joints; `jumps_m` lists the jump of the pelvis, then those of these joints
     searched : result of the search in each tree
     sampled : placements and errors before refining
     refined : result of refining, None if it was not requested

@@ -62,9 +62,9 @@ class Measured(NamedTuple):
 
     Parameters
     ----------
-    placements : of the steps' canonical frames in the world
-    errors : of each step's constraints (m,): metres, radians or seconds
-    jumps_m : for each transition, how far the pelvis and each transition joint jumps (1 + joints,)
+    placements : placements of the steps' canonical frames in the world
+    errors : errors (m,) of each step's constraints, in metres, radians or seconds
+    jumps_m : for each transition, the distances (1 + joints,) by which the pelvis and the transition joints jump
     """
 
     placements: tuple[Placement, ...]
@@ -89,7 +89,7 @@ class _Link(NamedTuple):
 
 
 class _Walked(NamedTuple):
-    """A step placed in the world after the steps before it; W counts the numbers of the latent vectors of all steps.
+    """A step placed in the world after the steps before it; W is the total length of the latent vectors of all steps.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class SeveralSteps:
     Parameters
     ----------
     joints : the transition joints that all steps have, by standard name
-    start : of the first step's canonical frame
+    start : placement of the first step's canonical frame
     """
 
     links: tuple[_Link, ...]
@@ -192,15 +192,15 @@ class SeveralSteps:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def carried_on(self, latents: Sequence[Floats]) -> CarriedOn:
-        """Compute where the step that follows given steps must begin to continue their motion.
+        """Compute the start of a step that continues the motion of given steps.
 
         Parameters
         ----------
-        latents : sequence of (L,) float64    latent vectors of the given steps, the first of the sequence
+        latents : sequence of (L,) float64    latent vectors of the given steps, with which the sequence begins
 
         Returns
         -------
-        CarriedOn    place and heading of the last given step's end, and its transition joints
+        CarriedOn    position and heading at the end of the last given step, and its transition joints
         """
         if not latents:
             return CarriedOn(self.start, {})

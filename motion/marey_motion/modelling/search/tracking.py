@@ -39,14 +39,14 @@ class Chains(NamedTuple):
 
     Parameters
     ----------
-    mean, directions : (X,), (k, X) channels, and what one unit of each spatial score adds to them
+    mean, directions : (X,), (k, X) mean channels, and their change per unit of each spatial score
     columns : (V,) first channel of each joint's quaternion; a root's translation precedes it
-    parents : (V,) place of the parent among the V, -1 for roots
+    parents : (V,) index of the parent among the V joints, -1 for roots
     offsets : (V, 3) metres
     term_starts, term_nodes, term_signs : (n + 1,), (t,), (t,) the joints whose positions make up each point
     held : (n,) 1 if the point is a position, which moves with the placement; 0 if it is a difference of positions,
         which is only turned by it
-    turned : (n,) place among the V of the joint whose rotation is tracked with each point
+    turned : (n,) index among the V joints of the one whose rotation is tracked with each point
     """
 
     mean: Floats
@@ -66,11 +66,12 @@ class Clocks(NamedTuple):
 
     Parameters
     ----------
-    mean, directions : (N - 1,), (k, N - 1) logarithms of steps, and what one unit of each temporal number adds to them
+    mean, directions : (N - 1,), (k, N - 1) mean logarithms of steps, and their change per unit of each temporal number
+        of a latent vector
     weights : (n, N - 1) seconds that one frame of each step counts for each moment
     frame_s : seconds of one frame
-    range_s : (2,) how long motions last, at least and at most; what would last longer or shorter is played faster or
-        slower as a whole
+    range_s : (2,) shortest and longest duration of a motion; a longer or shorter one is played faster or slower as a
+        whole
     log_slope_bounds : (2,) limits to which logarithms of steps are clipped
     """
 
@@ -83,7 +84,7 @@ class Clocks(NamedTuple):
 
 
 def body_place(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
-    """Choose the point that gives the place of the body: the pelvis, else the root.
+    """Choose the point that represents the position of the body: the pelvis, or else the root.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ def facing(frame: float, standard_joints: Mapping[str, int]) -> Tracked:
 
 
 def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chains:
-    """Prepare the joints that carry tracked points, with their channels at the requested moments.
+    """Prepare the joints that move tracked points, with their channels at the requested moments.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ def track_points(primitive: MotionPrimitive, tracked: Sequence[Tracked]) -> Chai
 
 
 def track_times(primitive: MotionPrimitive, moments: Sequence[float]) -> Clocks:
-    """Prepare the steps of canonical time, with the share of each that has passed at the moments.
+    """Prepare the steps of canonical time, and the share of each step that has passed at each moment.
 
     Parameters
     ----------

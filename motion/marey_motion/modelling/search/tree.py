@@ -22,7 +22,7 @@ from marey_motion.modelling.search.tracking import Tracked, track_points
 from marey_schemas.options.modelling import TreeOptions
 
 END_EFFECTORS = ("left_wrist", "right_wrist", "left_ankle", "right_ankle", "head")
-"""Standard joints."""
+"""Standard joints whose positions can be features of samples."""
 
 
 DEFAULT_TREE = TreeOptions()
@@ -30,16 +30,16 @@ DEFAULT_TREE = TreeOptions()
 
 @dataclass(frozen=True, eq=False)
 class SampleTree:
-    """Samples of a primitive, grouped.
+    """Samples of a primitive, grouped in a tree.
 
     Nodes come level by level from the root; the children of a node follow one another, and each holds a part of its
     samples. A node without children is a leaf.
 
     Parameters
     ----------
-    samples : (n, L) float32 latent vectors, those of a node side by side
-    sizes : (M,) samples of each node
-    children : (M,) child nodes of each node
+    samples : (n, L) float32 latent vectors; those of a node are contiguous
+    sizes : (M,) number of samples of each node
+    children : (M,) number of child nodes of each node
     """
 
     samples: NDArray[np.float32]

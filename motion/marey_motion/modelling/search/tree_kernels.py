@@ -10,7 +10,7 @@ import numpy as np
 from marey_motion.kernels import compiled
 
 MOST_ROUNDS = 25
-"""Rounds of Lloyd's algorithm; what is left to gain after them is little."""
+"""Maximum number of rounds of Lloyd's algorithm; further rounds gain little."""
 
 
 @compiled
@@ -139,7 +139,7 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
 
 @compiled
 def locate(sizes, children, starts):  # type: ignore[no-untyped-def]
-    """Fill each node's first sample: where its parent's begin, after those of the siblings before it."""
+    """Fill each node's first sample: the parent's first sample plus the sizes of the siblings before the node."""
     starts[0] = 0
     following = 1
     for node in range(sizes.shape[0]):
