@@ -98,6 +98,7 @@ class Me(Answer):
         None, description="The id of the job whose attempt uses the token; null for tokens of users."
     )
     expires_at: datetime | None = Field(None, description="The end of the token of this request; null if it has none.")
+    token: str | None = Field(None, description="The id of the token of this request; null for tokens of attempts.")
 
 
 class TokenCreate(Request):
@@ -120,6 +121,19 @@ class TokenCreate(Request):
     )
 
 
+class TokenRotation(Request):
+    """Request to replace the token of the request by a successor with the same rights and the same end."""
+
+    rotation_id: str = Field(
+        pattern=r"^[A-Za-z0-9_-]{32,64}$",
+        description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
+        "gets the same successor. Keep it as secret as the token until you have the answer.",
+    )
+    grace_s: int = Field(
+        3600, ge=60, le=7 * 86400, description="Time for which the replaced token remains valid, unless it ends sooner."
+    )
+
+
 class Token(Answer):
     """A token without its secret."""
 
@@ -138,6 +152,7 @@ class Token(Answer):
     labels: dict[str, str] | None = Field(
         None, description="The labels that a worker with this token may announce; null: any."
     )
+    successor_of: str | None = Field(None, description="The id of the token that this one replaced by a rotation.")
 
 
 class NewToken(Token):

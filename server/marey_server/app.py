@@ -52,8 +52,9 @@ from marey_server.process.housekeeping import keeping_house
 from marey_server.process.observe import access_log, configure_logging
 from marey_server.process.services import Description, Services
 from marey_server.process.settings import Settings, misspelt_variables
-from marey_server.store import tokens, users
+from marey_server.store import users
 from marey_server.store.blob_backings import DirectoryBlobs
+from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.database.opening import opening
 from marey_server.store.database.schema import upgrade_schema

@@ -10,7 +10,7 @@ import pytest
 from tests.support.rest_server import ALL_SCOPES, Server
 
 from marey_server.access.principal import SYSTEM
-from marey_server.store import tokens
+from marey_server.store.credentials import tokens
 
 CHAIN = {"schema": "marey/skeleton@1", "joints": [{"name": "hips", "parent": -1, "offset": [0, 1, 0]}]}
 ORIGINAL, SECRET = b"the file of the clip", b"of another project"

@@ -37,6 +37,7 @@ MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\
 BODIES = {
     "Login": {"name": "nobody", "password": "wrong wrong wrong"},
     "TokenCreate": {"name": "t", "scopes": ["read"]},
+    "TokenRotation": {"rotation_id": "r" * 32},
     "UserCreate": {"name": "new-user"},
     "UserChange": {"display_name": "D"},
     "ProjectCreate": {"name": "lab"},  # the name is taken: 409 means that the caller was admitted

@@ -27,7 +27,8 @@ from marey_schemas.worker_protocol import (
     StagedOutput,
 )
 from marey_server.access.principal import SYSTEM, Principal
-from marey_server.store import projects, tokens, users
+from marey_server.store import projects, users
+from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.items.drafts import Draft, Published
 from marey_server.store.items.publishing import publish
@@ -103,12 +104,12 @@ class Desk:
         """Make the user `ann` and her project."""
         made = self.database.write(SYSTEM, users.create_user, UserCreate(name="ann"))
         scopes = ("read", "write", "jobs", "work")
-        self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann", claim_key=b"of ann")
+        self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann", token_key=b"of ann")
         self.database.write(self.user, projects.create_project, ProjectCreate(name=self.project))
 
     def replaced_token(self) -> Principal:
         """Return the user with another token."""
-        return replace(self.user, token_id="token_new", claim_key=b"another secret")
+        return replace(self.user, token_id="token_new", token_key=b"another secret")
 
     # -- submitting ----------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,8 @@ from marey_server.access.principal import SYSTEM, Principal
 from marey_server.app import Application, create_app, listening
 from marey_server.process.children import Children
 from marey_server.process.settings import Settings
-from marey_server.store import members, projects, tokens, users
+from marey_server.store import members, projects, users
+from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 
 ALL_SCOPES = ("read", "write", "jobs", "work", "admin")

@@ -29,8 +29,8 @@ class Principal:
     job_id: str | None = None
     fence: int | None = None
     project_id: str | None = None
-    claim_key: bytes = field(default=b"", repr=False)
-    """Secret from which the tokens of repeatable claims are derived; empty without a user's token."""
+    token_key: bytes = field(default=b"", repr=False)
+    """Secret from which the tokens of attempts and the successor of a user's token are derived; empty without one."""
     ended: bool = False
     labels: Mapping[str, str] | None = field(default=None, hash=False)
     """Labels that a worker with this token may announce; None: any."""

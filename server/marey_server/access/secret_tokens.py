@@ -25,8 +25,12 @@ class IssuedToken(NamedTuple):
 
 def issue_user_token() -> IssuedToken:
     """Create a user's token."""
-    prefix, secret = secrets.token_hex(6), secrets.token_hex(32)
-    return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
+    return _user_token(issue_prefix(), secrets.token_hex(32))
+
+
+def issue_prefix() -> str:
+    """Create the prefix of a user's token."""
+    return secrets.token_hex(6)
 
 
 def issue_attempt_token() -> IssuedToken:
@@ -34,14 +38,24 @@ def issue_attempt_token() -> IssuedToken:
     return _attempt_token(secrets.token_hex(32))
 
 
-def derive_claim_key(secret: str) -> bytes:
-    """Derive the key of `derive_attempt_token` from the secret of a user's token."""
+def derive_token_key(secret: str) -> bytes:
+    """Derive the key of `derive_attempt_token` and `derive_successor` from the secret of a user's token."""
     return hmac.digest(secret.encode("utf-8", "surrogatepass"), b"marey attempt tokens", "sha256")
 
 
-def derive_attempt_token(claim_key: bytes, claim_id: str, job_id: str, fence: int) -> IssuedToken:
+def derive_attempt_token(token_key: bytes, claim_id: str, job_id: str, fence: int) -> IssuedToken:
     """Derive the token of an attempt, always the same one for the same claim of the same user's token."""
-    return _attempt_token(hmac.digest(claim_key, f"{claim_id} {job_id} {fence}".encode(), "sha256").hex())
+    return _attempt_token(hmac.digest(token_key, f"{claim_id} {job_id} {fence}".encode(), "sha256").hex())
+
+
+def derive_successor(token_key: bytes, rotation_id: str, prefix: str) -> IssuedToken:
+    """Derive the token that replaces a user's token, always with the same secret for the same `rotation_id`."""
+    # A rotation_id contains no space, so this message is different from that of every attempt.
+    return _user_token(prefix, hmac.digest(token_key, f"rotation {rotation_id}".encode(), "sha256").hex())
+
+
+def _user_token(prefix: str, secret: str) -> IssuedToken:
+    return IssuedToken(f"{_USER}{prefix}_{secret}", prefix, hash_secret(secret))
 
 
 def _attempt_token(secret: str) -> IssuedToken:

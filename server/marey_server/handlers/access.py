@@ -12,6 +12,7 @@ from marey_schemas.access import (
     QuotasInUse,
     Token,
     TokenCreate,
+    TokenRotation,
     User,
     UserChange,
     UserCreate,
@@ -27,10 +28,11 @@ from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.process.password_lanes import limited_address
-from marey_server.store import sign_ins, tokens, users
+from marey_server.store import users
+from marey_server.store.credentials import rotation, sign_ins, tokens
+from marey_server.store.credentials.sign_ins import SignInTry
+from marey_server.store.credentials.tokens import TokenFilter
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.sign_ins import SignInTry
-from marey_server.store.tokens import TokenFilter
 from marey_server.store.transaction import Transaction
 
 MAX_LOGIN_BYTES = 4 * KIB
@@ -43,7 +45,8 @@ def read_me(tx: Transaction) -> Me:
     if principal.kind == "attempt" or principal.user_name is None:
         return Me(user=None, scopes=principal.scopes, job=principal.job_id)
     expires_at = None if principal.expires_us is None else datetime_of(principal.expires_us)
-    return Me(user=users.find_user(tx, principal.user_name), scopes=principal.scopes, expires_at=expires_at)
+    user = users.find_user(tx, principal.user_name)
+    return Me(user=user, scopes=principal.scopes, expires_at=expires_at, token=principal.token_id)
 
 
 def sign_in(tx: Transaction, attempt: SignInTry, verified_hash: str, expires_in_s: int) -> NewToken:
@@ -193,6 +196,22 @@ class TokenResource(Resource):
         return await self.answer(tokens.revoke_token, token, with_created=query.with_created)
 
 
+class RotatedToken(Resource):
+    """Rotation of a token."""
+
+    path = "/tokens/{token}/rotate"
+    tag = "Access"
+
+    @writes(access=Access.USER, scope=None, body=TokenRotation, answer=NewToken)
+    async def post(self, token: str, body: TokenRotation) -> Rendered:
+        """Replace the token of this request by a successor with the same rights and the same end.
+
+        The replaced token remains valid for `grace_s`. A repeated request gets the same successor.
+        """
+        private = {"Cache-Control": "no-store"}
+        return await self.answer_with(lambda made: Reply(made, headers=private), rotation.rotate_token, token, body)
+
+
 class AllUsers(PasswordResource):
     """All users."""
 
@@ -292,6 +311,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     LogoutResource,
     OwnTokens,
     TokenResource,
+    RotatedToken,
     AllUsers,
     UserResource,
     UserQuotas,

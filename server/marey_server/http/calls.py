@@ -20,7 +20,8 @@ from marey_server.access.secret_tokens import hash_secret
 from marey_server.errors import BadRequestProblem, ForbiddenProblem, UnauthenticatedProblem
 from marey_server.http.declarations import Access, Operation
 from marey_server.http.reply import AnswerCache, AnswerForm, Loaded, Rendered, Reply, render, settle
-from marey_server.store import idempotency, projects, tokens
+from marey_server.store import idempotency, projects
+from marey_server.store.credentials import tokens
 from marey_server.store.jobs.fencing import lease_lost, require_attempt
 from marey_server.store.transaction import Transaction
 

@@ -6,7 +6,8 @@ import os
 from pathlib import Path
 
 from marey_schemas.access import TokenCreate
-from marey_server.store import tokens, users
+from marey_server.store import users
+from marey_server.store.credentials import tokens
 from marey_server.store.transaction import Transaction
 
 TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file

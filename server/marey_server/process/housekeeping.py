@@ -17,7 +17,8 @@ from typing import Concatenate, ParamSpec, TypeVar
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
-from marey_server.store import leader, sign_ins
+from marey_server.store import leader
+from marey_server.store.credentials import sign_ins
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.reaper import StartGrace

@@ -19,7 +19,7 @@ from typing import ParamSpec, TypeVar
 
 from marey_schemas.lru import LruCache
 from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
-from marey_server.store.sign_ins import LimitScope, SignInTry, too_many_sign_ins
+from marey_server.store.credentials.sign_ins import LimitScope, SignInTry, too_many_sign_ins
 
 P = ParamSpec("P")
 T = TypeVar("T")

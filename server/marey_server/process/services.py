@@ -24,7 +24,8 @@ from marey_server.process.observe import Metrics
 from marey_server.process.password_lanes import PasswordLane, RefusedTries
 from marey_server.process.settings import Settings
 from marey_server.process.upload_hashes import UploadHashes
-from marey_server.store import events, tokens
+from marey_server.store import events
+from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs.failure import end_for_lost_author
 from marey_server.store.jobs.policy import QueuePolicy

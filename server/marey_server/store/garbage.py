@@ -18,6 +18,7 @@ from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
 from marey_server.store.blobs import GRACE_US
 from marey_server.store.coverage_streams import drop_old_streams
+from marey_server.store.credentials.tokens import forget_ended
 from marey_server.store.database.connections import Database
 from marey_server.store.idempotency import LIFETIME_US as KEY_LIFETIME_US
 from marey_server.store.jobs.fencing import RUNNING
@@ -33,7 +34,6 @@ from marey_server.store.tables import (
     revision_part,
     staged_output,
 )
-from marey_server.store.tokens import forget_ended
 from marey_server.store.transaction import Transaction
 
 BATCH = 200

@@ -85,7 +85,8 @@ def _used(tx: Transaction, quota: str, user_id: str) -> Select[Any]:
         return select(func.coalesce(func.sum(upload.c.length), 0)).where(*_open(user_id))
     if quota == "user_tokens":
         valid = or_(token.c.expires_us.is_(None), token.c.expires_us > tx.now_us)
-        return select(func.count()).select_from(token).where(token.c.user_id == user_id, ~token.c.session, valid)
+        counted = token.c.user_id == user_id, ~token.c.session, token.c.rotation_hash.is_(None), valid
+        return select(func.count()).select_from(token).where(*counted)
     if quota == "user_jobs":
         return select(func.count()).select_from(job).where(job.c.author_id == user_id, UNFINISHED)
     owned = select(func.count()).select_from(member.join(project, project.c.id == member.c.project_id))

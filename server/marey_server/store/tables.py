@@ -71,6 +71,9 @@ token = Table(
     Column("session", Boolean, nullable=False, default=False, server_default=false()),  # made by a sign-in
     Column("created_by", ID),  # the token whose bearer created it
     Column("labels", Document),  # that its workers may announce; null: any
+    Column("rotation_hash", String(64)),  # hash of the id of the rotation that replaced it
+    Column("successor_of", ID),  # the token that it replaced
+    Index("uq_token_successor_of", "successor_of", unique=True),
 )
 
 sign_in_limit = Table(

@@ -18,7 +18,8 @@ from marey_server.errors import (
     PreconditionFailedProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import listing, quotas, tokens
+from marey_server.store import listing, quotas
+from marey_server.store.credentials import tokens
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id

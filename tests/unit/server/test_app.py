@@ -16,7 +16,8 @@ from marey_server.app import make_worker_token
 from marey_server.errors import NotFoundProblem, UnauthenticatedProblem, UnavailableProblem
 from marey_server.process.administrators import give_token, make_first_administrator
 from marey_server.process.settings import Settings
-from marey_server.store import leader, tokens, users
+from marey_server.store import leader, users
+from marey_server.store.credentials import tokens
 from marey_server.store.database.connections import Database
 
 

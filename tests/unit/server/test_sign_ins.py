@@ -14,9 +14,9 @@ from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
 from marey_server.http.exchange import forwarded_address
 from marey_server.process import password_lanes
 from marey_server.process.password_lanes import PLACES, PLACES_PER_ADDRESS, PasswordLane, RefusedTries, limited_address
-from marey_server.store import sign_ins
+from marey_server.store.credentials import sign_ins
+from marey_server.store.credentials.sign_ins import MORE_FOR_MANY, SignInTry, too_many_sign_ins
 from marey_server.store.database.connections import Database
-from marey_server.store.sign_ins import MORE_FOR_MANY, SignInTry, too_many_sign_ins
 from marey_server.store.tables import sign_in_limit
 
 PER_MINUTE = 10

@@ -22,11 +22,12 @@ from marey_server.errors import (
     PreconditionFailedProblem,
     UnauthenticatedProblem,
 )
-from marey_server.store import projects, tokens, users
+from marey_server.store import projects, users
+from marey_server.store.credentials import tokens
+from marey_server.store.credentials.tokens import TokenFilter
 from marey_server.store.database.connections import Database
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.tables import attempt, job
-from marey_server.store.tokens import TokenFilter
 from marey_server.store.transaction import Transaction
 
 

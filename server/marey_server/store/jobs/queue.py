@@ -71,7 +71,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = _require_worker(tx.principal)
     _require_labels(tx.principal, request)
-    claim_id = request.claim_id if tx.principal.claim_key else None
+    claim_id = request.claim_id if tx.principal.token_key else None
     if claim_id is not None and (again := _claimed_before(tx, claim_id, policy)):
         return again
     rows = _claim_rows(tx, request, scopes, policy)
@@ -128,7 +128,7 @@ def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> Issued
     """Return the token of an attempt, derived if the claim can be repeated, so that no secret needs to be stored."""
     if claim_id is None:
         return issue_attempt_token()
-    return derive_attempt_token(tx.principal.claim_key, claim_id, row.id, row.fence)
+    return derive_attempt_token(tx.principal.token_key, claim_id, row.id, row.fence)
 
 
 def heartbeat(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Row, and_, bindparam, delete, insert, or_, select, update
+from sqlalchemy import ColumnElement, Row, Select, and_, bindparam, delete, insert, or_, select, update
 
 from marey_schemas.access import EndTokens, NewToken, Token, TokenCreate
 from marey_schemas.items import Page
@@ -16,7 +16,7 @@ from marey_server.access.principal import Principal
 from marey_server.access.roles import is_administrator, require_administrator
 from marey_server.access.secret_tokens import (
     attempt_secret,
-    derive_claim_key,
+    derive_token_key,
     hash_secret,
     issue_user_token,
     secret_matches,
@@ -88,19 +88,20 @@ def resolve_token(tx: Transaction, text: str) -> Principal:
         return _resolve_attempt(tx, secret)
     if (parts := split_user_token(text)) is not None:
         return _resolve_user(tx, *parts)
-    raise _unknown()
+    raise unknown_token()
 
 
-def _unknown() -> UnauthenticatedProblem:
+def unknown_token() -> UnauthenticatedProblem:
+    """Return the error for a token that is not valid, whatever the reason."""
     return UnauthenticatedProblem("The token is unknown, expired or revoked.", code="bad-token")
 
 
 def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
     row = tx.first(_USER_TOKEN, {"prefix": prefix})
     if row is None or not secret_matches(secret, row.secret_hash) or row.disabled:
-        raise _unknown()
+        raise unknown_token()
     if row.expires_us is not None and row.expires_us <= tx.now_us:
-        raise _unknown()
+        raise unknown_token()
     return Principal(
         "user",
         row.user_id,
@@ -109,7 +110,7 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
         tuple(row.scopes),
         row.id,
         row.expires_us,
-        claim_key=derive_claim_key(secret),
+        token_key=derive_token_key(secret),
         labels=row.labels,
     )
 
@@ -123,7 +124,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """
     row = tx.first(_ATTEMPT_TOKEN, {"hash": hash_secret(secret)})
     if row is None:
-        raise _unknown()
+        raise unknown_token()
     if row.holds and not row.author_may_run:
         raise AuthorLostProblem(row.id, row.fence)
     if row.holds:
@@ -131,7 +132,7 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     if row.write_id is None:  # it sent no last request that could be repeated
         raise lease_lost(row.id, row.fence)
     if row.ended_us + REPLAY_GRACE_US <= tx.now_us:
-        raise _unknown()
+        raise unknown_token()
     return Principal("attempt", job_id=row.id, fence=row.fence, ended=True)
 
 
@@ -154,6 +155,7 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
         )
     labels, ends_us = _labels_of(tx, request), _end_of(tx, request)
     if tx.principal.token_id is not None:  # the server itself may always make one, for its workers or after a loss
+        lock_own(tx)
         require_room(tx, "user_tokens")
     return _insert(tx, user_id, request, ends_us, labels=labels)
 
@@ -181,7 +183,7 @@ def _insert(
     }  # fmt: skip
     made = tx.execute(insert(token).values(**row).returning(*token.c)).one()
     tx.emit("token.created", made.id, name=made.name, scopes=list(request.scopes))
-    return NewToken(**_shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
+    return NewToken(**shown(made, tx.principal.user_name).model_dump(), secret=issued.text)
 
 
 def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | None:
@@ -253,7 +255,7 @@ def list_tokens(
     statement = select(token, user.c.name.label("user_name")).join(user, user.c.id == token.c.user_id)
     identity = ["tokens", own_id, *map(str, wanted)]
     rows, next_cursor = listing.read_page(tx, statement.where(*conditions), order, identity, cursor, limit)
-    return Page(items=tuple(_shown(row, row.user_name) for row in rows), next_cursor=next_cursor)
+    return Page(items=tuple(shown(row, row.user_name) for row in rows), next_cursor=next_cursor)
 
 
 def _id_of(tx: Transaction, name: str) -> str:
@@ -269,9 +271,9 @@ def _id_of(tx: Transaction, name: str) -> str:
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
-    With `with_created`, also revoke the tokens that were created with it, and so on recursively. Without it, the
-    tokens that were created with the revoked one are recorded as created with the token that created the revoked one. A
-    token may always revoke itself.
+    With `with_created`, also revoke the tokens that were created with it, its successors, its predecessors, and so on
+    recursively. Without it, the tokens that were created with the revoked one are recorded as created with the token
+    that created the revoked one, and its successor as that of its predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
@@ -279,16 +281,45 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     which = token.c.id == token_id
     if not is_administrator(principal):
         which = and_(which, token.c.user_id == principal.user_id)
-    found = tx.execute(select(token.c.created_by).where(which)).first()
+    found = tx.execute(select(token.c.user_id, token.c.created_by, token.c.successor_of).where(which)).first()
     if found is None:
         raise NotFoundProblem(f"You have no token {token_id!r}.", code="no-token")
+    _lock_tokens(tx, found.user_id)
     if with_created:
-        chain = select(token.c.id).where(which).cte("chain", recursive=True)
-        chain = chain.union(select(token.c.id).where(token.c.created_by == chain.c.id))
-        which = token.c.id.in_(select(chain.c.id))
-    else:
-        tx.execute(update(token).where(token.c.created_by == token_id).values(created_by=found.created_by))
+        _revoke(tx, token.c.id.in_(_connected_with(which)))
+        return
+    tx.execute(update(token).where(token.c.created_by == token_id).values(created_by=found.created_by))
     _revoke(tx, which)
+    tx.execute(update(token).where(token.c.successor_of == token_id).values(successor_of=found.successor_of))
+
+
+def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
+    """Return the query for the ids of tokens, and of all that were created with them or replaced by rotations."""
+    chain = select(token.c.id, token.c.successor_of).where(which).cte("chain", recursive=True)
+    connected = or_(
+        token.c.created_by == chain.c.id, token.c.successor_of == chain.c.id, token.c.id == chain.c.successor_of
+    )
+    chain = chain.union(select(token.c.id, token.c.successor_of).where(connected))
+    return select(chain.c.id)
+
+
+def lock_own(tx: Transaction) -> Row[Any]:
+    """Return the row of the token of the request, which no other transaction can revoke or rotate before this one ends.
+
+    Raises `UnauthenticatedProblem` if it was revoked after the request was authenticated.
+    """
+    _lock_tokens(tx, tx.principal.user_id)
+    row = tx.execute(select(token).where(token.c.id == tx.principal.token_id)).one_or_none()
+    if row is None:
+        raise unknown_token()
+    return row
+
+
+def _lock_tokens(tx: Transaction, user_id: str | None) -> None:
+    """Let only one transaction at a time create, rotate or revoke tokens of a user, so that none escapes a revocation
+    of all tokens that were created with another.
+    """
+    tx.lock(f"user_tokens {user_id}")
 
 
 def revoke_named(tx: Transaction, name: str) -> None:
@@ -333,10 +364,12 @@ def _require_user(principal: Principal, scope: str) -> str:
     return principal.user_id
 
 
-def _shown(row: Row[Any], user_name: str | None) -> Token:
+def shown(row: Row[Any], user_name: str | None) -> Token:
+    """Return a token as a document, without its secret."""
     return Token(
         id=row.id, name=row.name, prefix=row.prefix, scopes=tuple(row.scopes), created_at=datetime_of(row.created_us),
         expires_at=None if row.expires_us is None else datetime_of(row.expires_us),
         last_used_at=None if row.last_used_us is None else datetime_of(row.last_used_us),
         user=user_name, session=row.session, created_by=row.created_by, labels=row.labels,
+        successor_of=row.successor_of,
     )  # fmt: skip

@@ -1,0 +1,23 @@
+"""Rotation of tokens: which token a token replaces, and whether it was replaced itself."""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0013"
+down_revision = "0012"
+branch_labels = None
+depends_on = None
+
+
+def upgrade() -> None:
+    """Add the columns."""
+    op.add_column("token", sa.Column("rotation_hash", sa.String(64)))
+    op.add_column("token", sa.Column("successor_of", sa.String(40)))
+    op.create_index("uq_token_successor_of", "token", ["successor_of"], unique=True)
+
+
+def downgrade() -> None:
+    """Remove the columns."""
+    op.drop_index("uq_token_successor_of", "token")
+    op.drop_column("token", "successor_of")
+    op.drop_column("token", "rotation_hash")

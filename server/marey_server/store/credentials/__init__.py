@@ -1,0 +1,1 @@
+"""Tokens, their rotation, and limits on sign-ins."""
