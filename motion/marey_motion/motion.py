@@ -90,7 +90,7 @@ class Motion(NamedTuple):
         return np.asarray(positions, dtype=np.float64)
 
     def at_frames(self, frames: NDArray[np.integer]) -> Motion:
-        """Pick frames.
+        """Select frames.
 
         Parameters
         ----------
@@ -111,7 +111,7 @@ class Motion(NamedTuple):
 
         Parameters
         ----------
-        start, stop : int    first frame, and the one after the last
+        start, stop : int    first frame, and the frame after the last
 
         Returns
         -------

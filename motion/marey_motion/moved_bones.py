@@ -1,8 +1,8 @@
 """Directions of bones in poses whose joints move relative to their parents.
 
-Some takes keep the shape of the body in position channels: a shoulder blade that slides, a rig whose offsets are not
-those of its performer. In such a take, the direction of a bone does not follow from its joint's rotation, but from the
-positions of the joint and the next one.
+Some takes keep the shape of the body in position channels: examples are a shoulder blade that slides, and a rig whose
+offsets are not those of its performer. In such a take, the direction of a bone is not given by the rotation of its
+joint, but by the positions of this joint and the next one.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class FollowedBones:
 
 
 def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
-    """Rotate each joint the shortest way from its bone's direction without translations to its real one.
+    """Rotate each joint by the shortest rotation from its bone's direction without translations to the real one.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Compiled turns of moved bones, kept apart so that importing the rest of the package does not load numba.
 
-Operations and their order are those of `quaternions`, so that results are equal to the bit.
+Operations and their order are those of `quaternions`, so that results are bit-identical.
 """
 
 from __future__ import annotations

@@ -21,17 +21,17 @@ CHANNELS = 32
 def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = None) -> Clip:
     """Sample a clip at another frame rate.
 
-    First frames coincide, and no frame lies beyond the last one. Positions follow cubic splines; rotations cubic
-    splines through their sign-continuous components, brought back to unit length. Where all samples fall on frames,
-    those are taken as they are.
+    The first frames coincide, and no sample lies beyond the last frame. Positions follow cubic splines. Rotations
+    follow cubic splines through their sign-continuous components and are then normalised. If all samples fall on
+    frames, these frames are copied unchanged.
 
     Parameters
     ----------
     clip : Clip    F frames
     frame_rate_hz : float    frames per second
     seam : LoopSeam, optional    the transition from one round of a loop to the next (`looping.loop_seam`), None for
-        other clips. A round is sampled at even distances, so that one of a fractional number of samples gets slower or
-        faster by less than half a sample.
+        other clips. A round is sampled at even distances; if it does not last a whole number of samples, it becomes
+        slower or faster by less than half a sample.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
 
 
 def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopSeam | None = None) -> Motion:
-    """Sample a motion at another frame rate, as `resample_clip` in double precision.
+    """Sample a motion at another frame rate, as `resample_clip` does, but in double precision.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def sample_motion(motion: Motion, places: Floats) -> Motion:
     Parameters
     ----------
     motion : Motion    F frames
-    places : (n,) float64    frame numbers from 0 to F - 1; where all are whole, frames are taken as they are
+    places : (n,) float64    frame numbers from 0 to F - 1; if all are whole, the frames are copied unchanged
 
     Returns
     -------

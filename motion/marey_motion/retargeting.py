@@ -115,7 +115,7 @@ def plan_retarget(
     source : Skeleton    the skeleton that clips come from
     source_mapping : JointMapping    its standard joints
     source_axes : mapping of str to JointAxes    its twist and swing axes by joint name, at least of the mapped joints
-    target : Skeleton    the skeleton that clips are wanted for
+    target : Skeleton    the skeleton to which clips are transferred
     target_mapping : JointMapping    its standard joints
     target_axes : mapping of str to JointAxes    its axes
     scale : float, optional    target metres per source metre of travel; the ratio of the hip heights when None
@@ -234,7 +234,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Correct the source's rotations so that its bones point to where translations of joints move their ends.
+    """Correct the source's rotations so that its bones point in the directions of its translated joints.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def _hip_height_ratio(
     target: Skeleton,
     target_axes: Mapping[str, JointAxes],
 ) -> float:
-    """Compute the ratio of target to source of the height of the pelvis above the toes, of upright bodies.
+    """Compute the height of the target's pelvis above its toes, upright, divided by that of the source.
 
     Bone lengths are added up, because many files have a rest pose that is not upright. A part that is known of one
     skeleton only is left out of both.
@@ -332,7 +332,7 @@ def _hip_height_ratio(
 def _heights(
     skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str
 ) -> tuple[float, float, float]:
-    """Measure the pelvis above the hip, the leg and the foot, in metres; NaN where the skeleton does not show it.
+    """Measure the height of pelvis over hip, the leg's length and the foot's height, in metres; NaN if unknown.
 
     `up` is the direction of the trunk in the pelvis' frame.
     """

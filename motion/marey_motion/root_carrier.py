@@ -16,7 +16,7 @@ from marey_motion.motion import Motion
 from marey_motion.skeleton import Skeleton
 
 STILL = 1e-5
-"""Components of rotations that do not turn vary by less: single precision and its rounding."""
+"""Variation of the components of a rotation below which it counts as constant; rounding to float32 causes less."""
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:
@@ -94,8 +94,8 @@ def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
     motion : Motion    F frames
     skeleton : Skeleton    its joints
     carrier : int    joint that carries the body
-    root_stays : bool    the root is a static reference whose rotation does not depend on the body; else it turns with
-        the body
+    root_stays : bool    whether the root is a static reference, whose rotation does not depend on the body; if False,
+        the root turns with the body
 
     Returns
     -------

@@ -22,7 +22,7 @@ UNIT_TOLERANCE = 1e-3
 SAME_OFFSET_M = 1e-3
 """Largest difference of bone offsets that counts as rounding of one skeleton in several files."""
 SAME_SKELETON_M = 1e-5
-"""Largest difference of bone offsets of one skeleton that went through one file."""
+"""Largest difference of bone offsets that counts as rounding of a skeleton written to one file and read again."""
 
 _Vector: TypeAlias = tuple[float, float, float]
 _Rotation: TypeAlias = tuple[float, float, float, float]
@@ -34,7 +34,7 @@ class EndSite:
 
     Parameters
     ----------
-    joint : int    index of the joint that carries it
+    joint : int    index of the joint to which it belongs
     offset : (3,) float64    metres, in that joint's frame
 
     Examples
@@ -56,7 +56,7 @@ class EndSite:
 class Skeleton:
     """A tree of joints, ordered so that parents come before their children.
 
-    Arrays are used without a copy where their type fits, and are read-only afterwards.
+    Arrays of the right type are not copied. The arrays of a skeleton are read-only.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Skeleton:
 
     Raises
     ------
-    SkeletonError    naming the joint and field that is wrong
+    SkeletonError    naming the invalid joint and field
 
     Examples
     --------

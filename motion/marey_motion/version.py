@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def code_version() -> str:
-    """Name the version of the package for results and reports.
+    """Return the version of the package, as written in results and reports.
 
     Returns
     -------

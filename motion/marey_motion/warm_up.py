@@ -1,4 +1,4 @@
-"""Compilation of all kernels in advance, so that the first real file does not wait: `python -m marey_motion.warm_up`.
+"""Compilation of all kernels in advance, so that first uses do not wait for it: `python -m marey_motion.warm_up`.
 
 The compiled code is kept on disk; later processes load it in a fraction of a second.
 """
@@ -26,7 +26,7 @@ PACKAGE = Path(__file__).parent
 # Either numba itself or the options of a decorator that kernels share, at the outer level of the module.
 _IMPORTS_COMPILER = re.compile(r"^(?:import numba|from (?:numba[\w.]*|[\w.]*kernels) import)\b", re.MULTILINE)
 STAMP = Path(os.environ.get("NUMBA_CACHE_DIR") or PACKAGE / "__pycache__") / "kernels-compiled"
-"""Records the origin of the compiled code, and whether all of it is there."""
+"""File that records the origin of the compiled code, and whether the code is complete."""
 _COMPILING, _DONE = "compiling", "done"
 
 _ASF = b""":version 1.10
@@ -69,9 +69,9 @@ def kernel_sources() -> list[Path]:
 def discard_outdated_kernels() -> None:
     """Remove all compiled code if it was compiled from other sources or by another compiler than those installed.
 
-    The cache of the compiler compares each kernel with its own file only, but a kernel holds a copy of those that it
-    calls, and names the types of its arguments. Modification times cannot be used: files of an installed package have
-    the times of the archive, which are the same for every version.
+    The cache of the compiler compares each kernel with its own file only, but a kernel contains copies of the kernels
+    that it calls, and the names of the types of its arguments. Modification times cannot be used: files of an installed
+    package have the times of the archive, which are the same for every version.
     """
     if _origin() == _recorded_origin() or not os.access(STAMP.parent, os.W_OK):
         return
@@ -107,7 +107,7 @@ def _record(state: str) -> None:
 
 
 def compile_kernels(stages: Sequence[str], processes: int = 1) -> None:
-    """Run stages of `STAGES`, the first one before the others, which run side by side.
+    """Run stages of `STAGES`, the first one before the others, which run in parallel.
 
     Parameters
     ----------

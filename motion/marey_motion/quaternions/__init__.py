@@ -2,7 +2,8 @@
 
 Components are on the last axis; any leading axes broadcast. Arithmetic is done in float64 and the result has the
 floating type of the arguments (float32 in, float32 out). Angles are radians. A rotation acts on column vectors, so
-`multiply(a, b)` does `b` first. `from_x` makes rotations of another form, `as_x` gives that form back.
+`multiply(a, b)` applies `b` first. The functions `from_x` convert another form to quaternions, and `as_x` convert
+quaternions to that form.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def identity(*leading: int, dtype: type[np.floating[Any]] = np.float64) -> AnyFl
 
 
 def multiply(a: ArrayLike, b: ArrayLike) -> AnyFloats:
-    """Multiply quaternions (the Hamilton product a·b): the rotation that does `b`, then `a`.
+    """Multiply quaternions (the Hamilton product a·b): the rotation that applies `b`, then `a`.
 
     Parameters
     ----------
@@ -143,8 +143,9 @@ def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> AnyFloats:
 def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLike | None = None) -> AnyFloats:
     """Compute the shortest rotations from one direction to another.
 
-    Opposite directions have no shortest rotation: those turn half about `half_turn_axis`, made perpendicular to
-    `start`, or, without one, about the perpendicular next to the coordinate axis that `start` is farthest from.
+    Opposite directions have no unique shortest rotation. They get half a turn about `half_turn_axis`, made
+    perpendicular to `start`, or, if that is None, about the perpendicular nearest to the coordinate axis with the
+    largest angle to `start`.
 
     Parameters
     ----------
@@ -195,7 +196,8 @@ def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
 def twist_swing(q: ArrayLike, axis: ArrayLike) -> tuple[AnyFloats, AnyFloats]:
     """Split rotations into a twist about an axis and a swing: q = swing · twist.
 
-    The swing's axis is perpendicular to `axis`. A swing of half a turn leaves the twist open; it is the identity then.
+    The swing's axis is perpendicular to `axis`. If the swing is half a turn, the twist is not determined, and the
+    identity is returned for it.
 
     Parameters
     ----------
@@ -241,7 +243,8 @@ def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
 def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
     """Differentiate rotations over time.
 
-    The shortest rotation to the next frame, averaged over both neighbours; at the ends, their linear extrapolation.
+    The result at a frame is the mean of the rates of the shortest rotations from the frame before and to the frame
+    after; at the ends, these rates are extrapolated linearly.
 
     Parameters
     ----------
@@ -258,7 +261,7 @@ def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
 
 
 def rate_from_steps(steps: Floats, frame_count: int) -> Floats:
-    """Compute rates at frames from those between frames: means inside, extrapolated at the ends.
+    """Compute rates at frames from rates between frames: means inside, linear extrapolation at the ends.
 
     Parameters
     ----------

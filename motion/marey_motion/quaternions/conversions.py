@@ -101,7 +101,7 @@ def from_axis_angle(axis: ArrayLike, angle_rad: ArrayLike) -> AnyFloats:
 
 
 def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
-    """Make rotations about vectors by their length (the exponential map).
+    """Make rotations about vectors, by angles equal to their lengths (the exponential map).
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
     """Convert quaternions to Euler angles about three axes; see `from_euler`.
 
     The middle angle is in -pi/2 to pi/2, or in 0 to pi where first and last axis are the same. In gimbal lock only the
-    sum or the difference of the outer angles is defined: that of the turn that acts first is zero then.
+    sum or the difference of the outer angles is defined; the angle of the rotation that acts first is then zero.
 
     Parameters
     ----------

@@ -1,11 +1,13 @@
 """Anatomical axes of joints, each in the joint's own frame, by which rotations of different rigs can be compared.
 
 `twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to it and points to the
-body's left when the limb hangs down or the trunk stands: the axis about which knees and elbows hinge. An arm that is
-raised sideways takes its swing axis along, so that in a T-pose with palms down it is up on the left, down on the right.
+body's left when the limb hangs down or the trunk is upright: it is the axis about which knees and elbows hinge. The
+swing axis of an arm turns with the arm when the arm is raised sideways, so that in a T-pose with palms down it is up on
+the left, down on the right.
 
-The twist mostly follows from offsets alone. The swing of a limb follows from the rest pose only where that is the pose
-of a standing body; many files put all bones on one line at rest, and then it is determined from a motion.
+The twist can usually be computed from offsets alone. The swing of a limb can be computed from the rest pose only if
+that is the pose of a standing body. In many files all bones are on one line at rest; the swing is then determined from
+a motion.
 """
 
 from __future__ import annotations
@@ -101,8 +103,8 @@ def guess_axes(skeleton: Skeleton, mapping: JointMapping, motion: Clip | None = 
 
     Raises
     ------
-    MappingError    if the mapping lacks the joints that give left and up, or those of an arm coincide
-    UnknownJoint    if it names joints that the skeleton does not have
+    MappingError    if the mapping lacks the joints that define left and up, or if joints of an arm coincide
+    UnknownJoint    if the mapping names joints that the skeleton does not have
     ClipError    if the motion belongs to another skeleton
 
     Examples
@@ -154,7 +156,7 @@ def rest_pose_doubts(skeleton: Skeleton, mapping: JointMapping) -> tuple[str, ..
 
     Raises
     ------
-    MappingError    as `guess_axes`
+    MappingError    for the same reasons as in `guess_axes`
     """
     rest = _resting_body(skeleton, mapping)
     parts = dict.fromkeys(_part(standard) for standard in STANDARD_JOINTS if standard in rest.joints)
@@ -237,7 +239,7 @@ class _PosedBody:
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
     def _level(self, names: tuple[str, ...]) -> Floats | None:
-        """Find positions (K, 3) of the first of these joints that is mapped; the middle of left and right joints."""
+        """Find positions (K, 3) of the first mapped one of these joints; for a pair, the middle of left and right."""
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):
@@ -343,7 +345,7 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
 
 
 def _leg_hinge(side: str, body: _PosedBody) -> Floats:
-    """Find the axis a knee bends about, which turns the shank backwards; the body's left where it does not bend."""
+    """Find the axis about which a knee bends and the shank turns backwards; the body's left if it does not bend."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
         bend = np.cross(thigh, shank)
@@ -353,7 +355,7 @@ def _leg_hinge(side: str, body: _PosedBody) -> Floats:
 
 
 def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
-    """Find the axis an elbow stretches about; the body's left, turned with the raised arm, where it does not bend."""
+    """Find the axis about which an elbow stretches; if it does not bend, the body's left, turned with a raised arm."""
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:
         bend = np.cross(fore, upper)
@@ -371,7 +373,7 @@ def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
 
 
 def _across(swing: Floats, twist: Floats) -> Floats:
-    """Compute the unit part of a swing axis perpendicular to the twist axis; any perpendicular where that is zero."""
+    """Compute the unit part of a swing axis perpendicular to the twist axis; any perpendicular if that part is zero."""
     across = swing - (swing @ twist) * twist
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(twist, np.eye(3)[int(np.argmin(np.abs(twist)))])

@@ -57,7 +57,7 @@ ARM_BY_LEG_LIMITS = (0.3, 1.2)
 
 @dataclass(frozen=True)
 class LimbReading:
-    """A pair of limbs with the joints that start the upper and the lower long bone, and the end."""
+    """A pair of limbs with the joints at which the upper and the lower long bone start and the lower bone ends."""
 
     pair: LimbPair
     places: tuple[int, int, int]
@@ -90,7 +90,7 @@ class LimbReading:
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """Legs and arms, and how common such a body is: 0 and more for most people, less for others."""
+    """Legs and arms, with a score of how common such a body is: at least 0 for most people, less for others."""
 
     legs: LimbReading
     arms: LimbReading
@@ -134,7 +134,10 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Sort plans by worth; of joints at one position, the lower carry the bones, the upper is wrist or ankle."""
+    """Make the key that sorts readings by score, then by joints.
+
+    Of joints at the same position, the lower ones start the long bones, and the upper one is the wrist or ankle.
+    """
     a, b, c = reading.places
     return -round(reading.worth, 6), -a, -b, c
 
@@ -155,7 +158,7 @@ def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: 
 
 
 def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
-    """Score the joints inside a long bone: less where they do not bend it, nothing where they have no length."""
+    """Score the joints inside a long bone by whether they bend it; joints without length do not count."""
     count = sum(bone > SHORTEST_BONE_M for bone in pair.bones[start:stop]) - 1
     if count < 1:
         return 0.0

@@ -62,7 +62,7 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
 
     Returns
     -------
-    GeometryMatch or None    None when there are no two pairs of limbs
+    GeometryMatch or None    None if there are not two pairs of limbs
     """
     tree = BoneTree(skeleton)
     plans = body_plans(tree)
@@ -109,7 +109,7 @@ def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple
 
 
 def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
-    """Find the chain from the neck's first joint to the head's where the arms branch off, and how common it is."""
+    """Find the chain from neck to head that starts where the arms branch off, and a score of how common it is."""
     skeleton, arms, legs = tree.skeleton, plan.arms.pair, plan.legs.pair
     limbs = {limb.chain[0] for limb in arms.limbs} | set(skeleton.path_to_root(legs.parent))
     chains = [_neck_chain(tree, joint) for joint in skeleton.children[arms.parent] if joint not in limbs]
@@ -133,7 +133,7 @@ def _neck_chain(tree: BoneTree, start: int) -> list[int]:
 
 
 def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
-    """Score the length and direction of a neck; a chain with a mirrored copy beside it is none."""
+    """Score the length and direction of a neck; a chain with a mirrored copy beside it is no neck."""
     positions = tree.skeleton.rest_global_positions
     parent = plan.arms.pair.parent
     length = float(np.sum(tree.lengths[chain]))
@@ -180,7 +180,7 @@ def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
 
 
 def _left_and_right(skeleton: Skeleton, reading: LimbReading, left: Floats) -> tuple[tuple[int, int], bool]:
-    """Sort a pair of limbs, left one first; also return whether their names show the sides."""
+    """Sort a pair of limbs, the left limb first; also return whether their names show the sides."""
     first, second = reading.pair.limbs
     sides = [
         {parse_name(skeleton.display_names[joint]).side for joint in limb.chain} - {""} for limb in (first, second)

@@ -18,7 +18,7 @@ MOST_PREFIXES = 8
 
 @dataclass(frozen=True)
 class NameMatch:
-    """The joints of a skeleton that a known rig's names fit.
+    """The joints of a skeleton that have the names of a known rig.
 
     Parameters
     ----------
@@ -50,7 +50,8 @@ class NameMatch:
 def best_match(skeleton: Skeleton) -> NameMatch | None:
     """Find the known rig whose names fit best.
 
-    Ties in essential joints go to a tool's rig before everyday words; full ties go to the rig listed first.
+    Of rigs that match equally many essential joints, the rig of a tool is preferred to everyday words. Of rigs that
+    match equally in everything, the one listed first is taken.
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def _signature_share(rig: KnownRig, prefix: str, names: Names, joints: dict[Join
 
 
 def _drop_misplaced(found: dict[str, int], skeleton: Skeleton) -> None:
-    """Remove joints that do not descend from the joint they should hang on."""
+    """Remove joints that do not descend from the joint that should be above them."""
     for chain in CHAINS:
         above: int | None = None
         for standard in chain:

@@ -1,7 +1,7 @@
 """Rigs that are in common use, with the names of their joints.
 
-Names are compared by side and base (see `names`), so that a template stands for every style of writing it; prefixes
-that all joints of a file share need not be written. "{}" is the place of the side.
+Names are compared by side and base (see `names`), so one template covers all styles of writing a name. Prefixes that
+all joints of a file share are not part of a template. "{}" marks the position of the side.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ Names = str | tuple[str, ...]
 class KnownRig:
     """Names of one rig's joints; several names of a joint are alternatives, the first that is found counts.
 
-    `signature` distinguishes rigs that name the body alike: names of further joints, or a prefix of most names,
-    written "prefix*". More than half of it must be there. `everyday` marks words that are no tool's own: they count
-    where they name more of a body than the names of every tool.
+    `signature` distinguishes rigs that name the body alike: names of further joints, or a prefix of most names, written
+    "prefix*". More than half of the signature must be found. `everyday` marks a list of words that belong to no tool;
+    it is chosen only if it names more of a body than the names of every tool.
     """
 
     name: str

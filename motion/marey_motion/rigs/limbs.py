@@ -85,7 +85,7 @@ class BoneTree:
         return self._paths[joint]
 
     def extent(self, joint: int) -> float:
-        """Measure from a joint's parent to the farthest tip below the joint.
+        """Measure the length from a joint's parent to the farthest tip below the joint.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class BoneTree:
         return next(joint for joint in self.path_to_root(b) if joint in above)
 
     def distance(self, a: int, b: int) -> float:
-        """Measure the bones between two joints.
+        """Measure the length of the bones between two joints.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class BoneTree:
 
 
 def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
-    """Match two limbs of equal build, or the part they share before one of them continues into an object it holds."""
+    """Match two limbs of equal build, or their common part before one of them continues into an object it holds."""
     shorter = min(len(first.chain), len(second.chain)) - 1
     for a, b in ((first, second), *((first.cut(k), second.cut(k)) for k in range(shorter, LEAST_COMMON_BONES - 1, -1))):
         asymmetry = _asymmetry(a, b)

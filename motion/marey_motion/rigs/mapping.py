@@ -33,8 +33,8 @@ class JointMapping:
     Parameters
     ----------
     rig : str, optional    the known rig whose names were recognised
-    joints : mapping of str to str    standard name to joint name; one joint may have several, as hips that are root
-        and pelvis
+    joints : mapping of str to str    standard name to joint name; one joint can have several standard names, such as
+        hips that are both root and pelvis
     confidence : float    0 to 1; below 0.5 a person should check it before use
     method : str    "names", "geometry" or "manual"
     notes : tuple of str    assumptions and missing joints, in sentences for people
@@ -166,7 +166,7 @@ def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.in
 
     Returns
     -------
-    (J,) int32    index of the partner; its own for joints of the centre
+    (J,) int32    index of the partner; joints of the centre have their own index
     """
     partners = np.arange(skeleton.joint_count, dtype=np.int32)
     by_name = {parse_name(name): index for index, name in enumerate(skeleton.joint_names)}
@@ -186,9 +186,10 @@ def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.in
 
 
 def _spine(skeleton: Skeleton, joints: Mapping[str, int]) -> dict[str, int]:
-    """Find the joints between pelvis and arms: the lowest, the middle and the one that carries the arms.
+    """Find the joints between pelvis and arms: the lowest, the middle and the one to which the arms are attached.
 
-    Rigs have one to six of them under all kinds of names; a single one is the chest, because the arms hang on it.
+    Rigs have one to six of them under all kinds of names; a single one is the chest, because the arms are attached to
+    it.
     """
     tops = [joints.get(f"{side}_clavicle", joints.get(f"{side}_shoulder")) for side in SIDES]
     if None in tops or "pelvis" not in joints:

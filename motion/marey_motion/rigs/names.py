@@ -25,8 +25,8 @@ class JointName(NamedTuple):
 def parse_name(name: str) -> JointName:
     """Parse the side and base of a joint name of any style.
 
-    "mixamorig:LeftUpLeg", "L_UpLeg", "upLeg.l" and "UpLeg_L" have one side and differ at most by a prefix of the base.
-    A namespace, up to the last ":" or "|", is dropped.
+    "mixamorig:LeftUpLeg", "L_UpLeg", "upLeg.l" and "UpLeg_L" have the same side and differ at most by a prefix of the
+    base. A namespace, up to the last ":" or "|", is dropped.
 
     Parameters
     ----------
