@@ -19,16 +19,16 @@ NOISE_CM = 0.01
 JOINED_S = 0.1
 """Ranges of frames that are nearer to each other are joined."""
 MOST_SPANS = 100
-"""Most ranges of frames that are listed for a joint; beyond it, ranges further apart are joined, too."""
+"""Maximum number of ranges listed for a joint; if there are more, ranges farther apart are joined, too."""
 
 
 class Course(NamedTuple):
-    """Frames after at which changes are known, and the frame rate.
+    """Frames of the clip after the change that are compared, and their rate.
 
     Parameters
     ----------
-    frames : (n,) int    increasing numbers of the matched frames after
-    frame_rate_hz : float    frames per second after
+    frames : (n,) int    increasing numbers of the matched frames of the clip after
+    frame_rate_hz : float    frames per second of the clip after
     """
 
     frames: Ints
@@ -69,7 +69,7 @@ def joint_changes(
     names : sequence of str    J joints
     changes : (n, J) float    degrees or centimetres, for each matched frame
     course : Course    the matched frames
-    threshold : float    change from which on the times are listed
+    threshold : float    change above which the times are listed
     noise : float    largest change that is ignored
 
     Returns
@@ -93,7 +93,7 @@ def root_change(before: Floats, after: Floats, course: Course, threshold_cm: flo
     ----------
     before, after : (n, 3) float64    positions of the root in matched frames, metres
     course : Course    the matched frames
-    threshold_cm : float    distance from which on the times are listed
+    threshold_cm : float    distance above which the times are listed
 
     Returns
     -------

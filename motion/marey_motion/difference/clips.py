@@ -14,9 +14,9 @@ from marey_motion.difference.timing import SAME_PACE, Timing, compare_timing, fr
 from marey_schemas.documents.differences import DifferenceOptions, DifferencePlot, JointChange, MotionDifference
 
 MOST_ROWS = 600
-"""Most rows of the plotted changes of rotations."""
+"""Maximum number of rows in the plot of changed rotations."""
 MOST_POINTS = 1000
-"""Most points of a plotted path."""
+"""Maximum number of points of a plotted path."""
 MOST_PLOTTED_JOINTS = 256
 
 
@@ -31,7 +31,7 @@ def compare_clips(
     Parameters
     ----------
     before, after : Clip    clips of the same or of different skeletons
-    options : DifferenceOptions, optional    thresholds from which on the times of changes are listed
+    options : DifferenceOptions, optional    sizes of changes above which their times are listed
     plot : bool    whether to compute values to draw
 
     Returns
@@ -73,7 +73,7 @@ def compare_clips(
 
 
 def _poses(clip: Clip, joints: tuple[int, ...]) -> Poses:
-    """Return the poses of the joints in an order."""
+    """Return the poses of some joints, in the given order."""
     whole = joints == tuple(range(clip.skeleton.joint_count))
     return Poses(clip.root_translations, clip.rotations if whole else clip.rotations[:, list(joints)])
 
@@ -115,7 +115,7 @@ def _translations(clip: Clip, joint: int, frames: Ints) -> NDArray[np.floating]:
 def _plot(
     names: list[str], rotations: NDArray[np.float32], pairs: Ints, before: Poses, after: Poses, frame_rate_hz: float
 ) -> DifferencePlot:
-    """Reduce changes and paths to what a picture can show."""
+    """Reduce changes and paths to the size of a plot."""
     largest = rotations.max(axis=0, initial=0.0)
     shown = np.sort(np.argsort(-largest, kind="stable")[:MOST_PLOTTED_JOINTS])
     rows = min(MOST_ROWS, after.frame_count)

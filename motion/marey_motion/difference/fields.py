@@ -13,7 +13,7 @@ from marey_schemas.documents.differences import ModelDifference
 from marey_schemas.documents.models import log_likelihoods
 
 MOST_TEXT = 2000
-"""Greatest length of a value as JSON text; longer ones are replaced by a description."""
+"""Maximum length of a value as JSON text; longer values are replaced by a description."""
 
 
 class ChangedValue(NamedTuple):
@@ -35,8 +35,8 @@ class ChangedValue(NamedTuple):
 def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[ChangedValue]:
     """Compare two documents.
 
-    Objects are compared by field, lists of equal length by position. Of lists of different length, entries that only
-    one of them has are removed or added. Arrays are compared as a whole.
+    Objects are compared by field, lists of equal length by position. If lists have different lengths, entries of only
+    one of them count as removed or added. Arrays are compared as a whole.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> Model
 
     Parameters
     ----------
-    before, after : mapping    parts `model` of any age
+    before, after : mapping    parts `model`, also of older versions
 
     Returns
     -------

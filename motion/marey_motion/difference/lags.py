@@ -1,4 +1,4 @@
-"""Candidates for the shift in time between two clips: which frame after may correspond to a frame before."""
+"""Candidates for the shift in time between two clips: frame of the clip after minus corresponding frame before."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from marey_motion.arrays import AnyInts, Complexes, Floats
 from marey_motion.difference.poses import Poses
 
 MOST_LAGS = 16
-"""Most candidates, of each of the two methods."""
+"""Maximum number of candidates from each of the two methods."""
 WINDOWS = 12
-"""Windows of frames before that are searched in the whole clip after."""
+"""Number of windows of the clip before that are searched in the whole clip after."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
 """Factor of the least squared distance up to which the second-best place of a window is a candidate, too."""
@@ -57,7 +57,7 @@ def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, 
     Parameters
     ----------
     before, after : Poses    frames of the same joints
-    unmatched : (n,) int    frames before that the windows are centred on
+    unmatched : (n,) int    frames of the clip before on which windows are centred
 
     Returns
     -------

@@ -15,19 +15,19 @@ from marey_schemas.documents.differences import AnnotationDifference, KeyframeCh
 ALONE = 0.6
 """Cost of an added or removed segment."""
 OTHER_LABEL = 0.7
-"""Cost of another label, in addition to that of the range, which is 0 for equal ranges to 1 for ranges apart."""
+"""Cost of another label, added to the cost of the range, which is from 0 (equal ranges) to 1 (ranges apart)."""
 SHIFTED = 0.05
 """Cost of the shift that most segments of the annotation have in common."""
 MOST_PAIRS = 16_000_000
-"""Greatest product of the numbers of differing segments."""
+"""Maximum product of the numbers of differing segments in both annotations."""
 
 
 def compare_annotations(before: Annotation, after: Annotation) -> AnnotationDifference:
     """Describe the differences between two annotations.
 
-    Segments are matched in order, at the least cost: segments of the same label whose ranges overlap cost little, also
-    after a shift that most of them have in common. A segment with another label is matched only if the ranges overlap
-    by more than a half.
+    Segments are matched in order, at the least cost. Segments of the same label whose ranges overlap cost little, and
+    so do segments that overlap after the shift that most segments have in common. A segment with another label is
+    matched only if the ranges overlap by more than a half.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
 
 
 def _pair_costs(before: Ints, after: Ints) -> Floats:
-    """Return the costs (n, m) of pairs of entries; the columns are label, start and end."""
+    """Return the costs (n, m) of pairs of entries, whose columns are label, start and end."""
     same = before[:, None, 0] == after[None, :, 0]
     costs = np.minimum(
         _range_costs(before, after), SHIFTED + _range_costs(before + _common_shift(before, after), after)
@@ -108,7 +108,7 @@ def _range_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _common_shift(before: Ints, after: Ints) -> Ints:
-    """Return the most frequent shift of entries of the same label and length, as an addend of their columns."""
+    """Return the most frequent shift of entries of the same label and length, as a row to add to theirs."""
     alike = (before[:, None, 0] == after[None, :, 0]) & (
         before[:, None, 2] - before[:, None, 1] == after[None, :, 2] - after[None, :, 1]
     )

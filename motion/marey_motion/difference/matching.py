@@ -1,4 +1,4 @@
-"""Matching of frames: the one monotone sequence of runs in which two clips correspond at the least cost.
+"""Matching of frames: the monotone sequence of runs with the least cost in which two clips correspond.
 
 Within a run, each frame after corresponds to the frame before that is a fixed number of frames (the lag) away. Between
 runs, frames are removed or inserted. The runs are the cheapest path through the candidates for lags, so an insertion
@@ -23,9 +23,9 @@ NEW_RUN = 1.0
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further candidates are searched."""
 MOST_ROUNDS = 64
-"""Most changes of the lag that are considered."""
+"""Maximum number of changes of the lag."""
 SHORTEST_REPLACEMENT = 3
-"""Fewest consecutive frames that are called removed and inserted, because they differ entirely."""
+"""Minimum number of consecutive, entirely different frames that are reported as removed and inserted."""
 
 
 class Matching(NamedTuple):

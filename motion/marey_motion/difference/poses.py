@@ -12,9 +12,9 @@ from marey_motion.motion import Motion
 from marey_motion.resampling import sample_motion
 
 FAR_DEG = 30.0
-"""Angle from which on a joint counts as entirely different when frames are matched."""
+"""Smallest angle at which a joint counts as entirely different when frames are matched."""
 FAR_M = 0.3
-"""Distance from which on the root counts as entirely different when frames are matched."""
+"""Smallest distance at which the root counts as entirely different when frames are matched."""
 UNEQUAL = 0.01
 """Least cost of two frames that are not equal, so that equal frames are matched first."""
 BLOCK = 2048
@@ -111,7 +111,7 @@ def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
 
 
 def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, Floats]:
-    """Estimate by how many frames paired frames are apart in time.
+    """Estimate the offset in time, in frames, between paired frames.
 
     Parameters
     ----------
@@ -143,8 +143,9 @@ def _steps(first: Poses, second: Poses, rows: AnyInts, others: AnyInts) -> NDArr
 
 
 def _chords(before: Poses, after: Poses, pairs: AnyInts) -> NDArray[np.float32]:
-    """Return the distances (n, J) of quaternions: 2·sin(a / 4) for the angle a. Unlike the angle from a scalar product,
-    they are exact near 0.
+    """Return the distances (n, J) of quaternions: 2·sin(a / 4) for the angle a.
+
+    Unlike the angle from a scalar product, they are exact near 0.
     """
     steps = _steps(before, after, pairs[:, 0], pairs[:, 1])
     return np.asarray(np.sqrt(np.einsum("fjc,fjc->fj", steps, steps)), dtype=np.float32)

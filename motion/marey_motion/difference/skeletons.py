@@ -25,7 +25,7 @@ class JointPairs(NamedTuple):
     Parameters
     ----------
     before, after : tuple of int    indices of the same joints in both skeletons
-    renamed : tuple of pairs of str    names of those with different names
+    renamed : tuple of pairs of str    both names of each renamed joint
     """
 
     before: tuple[int, ...]

@@ -15,9 +15,9 @@ from marey_schemas.documents.differences import FrameRun
 
 SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
-"""Share of the shorter clip's frames that must be matched well, so that no other pace is tried."""
+"""Share of the shorter clip's frames; if more are matched well, no other pace is tried."""
 MUCH_BETTER = 0.5
-"""Share of the cost at the first pace that another pace must fall below."""
+"""Share of the cost at the first pace below which the cost at another pace must be for that pace to be chosen."""
 MOST_REFINEMENTS = 4
 ROUNDED_PACE = 1e-6
 GREATEST_PACE = 16.0
@@ -29,7 +29,7 @@ class Timing(NamedTuple):
 
     Parameters
     ----------
-    pace : float    frames after for each matched frame before
+    pace : float    frames of the clip after for each matched frame of the clip before
     before : Poses    the clip before, sampled at that pace
     matching : Matching    pairs of frames of the sampled clip and of the clip after
     """
@@ -49,7 +49,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
     Returns
     -------
-    Timing    the ratio of the frame rates, unless another pace explains much more
+    Timing    correspondence at the ratio of the frame rates, unless another pace explains much more
     """
     first, *others = _paces(before.frame_count, after.frame_count, rate_ratio)
     best = _at_pace(before, after, first, search=True)

@@ -50,8 +50,9 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     """
     name = file.planned.name
     if source.subject == "tree":
-        message = "this tree sorts samples of a model; import it with the file of that model, as walk_mm.json"
-        raise FormatError(f"{message}, which is needed for walk_cluster_tree.json", code="model-missing", file=name)
+        message = "a tree over samples of a model is imported together with the file of that model"
+        example = "for example, walk_cluster_tree.json needs walk_mm.json"
+        raise FormatError(f"{message}; {example}", code="model-missing", file=name)
     if source.subject == "graph":
         read = graph_of_document(source.document, name)
         graph = ImportedGraph(file.planned.item_name, file.collection, file.options.tags, read, name, file.digest)

@@ -111,7 +111,7 @@ def rank_fillings(
         present = set(clips_by_source(database.clips)) if comparable else set()
         for source, (own, rows, cells) in seconds[name].items():
             if cancelled is not None and cancelled():
-                raise EvaluationCancelled(f"the comparison of candidates was stopped after {done} of {total}")
+                raise EvaluationCancelled(f"the comparison was stopped after {done} of {total} candidates")
             filled = np.minimum(own, coverage.deficit_s)
             if source not in present and filled.any():
                 useful = rows[np.isin(cells, np.flatnonzero(filled))]

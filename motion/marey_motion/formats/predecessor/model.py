@@ -173,7 +173,8 @@ def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
     rate_sources = (time or {}, document, skeleton if isinstance(skeleton, dict) else {})
     frame_time_s = next((one["frame_time"] for one in rate_sources if one.get("frame_time")), DEFAULT_FRAME_TIME_S)
     if not isinstance(frame_time_s, int | float) or not 1e-5 < frame_time_s < 10.0:
-        raise FormatError(f"field 'frame_time' is {frame_time_s!r}, not seconds above 0", code="bad-number", file=file)
+        message = f"field 'frame_time' must be a number of seconds above 1e-5 and below 10, not {frame_time_s!r}"
+        raise FormatError(message, code="bad-number", file=file)
     joints = next((one for one in (space, document) if "animated_joints" in one), None)
     if joints is None and isinstance(skeleton, dict) and isinstance(skeleton.get("animated_joints"), list):
         joints = skeleton

@@ -167,8 +167,8 @@ def _features(
         return np.ascontiguousarray(samples[:, : primitive.spatial.count])
     if not end_effectors:
         raise MotionError(
-            "the joint mapping of the skeleton contains no hands, no feet and no head, whose "
-            "positions a tree is made from",
+            "the tree is made from the positions of hands, feet and head, but the joint mapping of the skeleton "
+            "contains none of them",
             where="features",
         )
     frames = feature_frames(primitive)
