@@ -245,7 +245,7 @@ def changed(path: list[str], value: object) -> dict[str, Any]:
         (changed(["gmm"], {"weights": [1.0], "means": [[0.0] * 9], "covars": [np.eye(9).tolist()]}), "9 dimensions"),
         (changed(["keyframes"], {"contact0": 48}), "keyframes': frame 'contact0' is outside the 48"),
         (changed(["keyframes"], {"contact0": 1.5}), "'contact0' must be the number of a frame, not 1.5"),
-        (changed(["tspm", "frame_time"], "x"), "'frame_time' is 'x'"),
+        (changed(["tspm", "frame_time"], "x"), "'frame_time' must be .* not 'x'"),
         (changed(["tspm"], 5), "'tspm' must be dict, not int"),
         (changed(["tspm"], [1]), "'tspm' must be dict, not list"),
         (changed(["tspm", "mean"], 3), "'mean' must be list, not int"),
