@@ -65,9 +65,10 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
     Notes
     -----
-    With F the constant that takes the local axes of the partner p to those of the joint j (improper, as it mirrors),
-    the global rotation is M·G_p·F_j⁻¹, so the local one is F_parent·L_p·F_j⁻¹, and -F is a rotation. F comes from the
-    rest pose, corrected to take the partner's bones to the joint's own where the rest pose is not symmetric.
+    Let F be the constant matrix that maps the local axes of the partner p to the axes of the joint j (improper, as it
+    mirrors). Then the global rotation is M·G_p·F_j⁻¹, so the local one is F_parent·L_p·F_j⁻¹, and -F is a rotation. F
+    comes from the rest pose, corrected to take the partner's bones to the joint's own where the rest pose is not
+    symmetric.
     """
     mirrored = mirror_motion(clip.skeleton, partners, Motion.of(clip))
     return mirrored.as_clip(clip.skeleton, clip.frame_rate_hz)
@@ -124,7 +125,7 @@ def _mirror_of(skeleton: Skeleton, pairing: tuple[int, ...]) -> _Mirror:
 
 
 def _frame(skeleton: Skeleton, sources: NDArray[np.int64], carried: NDArray[np.bool_], joint: int) -> Floats:
-    """Make the improper matrix (3, 3) that takes the local axes of the partner to those of the joint."""
+    """Make the improper matrix (3, 3) that maps the local axes of the partner to the axes of the joint."""
     source = sources[joint]
     rest = quaternions.as_matrix(skeleton.rest_global_rotations[[joint, source]])
     by_rest = rest[0].T @ REFLECTION @ rest[1]
@@ -160,7 +161,7 @@ def _turns(skeleton: Skeleton, frames: Floats, carried: NDArray[np.bool_]) -> tu
 
 
 def _mirrored_translations(skeleton: Skeleton, mirror: _Mirror, motion: Motion) -> tuple[Floats, tuple[int, ...]]:
-    """Mirror translations: a joint gets those of its partner, in the axes of its parent."""
+    """Mirror translations: a joint gets the mirrored translations of its partner, in the axes of its parent."""
     if not motion.translated_joints:
         return motion.translations, ()
     moving = np.array(motion.translated_joints)

@@ -1,6 +1,6 @@
 """Compiled turns of moved bones, kept apart so that importing the rest of the package does not load numba.
 
-Operations and their order are those of `quaternions`, so that results are bit-identical.
+Operations and their order are the same as in `quaternions`, so that results are bit-identical.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ def _length(x, y, z):  # type: ignore[no-untyped-def]
 def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, turns, halves, opposite):  # type: ignore[no-untyped-def]
     """Fill `turns` (B, F, 4) with the shortest rotations of B bones from positions `rigid` to `moved` (F, J, 3).
 
-    `halves` (2, B, F) receives sine and cosine of half of each angle. Bones shorter than `shortest_bone` do not
-    turn; `opposite` (B, F) marks those that turn by nearly half a circle, which are left out.
+    `halves` (2, B, F) receives sine and cosine of half of each angle. Bones shorter than `shortest_bone` do not turn;
+    `opposite` (B, F) marks bones that turn by nearly half a circle, which are left out.
     """
     for b in range(starts.shape[0]):
         s, e = starts[b], ends[b]

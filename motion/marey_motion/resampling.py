@@ -78,7 +78,7 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
 
 
 def count_samples(frames: int, from_hz: float, to_hz: float) -> int:
-    """Count the frames of a resampled motion, none beyond its last frame.
+    """Count the frames of a resampled motion, which has no frame beyond the last frame of the original.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Retargeting: transfer of the motion of one skeleton to another, with any rest poses, proportions and local axes.
 
 Both skeletons give each joint two axes in its own frame: twist along the bone and swing across it (`rigs.guess_axes`).
-A target joint takes the global orientation in which its two axes coincide with those of the source joint with the same
+A target joint gets the global orientation in which its two axes coincide with those of the source joint with the same
 standard name (Herrmann et al. 2019, Algorithm 1, after Monzani et al. 2000).
 
 The paper rotates twist onto twist, then swing onto swing, for every pose. As both axes are fixed in their joints, this
@@ -170,11 +170,11 @@ def plan_retarget(
 def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None) -> Clip:
     """Retarget a clip to the plan's target skeleton.
 
-    Mapped joints take the source's orientation; all others keep their rest rotation, or their source rotation between
-    copies of one rig. Bones keep the lengths of the target. If the source has translations, the target's bones point in
-    the directions of the source's translated bones; if the target is the source skeleton itself, the clip keeps its
-    translations. The pelvis travels as in the source, times the plan's scale; a root above the pelvis moves along
-    without turning.
+    Mapped joints take the source's orientation; all others keep their rest rotation, or, if both skeletons are copies
+    of one rig, their source rotation. Bones keep the lengths of the target. If the source has translations, the
+    target's bones point in the directions of the source's translated bones; if the target is the source skeleton
+    itself, the clip keeps its translations. The pelvis travels as in the source, times the plan's scale; a root above
+    the pelvis moves along without turning.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ _AMC = b":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 16 0 0 0 0\nfemur 10\n2\nroot 0 1
 
 
 def kernel_sources() -> list[Path]:
-    """List the modules of the package that contain compiled functions: those that import the compiler.
+    """List the modules of the package that contain compiled functions, which are the modules that import the compiler.
 
     Returns
     -------
@@ -287,7 +287,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
 
 
 def main() -> None:
-    """Compile everything, or the stages that are named."""
+    """Compile everything, or only the stages named in the arguments."""
     parser = argparse.ArgumentParser(prog="python -m marey_motion.warm_up", description=__doc__)
     parser.add_argument("stages", nargs="*", metavar="stage", help=f"stages to run: {', '.join(STAGES)}; default: all")
     parser.add_argument("--processes", type=int, default=1, help="number of processes; default: 1")

@@ -145,7 +145,7 @@ def restored_clip(clip: Clip, info: Mapping[str, Any]) -> Clip:
 
     Raises
     ------
-    MotionError    if frame count or frame rate of the clip differ from those in `info`
+    MotionError    if the frame count or the frame rate of the clip differs from that in `info`
     """
     example = _example(StoredExample("", clip, info))
     return restore(example, clip.skeleton).as_clip(clip.skeleton, clip.frame_rate_hz)

@@ -137,7 +137,7 @@ def require_labels(own: tuple[tuple[str, ...], ...], common: tuple[tuple[str, ..
 
     Parameters
     ----------
-    own, common : tuple of tuples of str    labels of the bounds of this example, and of those of the others
+    own, common : tuple of tuples of str    labels of the bounds, in this example and in the others
 
     Raises
     ------

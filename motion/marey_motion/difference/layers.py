@@ -108,7 +108,7 @@ def _range_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _common_shift(before: Ints, after: Ints) -> Ints:
-    """Return the most frequent shift of entries of the same label and length, as a row to add to theirs."""
+    """Return (0, d, d), where d is the most frequent shift between entries of the same label and length."""
     alike = (before[:, None, 0] == after[None, :, 0]) & (
         before[:, None, 2] - before[:, None, 1] == after[None, :, 2] - after[None, :, 1]
     )

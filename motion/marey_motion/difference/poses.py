@@ -86,7 +86,7 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
 
 
 def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
-    """Compute how much paired frames differ, for matching.
+    """Compute the costs of paired frames, by which frames are matched.
 
     The cost is the mean over all joints of the angle divided by `FAR_DEG`, at most 1, where the position of the root
     counts as one more joint. A joint that was edited a lot therefore adds no more than its share.

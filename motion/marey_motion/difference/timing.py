@@ -45,7 +45,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
     Parameters
     ----------
     before, after : Poses    frames of the same joints
-    rate_ratio : float    frame rate after divided by the frame rate before
+    rate_ratio : float    frame rate of the clip after, divided by that of the clip before
 
     Returns
     -------

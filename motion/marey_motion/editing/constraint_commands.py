@@ -83,7 +83,7 @@ def constrain(take: Take, command: Constrain) -> Take:
 
 
 def plant_feet(take: Take, command: PlantFeet) -> Take:
-    """Fix planted feet to the ground, and record how far they slid before and after.
+    """Fix planted feet to the ground, and record their sliding distances before and after.
 
     Parameters
     ----------

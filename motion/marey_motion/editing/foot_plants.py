@@ -241,7 +241,7 @@ def _turn_between(before: Floats, after: Floats) -> Floats:
 
 
 def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], zone: float, blend: int) -> Floats:
-    """Compute how far to lower the root (F,), metres, so that planted feet are in reach without stretching knees."""
+    """Compute distances (F,), in metres, to lower the root so that planted feet are in reach with bent knees."""
     from marey_motion.editing.inverse_kinematics import two_bone_kernels
 
     wanted = np.zeros(len(positions))

@@ -280,7 +280,7 @@ def mirror(take: Take, _command: Mirror) -> Take:
 
 
 def fix_drift(take: Take, command: FixDrift) -> Take:
-    """Spread a shift and a turn about the vertical over a range, from none in its first to all in its last frame.
+    """Spread a shift and a turn about the vertical over a range: none in its first frame, all in its last frame.
 
     Within the range, each frame turns about its own pelvis. The frames after the range move rigidly with its last one.
 

@@ -178,7 +178,7 @@ def apply_command(take: Take, command: AnyCommand) -> tuple[Take, ...]:
 
 
 def _size_for(take: Take, command: AnyCommand) -> int:
-    """Count the values that a command processes: those of the take and of the clip that the command names."""
+    """Count the values that a command processes: the values of the take and of the clip that the command names."""
     other = take.sources.get(command.source) if isinstance(command, Concatenate | Paste) else None
     return take.size + (0 if other is None else other.poses.size)
 

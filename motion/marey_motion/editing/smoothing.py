@@ -22,7 +22,7 @@ memory of its input.
 """
 
 LEAST_LENGTH = 0.1
-"""Minimum length of a mean of unit quaternions; rotations with a shorter mean are so different that they have none."""
+"""Minimum length of a mean of unit quaternions; rotations with a shorter mean differ too much to be averaged."""
 
 
 def smooth(take: Take, command: Smooth) -> Take:

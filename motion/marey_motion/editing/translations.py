@@ -15,7 +15,7 @@ def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> M
     ----------
     motion : Motion    F frames
     skeleton : Skeleton    its skeleton
-    joints : tuple of int    increasing indices, at least those of the joints with translations
+    joints : tuple of int    increasing indices, which include all joints that have translations already
 
     Returns
     -------

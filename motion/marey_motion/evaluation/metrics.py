@@ -145,7 +145,10 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Compute turn rates from the step before; NaN if a step is too short or only one of the two is in the approach."""
+    """Compute the turn rate from each step's predecessor to the step.
+
+    The rate is NaN if one of the two steps is too short, or if only one of them belongs to the approach.
+    """
     turned = np.diff(np.arctan2(steps[:, 0], steps[:, 1]))
     turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
     moving = speeds >= LEAST_TRAVEL_M_S
@@ -310,7 +313,7 @@ def _p95(values: Floats) -> float:
 
 
 SUMMED = ("transitions", "clip_ends", "response_missed")
-"""Metrics that are counts; those of a suite are the sums over its trials."""
+"""Metrics that are counts; a metric of a suite is the sum over its trials."""
 
 
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:

@@ -20,7 +20,7 @@ def unique_names(names: Sequence[str], parents: Sequence[int]) -> tuple[str, ...
 
     Returns
     -------
-    tuple of str    unique names; those that were unique are unchanged
+    tuple of str    unique names; names that were already unique are unchanged
     """
     counts = Counter(names)
     taken = {name for name, count in counts.items() if count == 1}

@@ -78,7 +78,7 @@ def import_file(file: FileToImport) -> ImportedFile:
 
 
 def refusal_of(error: MotionError) -> Refusal:
-    """Describe an error for the entry of its file, with line and joint where they are known.
+    """Describe an error for the entry of its file, with line and joint if they are known.
 
     Parameters
     ----------

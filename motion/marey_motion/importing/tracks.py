@@ -134,8 +134,7 @@ def sole_points(skeleton: Skeleton, foot: int) -> list[int]:
 
     Returns
     -------
-    list of int    the joints from the ankle down, and their end sites as the points that `end_sites` appends after the
-        joints
+    list of int    indices of the joints from the ankle down, and of their end sites, which are numbered from J on
     """
     below = {foot}
     for joint in range(foot + 1, skeleton.joint_count):

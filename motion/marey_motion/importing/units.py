@@ -92,7 +92,7 @@ class _Measurements:
 
 
 def infer_conversion(source: SourceMotion, anatomy: Anatomy, file: str, options: ImportOptions) -> Conversion:
-    """Decide the unit and the upward axis: from the options, else from the format, else from the body.
+    """Determine the unit and the upward axis from the options, or else from the format, or else from the body.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def _body_axis(positions: NDArray[np.float64], landmarks: Landmarks) -> tuple[Up
 
 
 def _mean_directions(ways: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute the mean direction (k, 3) of vectors (k, F, 3); those of length zero are ignored."""
+    """Compute the mean direction (k, 3) of vectors (k, F, 3); vectors of length zero are ignored."""
     lengths = _lengths(ways)
     lengths[lengths == 0] = 1.0
     mean: NDArray[np.float64] = np.add.reduce(ways / lengths[..., None], axis=1) / ways.shape[1]
@@ -396,7 +396,7 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
-    """Check that hands and feet are on one ground well below the hips, unlike those of a body lying on its side."""
+    """Check that hands and feet are on one ground well below the hips; if the body lies on its side, they are not."""
     assert body.leg is not None
     return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
 

@@ -31,7 +31,7 @@ class MatchingBody:
     feet, toes : (left, right) ankles, and (left, right) toes; without toe joints, the ankles again
     lefts, rights : matching joints of both sides, hips and shoulders, from whose differences the facing direction is
         computed
-    pose_joints : joints of the pose cost: those of `POSE_JOINTS` that the skeleton has, in that order
+    pose_joints : joints of the pose cost: the joints of `POSE_JOINTS` that the skeleton has, in that order
     partners : (J,) each joint's partner on the other side; joints of the centre have their own index
     standard_joints : joint index by standard name, for all joints of the mapping
     """

@@ -122,7 +122,7 @@ def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  
 
 @compiled
 def _distance_cost(index, points, row, other, query, first, limit):  # type: ignore[no-untyped-def]
-    """Compute the trajectory cost of `other` plus the summed distance (m) of its pose joints to those of `row`.
+    """Compute the trajectory cost of `other` plus the summed distance (m) of its pose joints from the joints of `row`.
 
     If the sum exceeds `limit`, any value above `limit` is returned.
     """

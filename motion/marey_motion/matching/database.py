@@ -183,7 +183,7 @@ class MatchingDatabase:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """First row of each clip, and N; (C + 1,) int64."""
+        """First row of each clip, followed by N; (C + 1,) int64."""
         return np.array([clip.start for clip in self.clips] + [self.row_count], dtype=np.int64)
 
     @cached_property

@@ -82,7 +82,7 @@ def explain_choice(
     count: int = 10,
     others: Sequence[int] = (),
 ) -> Explanation:
-    """List the cheapest candidates at a tick of a trial and the reason why one of them, or none, was chosen.
+    """List the cheapest candidates at a tick of a trial, and the reason for the choice at that tick.
 
     At ticks without a search, the candidates are those that a search would have had.
 

@@ -29,7 +29,7 @@ class FeatureGroup(NamedTuple):
 
 @dataclass(frozen=True)
 class FeatureLayout:
-    """The D dimensions of a feature vector: those of the pose first, those of the trajectory last.
+    """The D dimensions of a feature vector: first the pose, then the trajectory.
 
     Positions and velocities have components left, up, forward in the frame of the root (x, y, z of a body that heads
     along +z); points and directions of the trajectory have left and forward (x, z).

@@ -19,7 +19,9 @@ class Status(IntEnum):
     REPLACED = 2
     """The displayed row is the last before a switch, and neither the first after another switch nor forced."""
     FORCED = 3
-    """The displayed row is the first of the trial, after the end of a clip, or of a loop's next round."""
+    """The displayed row is the first of the trial, the first after the end of a clip, or the first of a loop's next
+    round.
+    """
 
 
 @dataclass(frozen=True, eq=False)

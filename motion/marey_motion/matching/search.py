@@ -37,8 +37,8 @@ class SearchIndex(NamedTuple):
     selectable : (N,) bool    rows a search may choose
     blocks : (B, D', 16) float32    the blocks' rows, one dimension after the other
     block_rows : (B, 16) int32    numbers of these rows
-    block_of_row : (N,) int32    index of each row's block; a row that is not selectable has that of the last
-        selectable row before it, or of the first one if there is none before it
+    block_of_row : (N,) int32    index of each row's block; a row that is not selectable has the block of the last
+        selectable row before it, or of the first selectable row
     boxes : (G, D', 2, 16) float32    low and high sides of the boxes about a group's blocks
     group_blocks : (G + 1,) int32    first block of each group, and B
     group_boxes : (⌈G / 16⌉, D', 2, 16) float32    sides of the boxes about groups
@@ -72,8 +72,8 @@ def build_index(
     normalised : (N, D) float64    features divided by their scales
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
-    method : str    "auto" chooses between "boxes" and "scan" by how much of the database a few mixtures of its own
-        rows would visit; it depends on the data alone, and changes the time of a search, not its result
+    method : str    "auto" chooses between "boxes" and "scan" by the share of the database that searches for a few mixed
+        rows visit. The choice depends only on the data, and affects only the time of a search, not its result
 
     Returns
     -------
@@ -237,7 +237,7 @@ def find_best(
     Returns
     -------
     rows : (count,) int64    the rows
-    costs : (count,) float64    those of `find_nearest`, bit for bit
+    costs : (count,) float64    the same costs as in `find_nearest`, bit for bit
     """
     from marey_motion.matching import search_kernels as kernels
 

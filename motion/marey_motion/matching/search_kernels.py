@@ -3,7 +3,7 @@
 `index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Rows are database rows.
 
 Proof that screening in float32 gives the answer of float64 ----------------------------------------------------------
-Let c be the cost of a row in exact arithmetic, c32 what the screening computes for it, u = 2⁻²⁴, and ‖·‖ the norm with
+Let c be the cost of a row in exact arithmetic, c32 the cost computed by the screening, u = 2⁻²⁴, and ‖·‖ the norm with
 the weights. Rounding row and query to float32 moves each by at most u times its norm, hence their distance √c by at
 most u (‖row‖ + ‖query‖) < reach / 2. Each of the D terms of the sum then goes through at most six roundings, and every
 addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded vectors' cost:

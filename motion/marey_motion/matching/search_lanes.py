@@ -96,6 +96,7 @@ All are float32 and D is even. Fills `sums` for block `number`; the integer retu
 sums[l] <= limit."""
 
 box_costs = _summed(_from_box, 2)
-"""box_costs(boxes (G, D, 2, 16), …): the same for squared distances to the nearest points of 16 boxes, given by their
-low and high sides.
+"""box_costs(boxes (G, D, 2, 16), …): squared distances from the query to the nearest points of 16 boxes.
+
+A box is given by its low and high sides. All else is as in `row_costs`.
 """

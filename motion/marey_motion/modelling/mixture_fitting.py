@@ -1,4 +1,4 @@
-"""Fits mixtures of normal distributions to latent vectors, and chooses how many components they have."""
+"""Fitting of mixtures of normal distributions to latent vectors, and choice of the number of components."""
 
 from __future__ import annotations
 

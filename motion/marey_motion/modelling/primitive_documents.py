@@ -84,7 +84,7 @@ def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], prov
 
 
 def primitive_from_tree(tree: Mapping[str, Any], skeleton: Skeleton) -> MotionPrimitive:
-    """Read the primitive of a part `model`; its joints must be those of the skeleton, in any order.
+    """Read the primitive of a part `model`; its joints must be the joints of the skeleton, in any order.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ MOST_DIMENSIONS = 200
 
 @dataclass(frozen=True, eq=False)
 class ReconstructionErrors:
-    """Mean distance of reconstructed joints from those of the aligned examples, centimetres.
+    """Mean distance of reconstructed joints from the joints of the aligned examples, in centimetres.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
     """Compute weights that scale each channel by the distance that a unit step of the channel moves the body.
 
     A unit step of a joint's quaternion rotates the joints below it by 2 radians. The joint's weight is the root mean
-    square, over all joints of the body, of their displacement: twice their lever arms, and 0 for those that are not
+    square, over all joints of the body, of their displacement: twice their lever arms, and 0 for joints that are not
     below it. (The mean over the joints below alone would give a finger the weight of a spine.)
 
     Parameters

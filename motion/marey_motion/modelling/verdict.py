@@ -1,4 +1,4 @@
-"""Summary of a trained model: one sentence, and a few numbers for lists."""
+"""Summary of a trained model: one sentence, and a few numbers to show in lists."""
 
 from __future__ import annotations
 

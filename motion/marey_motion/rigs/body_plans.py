@@ -1,7 +1,7 @@
 """Choice of the pairs of limbs that are legs and arms of a person, and of their bending joints, by proportions.
 
 A cape, wings or the bones of a skirt are pairs of chains as well, and twist bones lie between the joints that bend. The
-score of an interpretation is the sum of the logarithms of how common its proportions are among people.
+score of an interpretation is a sum of logarithms, one for each proportion, of its frequency among people.
 """
 
 from __future__ import annotations

@@ -184,7 +184,7 @@ def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
 
 
 def _asymmetry(first: Limb, second: Limb) -> float:
-    """Compute the difference of two chains' bones as a share of their length; infinite where they differ in build."""
+    """Compute the difference of two chains' bones as a share of their length; infinite if they differ in build."""
     if len(first.bones) != len(second.bones):
         return float("inf")
     a, b = np.array(first.bones), np.array(second.bones)

@@ -156,8 +156,8 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
     """Pair each joint with its partner on the other side of the body.
 
-    Partners come from the mapping if it has both sides, else from names that differ only in their side, else from the
-    joints below: the parents of partners are partners.
+    Partners come from the mapping if it has both sides; otherwise from names that differ only in their side; otherwise
+    from the joints below, since the parents of partners are partners.
 
     Parameters
     ----------

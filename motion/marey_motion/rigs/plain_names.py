@@ -1,8 +1,8 @@
 """Joint names without prefixes and suffixes that an exporter added to all of them.
 
 Duplicating an armature, joining scenes and converting files leave marks on every joint: "Hips.001", "hero_Hips",
-"Hips_jnt", "Hips_07". These marks contain no information about the body, but with them the names do not match those of
-any known rig.
+"Hips_jnt", "Hips_07". These marks contain no information about the body, but with them the names do not match the names
+of any known rig.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ def _shared_start(names: Sequence[str]) -> str:
 
 
 def _without_common_end(names: Names) -> Names:
-    """Drop the last separator and the text after it, where all names share it."""
+    """Drop the last separator and the text after it, if all names share this text."""
     shared = _shared_start([name[::-1] for name in _marked(names)])[::-1]
     at = max((found.start() for found in _SEPARATORS.finditer(shared)), default=None)
     return names if at is None else tuple(name.removesuffix(shared[at:]) for name in names)
 
 
 def _without_common_start(names: Names) -> Names:
-    """Drop the first separator and the text before it, where all names share it."""
+    """Drop the first separator and the text before it, if all names share this text."""
     shared = _shared_start(_marked(names))
     found = _SEPARATORS.search(shared)
     return names if found is None else tuple(name.removeprefix(shared[: found.end()]) for name in names)

@@ -186,7 +186,7 @@ def test_options_out_of_range_are_refused_by_name(field: str, value: int) -> Non
 
 
 def test_end_effectors_are_needed_to_group_by_them() -> None:
-    with pytest.raises(MotionError, match="contains no hands"):
+    with pytest.raises(MotionError, match="positions of hands, feet and head"):
         build_tree(sliding(), 0)
 
 

@@ -82,8 +82,8 @@ def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
 def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-def]
     """Compute the angle, about the upper bone, from a limb's hinge to the axis about which the limb is to bend.
 
-    `wished` is the bend in radians. A nearly straight limb bends about its hinge, even if it is a little overstretched;
-    an existing bend to the side is kept. The bending axis of a bent limb is that of its pose.
+    `wished` is the bend in radians. A nearly straight limb bends about its hinge, even if it is a little overstretched,
+    and keeps an existing bend to the side. A bent limb continues to bend about the axis of its present bend.
 
     Parameters
     ----------

@@ -70,8 +70,8 @@ def optimise(
 
     Parameters
     ----------
-    simulation : Resimulation    over a database with all clips of the set and all that may be added
-        (`selection.joined`)
+    simulation : Resimulation    simulation over a database that contains the clips of the set and all clips that may be
+        added (`selection.joined`)
     options : OptimisationOptions    objective and budget
     absent : collection of str    sources that may be added; all other sources are the set
     log : sequence of OptimisationStep    earlier steps to continue from; `absent` is then the value before these steps
@@ -195,7 +195,7 @@ class _Search:
         return candidates
 
     def _additions(self, absent: Sources) -> list[str]:
-        """List absent sources that fit into the budget of data, sorted by how much of the deficit they fill."""
+        """List absent sources that fit into the budget of data, sorted by the share of the deficit that they fill."""
         limit = self._options.max_data_s
         room = np.inf if limit is None else limit - self._simulation.seconds(absent)
         fitting = [source for source in sorted(absent) if self._simulation.seconds_of(source) <= room]

@@ -1,4 +1,4 @@
-"""Redundancy of the clips of a data set: the effect of leaving out each used clip, and a plan of several removals."""
+"""Redundancy of the clips of a data set: the effect of leaving out each used clip, and a plan for several removals."""
 
 from __future__ import annotations
 

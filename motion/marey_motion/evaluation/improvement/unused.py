@@ -28,7 +28,7 @@ from marey_motion.matching.simulation_root import DIRECTION_WINDOW_S
 from marey_schemas.options.evaluation import EvaluationOptions
 
 LEAST_RANGE_S = 0.5
-"""Duration below which an unused range is not reported, because a cut is not worth it."""
+"""Duration below which an unused range is not reported, because a cut would save too little."""
 DIFFERENCES_S = 0.05
 MARGIN_BEFORE_S = 0.5 * DIRECTION_WINDOW_S + DIFFERENCES_S
 MARGIN_AFTER_S = MARGIN_BEFORE_S
@@ -47,8 +47,8 @@ class UnusedClip:
 class UnusedRange:
     """Frames [start, stop) of a source that no trial needs, neither in the clip nor in its mirrored copy.
 
-    Frames are counted at the database's rate from the clip's first row. Times are those of the recording, which may
-    begin before the first row.
+    Frames are counted at the database's rate from the clip's first row. Times are counted from the start of the
+    recording, which can be before the first row.
     """
 
     source: str

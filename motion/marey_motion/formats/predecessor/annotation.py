@@ -41,8 +41,9 @@ def read_predecessor_annotation(
     frame_count : int    frames of the clip
     end_index : str    "inclusive" if sections include their frame `end_idx`, as in the predecessor's editor;
         "exclusive" if they end before it, as in the predecessor's time warping
-    labels : sequence of str, optional    read only these, for example if sections of different labels overlap, so
-        that each label needs a layer of its own. Sections without labels are called "section 1" and so on.
+    labels : sequence of str, optional    labels to read; all labels by default. If sections of different labels
+        overlap, read one label at a time, since a layer has no overlapping segments. Sections without labels are called
+        "section 1" and so on.
 
     Returns
     -------

@@ -98,7 +98,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
 
     Raises
     ------
-    FormatError    naming the field that is wrong
+    FormatError    naming the invalid field
     """
     return model_of_document(decode_document(data, file), file, skeleton=skeleton)
 
@@ -118,7 +118,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
 
     Raises
     ------
-    FormatError    naming the field that is wrong
+    FormatError    naming the invalid field
     """
     layout = layout_of(document)
     if layout is None:

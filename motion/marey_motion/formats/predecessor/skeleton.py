@@ -42,7 +42,7 @@ def read_skeleton_document(document: Document, file: str) -> SourceMotion:
 
     Raises
     ------
-    FormatError    naming the field and the node that is wrong
+    FormatError    naming the invalid field and its node
     """
     if isinstance(document.get("jointDescs"), list):
         nodes, mirrored = _listed_nodes(document, file), True

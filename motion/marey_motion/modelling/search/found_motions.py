@@ -56,7 +56,7 @@ class FoundMotion:
         return self.starts[step] + length
 
     def _length(self, step: int) -> int:
-        """Count the frames from the first to the last of a step."""
+        """Count the frames of a step, from its first to its last frame."""
         ends = (*self.starts[1:], self.motion.frame_count - 1)
         return ends[step] - self.starts[step]
 

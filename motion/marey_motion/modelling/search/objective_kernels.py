@@ -1,7 +1,7 @@
 """Compiled evaluation of constraints, kept apart so that importing the rest of the package does not load numba.
 
-`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so that results
-depend neither on how many are evaluated at once nor on threads. A placement is (heading, x, z).
+`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so that results do
+not depend on the number of vectors evaluated at once, or on threads. A placement is (heading, x, z).
 
 Derivatives of rotations are angular velocities in the world: turning by a small w takes q to (1, w / 2) q.
 """

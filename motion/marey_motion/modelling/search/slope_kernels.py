@@ -1,8 +1,8 @@
 """Compiled derivatives of the tracked points and times of constraints by the latent vectors of one or several steps.
 
-A step's own latent vector moves its joints through spline, quaternion normalisation and forward kinematics; those of
-the steps before it move the placement of its canonical frame. `moved` (3, W) is the derivative of that placement
-(heading, x, z) by all W numbers, of which the step's own begin at `first`.
+A step's own latent vector moves its joints through spline, quaternion normalisation and forward kinematics; the latent
+vectors of the steps before it move the placement of its canonical frame. `moved` (3, W) is the derivative of that
+placement (heading, x, z) by all W numbers, of which the step's own begin at `first`.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
 
 @compiled
 def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
-    """Add derivatives (3, k) in the canonical frame to those in the world."""
+    """Add derivatives (3, k) in the canonical frame to the derivatives in the world."""
     for score in range(slopes.shape[1]):
         x, z = slopes[0, score], slopes[2, score]
         out[0, first + score] += sign * (cos * x + sin * z)

@@ -252,7 +252,7 @@ class SeveralSteps:
 
 
 def _ends(step: Step, joints: Sequence[str]) -> tuple[Tracked, ...]:
-    """List the points tracked at the start and then at the end of a step. Raises `MappingError`."""
+    """List the points tracked at the start of a step, then those at its end. Raises `MappingError`."""
     return tuple(
         one
         for frame in (0.0, float(step.primitive.frame_count - 1))
