@@ -1,1 +1,1 @@
-"""Alignment of motions in time: which frame of one motion corresponds to which frame of another."""
+"""Alignment of motions in time: the correspondence between the frames of one motion and those of another."""

@@ -70,7 +70,7 @@ class SourceExample:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """An example in the canonical frame, at the set's rate."""
+    """An example in the canonical frame, resampled to the set's rate."""
 
     example: SourceExample
     motion: Motion

@@ -17,7 +17,7 @@ NOISE_DEG = 0.01
 NOISE_CM = 0.01
 """Largest change of a position that is attributed to rounding."""
 JOINED_S = 0.1
-"""Ranges of frames that are nearer to each other are joined."""
+"""Distance, in seconds, below which two ranges of frames are joined into one."""
 MOST_SPANS = 100
 """Maximum number of ranges listed for a joint; if there are more, ranges farther apart are joined, too."""
 
@@ -106,7 +106,7 @@ def root_change(before: Floats, after: Floats, course: Course, threshold_cm: flo
 
 
 def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
-    """Return the fields of `Exceeding`."""
+    """Compute the fields of `Exceeding` for the changes of a joint or of the root."""
     at = int(np.argmax(changes))
     return {
         "mean": float(changes.mean()),

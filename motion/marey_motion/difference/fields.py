@@ -17,7 +17,7 @@ MOST_TEXT = 2000
 
 
 class ChangedValue(NamedTuple):
-    """Value of a document that differs.
+    """A value that differs between two documents.
 
     Parameters
     ----------

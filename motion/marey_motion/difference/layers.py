@@ -101,7 +101,7 @@ def _pair_costs(before: Ints, after: Ints) -> Floats:
 
 
 def _range_costs(before: Ints, after: Ints) -> Floats:
-    """Return 1 minus the share that each two ranges have in common."""
+    """Return, for each pair of ranges, 1 minus the share of frames that they have in common."""
     common = np.minimum(before[:, None, 2], after[None, :, 2]) - np.maximum(before[:, None, 1], after[None, :, 1])
     whole = np.maximum(before[:, None, 2], after[None, :, 2]) - np.minimum(before[:, None, 1], after[None, :, 1])
     return np.asarray(1.0 - np.maximum(common, 0) / whole, dtype=np.float64)

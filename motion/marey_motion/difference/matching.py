@@ -66,14 +66,14 @@ def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matchin
 
 
 def _poorly_matched(matching: Matching, count: int) -> Ints:
-    """Return the frames before that are unmatched, or matched with a frame that differs."""
+    """Return the frames of the clip before that are unmatched, or matched with a different frame."""
     well = np.zeros(count, dtype=np.bool_)
     well[matching.pairs[matching.costs <= WELL_MATCHED, 0]] = True
     return np.flatnonzero(~well)
 
 
 class _Diagonal(NamedTuple):
-    """All pairs of frames with one lag; `start` and `stop` limit the frames before, `costs` are cumulative."""
+    """All pairs of frames with one lag; `start` and `stop` limit frames of the clip before; `costs` are cumulative."""
 
     lag: int
     start: int

@@ -217,7 +217,7 @@ def _limit(rig: _Rig, asked: AnyLimit) -> JointLimit:
 
 
 def _finding(asked: AnyConstraint, constraint: Constraint, before: Any, after: Any) -> dict[str, Any]:
-    """Describe the largest errors of a constraint, in metres or radians, and count the frames that reach it."""
+    """Describe the largest errors of a constraint, in metres or radians, and count the frames that satisfy it."""
     is_position = isinstance(constraint.target, PositionTarget)
     unit = "m" if is_position else "rad"
     tolerance = _OPTIONS.tolerance_m if is_position else _OPTIONS.tolerance_rad

@@ -147,7 +147,7 @@ def spread_displacements(frames: AnyInts, values: Floats, window: Window) -> Flo
 
 
 def _evened(frames: AnyInts, values: Floats, reach: float) -> Floats:
-    """Smooth values (n, c) along consecutive frames (n,); constant values stay, and slopes at the ends decrease."""
+    """Smooth values (n, c) along consecutive frames (n,); constant values stay constant, and end slopes decrease."""
     from scipy.ndimage import gaussian_filter1d
 
     rows = np.split(values, np.flatnonzero(np.diff(frames) > 1) + 1)

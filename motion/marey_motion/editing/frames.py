@@ -107,7 +107,7 @@ def concatenate(take: Take, command: Concatenate) -> Take:
 
 
 def _same_rate(take: Take, source: str) -> Take:
-    """Resample the source clip to the rate of this one. Raises `EditError`."""
+    """Resample the source clip to the rate of the take. Raises `EditError`."""
     clip = take.source(source)
     if not same_hierarchy(clip.skeleton, take.skeleton, tolerance_m=SAME_SKELETON_M):
         raise EditError(

@@ -265,7 +265,7 @@ def _direction(axis: SignedAxis) -> Floats:
 
 
 def mirror(take: Take, _command: Mirror) -> Take:
-    """Reflect the motion in x and exchange the joints of left and right; names and axes of joints do not matter.
+    """Reflect the motion in x and exchange left and right joints, whatever the names and axes of the joints are.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ def _smooth_rotations(take: Take, rotations: Floats, weights: Floats, joints: Se
 
 
 def _reflected(end: Floats, rotations: Floats) -> Floats:
-    """Reflect rotations (n, J, 4) through those of an end frame (J, 4): the same angle in the opposite direction."""
+    """Reflect rotations (n, J, 4) through an end frame's rotations (J, 4): by the same angle in the other direction."""
     back = quaternions.multiply(end, quaternions.multiply(quaternions.conjugate(rotations), end))
     return np.asarray(back, dtype=np.float64)
 

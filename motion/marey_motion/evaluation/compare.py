@@ -58,7 +58,7 @@ class MetricChange:
 
     @property
     def verdict(self) -> str:
-        """One of: same, better, worse, changed (a metric without direction), unclear (the interval contains 0)."""
+        """Verdict: same, better, worse, changed (a metric without direction) or unclear (the interval contains 0)."""
         if self.low == self.high == 0.0:
             return "same"
         if self.low <= 0.0 <= self.high or self.trials < 2:

@@ -23,7 +23,7 @@ WINDOW_S = 1.0
 SPEED_STEP_M_S, TURN_RATE_STEP_DEG_S = 0.25, 25.0
 """Width of the only cell of a grid with one speed or turn rate."""
 EDGE_DECIMALS = 9
-"""Decimals to which edges of cells are compared, so that left and right turns have the same ones."""
+"""Decimals to which edges of cells are compared, so that left and right turns have the same edges."""
 
 
 class Windows(NamedTuple):

@@ -50,7 +50,7 @@ class LiveTake(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """Smoothers of the position and of the direction, see `smoother`."""
+    """Smoothers of the position and of the direction, made by `smoother`."""
 
     positions: Floats
     directions: Floats

@@ -137,7 +137,7 @@ def measure_trial(trial: Trial, reference: Reference, record: TrialRecord, optio
 
 
 def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
-    """Number the period of constant speed that each time belongs to; -1 before the circle."""
+    """Find the number of the period of constant speed at each time; -1 before the circle."""
     on_circle = times_s + TIME_TOLERANCE_S - trial.approach_s
     if trial.family == "switching":
         return np.maximum(np.floor(on_circle / trial.switch_every_s), -1.0).astype(np.int64)
@@ -145,7 +145,7 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Compute the turn rate from each step's predecessor to the step.
+    """Compute the turn rate of the direction of travel from the step before to each step.
 
     The rate is NaN if one of the two steps is too short, or if only one of them belongs to the approach.
     """
@@ -184,7 +184,7 @@ def _speed_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None
 
 
 def _pooled_spread(values: Floats, regimes: NDArray[np.int8]) -> float | None:
-    """Compute the standard deviation over all regimes, each about its own mean."""
+    """Compute one standard deviation over all regimes, from deviations about each regime's own mean."""
     if not len(values):
         return None
     squares = 0.0

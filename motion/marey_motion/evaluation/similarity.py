@@ -23,7 +23,7 @@ from marey_motion.matching.record import Status, TrialRecord
 ProgressCallback = Callable[[int, int, str], None]
 
 MOST_FRAMES = 2_000
-"""Maximum number of frames of a cell that are measured; if there are more, every k-th is. All are candidates for
+"""Maximum number of frames of a cell that are measured; if there are more, every k-th is measured. All frames can be
 matches.
 """
 

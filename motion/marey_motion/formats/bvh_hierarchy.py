@@ -49,7 +49,7 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """A parsed HIERARCHY, and the position and line number after it. The lists must not be changed."""
+    """A parsed HIERARCHY, and the position and line number after it. Its lists must not be changed."""
 
     header: BvhHeader
     position: int

@@ -119,7 +119,7 @@ class FootMotion:
     balls : (n, 3)    position of the ball joint, metres
     yaws, pitches, toe_pitches : (n,)    radians; toes up is positive
     freedom : (n,)    0 while the foot is loaded, rising to 1 in the middle of its swing
-    heel_planted, ball_planted : (n,) bool    True where that point of the sole is fixed on the floor
+    heel_planted, ball_planted : (n,) bool    True where the heel, or the ball, is fixed on the floor
     """
 
     balls: AnyFloats
@@ -251,7 +251,7 @@ class Footfalls:
         return np.asarray(self._leaving_pitches / ((1.0 - PUSH_OFF_START) * (self.leaves_s - self.strikes_s)))
 
     def _standing(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
-        """Compute the foot on the ground: it rolls about the heel, is flat, and rolls about the ball."""
+        """Compute the pose of the foot on the ground: it rolls about the heel, is flat, and rolls about the ball."""
         share = (times_s - self.strikes_s[stance]) / (self.leaves_s - self.strikes_s)[stance]
         landing = 1.0 - eased(share / LANDING_SHARE)
         pushing = np.clip((share - PUSH_OFF_START) / (1.0 - PUSH_OFF_START), 0.0, 1.0)
@@ -274,7 +274,7 @@ class Footfalls:
         return self.lifts_m[np.minimum(stance, len(self.lifts_m) - 1)]
 
     def _swinging(self, times_s: AnyFloats, stance: NDArray[np.intp]) -> _Foot:
-        """Compute the foot in the air, from the end of `stance` to the beginning of the next."""
+        """Compute the pose of the foot in the air, from the end of `stance` to the beginning of the next stance."""
         following = np.minimum(stance + 1, len(self.strikes_s) - 1)
         duration = self.strikes_s[following] - self.leaves_s[stance]
         share = np.clip((times_s - self.leaves_s[stance]) / np.where(duration > 0.0, duration, 1.0), 0.0, 1.0)

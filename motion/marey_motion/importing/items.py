@@ -66,7 +66,7 @@ class FileToImport:
 class ImportedItem:
     """An item to store: its name, collection, tags and documents.
 
-    `name` identifies it within the import: other items refer to it as `{"output": name}` until it is stored.
+    `name` identifies the item within the import: other items refer to it as `{"output": name}` until it is stored.
     """
 
     name: str

@@ -79,7 +79,8 @@ class Conversion:
 class _Measurements:
     """Measures of the file's body, in its own unit and axes.
 
-    `positions` (J, F, 3) of the joints in sampled frames and `rest` (J, 3); `leg` is None without two feet.
+    `positions` (J, F, 3) are those of the joints in sampled frames, `rest` (J, 3) those in the rest pose. `leg` is None
+    if there are not two feet.
     """
 
     file: str

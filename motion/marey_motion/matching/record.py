@@ -19,9 +19,7 @@ class Status(IntEnum):
     REPLACED = 2
     """The displayed row is the last before a switch, and neither the first after another switch nor forced."""
     FORCED = 3
-    """The displayed row is the first of the trial, the first after the end of a clip, or the first of a loop's next
-    round.
-    """
+    """The displayed row is the first of the trial, the first of a loop's new round, or the first after a clip's end."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,8 +52,8 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
 
     Notes
     -----
-    Savitzky-Golay filters of third order over 0.5 s and 1 s, as is usual for motion matching; shorter ones for short
-    clips. A loop is filtered across its seam when it comes with frames of the rounds before and after it
+    Savitzky-Golay filters of third order over 0.5 s and 1 s are used, as is usual for motion matching; for short clips,
+    they are shorter. A loop is filtered across its seam when it comes with frames of the rounds before and after it
     (`looping.continue_motion`).
     """
     raw = raw_root(positions, body)
@@ -87,7 +87,7 @@ def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
 def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
     """Compute the motion of the root joint on the ground, for data in which the root joint guides the character.
 
-    Its heading is that of the rest pose, rotated as the root is about the vertical.
+    Its heading is the heading of the rest pose plus the root's rotation about the vertical.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class PrincipalExamples:
     ----------
     functions : FunctionalComponents    the components to keep
     energy : (r,) float64    cumulative share of the variance, of all r components that the examples have
-    scores : (m, r) float64    scores of the examples on all of them, centred
+    scores : (m, r) float64    scores of the examples on all components, centred
     deviations : (m, n, D) float64    deviations of the examples' coefficients from their mean
     """
 

@@ -70,7 +70,7 @@ class TrainingReport:
     mixture_method : see `FittedMixture`
     candidates : mixtures compared, with their criteria
     log_likelihood : mean over the examples
-    held_out_log_likelihood : mean over the examples of their density under mixtures fitted without them
+    held_out_log_likelihood : mean over the examples, each under a mixture fitted without it
     examples : in the order of the aligned set
     time_error_frames : root mean square error of time functions that are rebuilt from splines and kept components
     """

@@ -1,4 +1,4 @@
-"""Cyclic coordinate descent: each joint in turn takes the rotation that is best for all targets it can move."""
+"""Cyclic coordinate descent: each joint in turn gets the rotation that is best for all targets that it can move."""
 
 from __future__ import annotations
 

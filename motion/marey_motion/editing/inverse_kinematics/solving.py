@@ -78,7 +78,7 @@ class TwoBoneLimb:
 
 
 class _LimbKernel(NamedTuple):
-    """A limb whose joints have the indices of the kernels."""
+    """A limb whose joints are numbered as in the arrays of the kernels."""
 
     start: int
     middle: int

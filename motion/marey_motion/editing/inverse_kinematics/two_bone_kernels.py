@@ -47,7 +47,7 @@ def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
 def damped_bend(angle, wished, zone):  # type: ignore[no-untyped-def]
     """Damp the change of the inner angle from `angle` to `wished` near a straight limb (Kovar et al. 2002, 5.2).
 
-    In the last `zone` radians before straight, the change is weighted by a cubic that falls from 1 to 0.
+    In the last `zone` radians before the limb is straight, the change is weighted by a cubic that falls from 1 to 0.
     """
     if wished <= angle or zone <= 0.0:
         return wished

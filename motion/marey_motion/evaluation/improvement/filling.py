@@ -36,7 +36,7 @@ class FilledCell:
 
 @dataclass(frozen=True)
 class Filling:
-    """A source (with its mirrored copy, where its collection has it) that would fill holes.
+    """A source that would fill holes, with its mirrored copy if its collection contains one.
 
     Parameters
     ----------

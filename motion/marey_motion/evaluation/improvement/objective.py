@@ -14,7 +14,7 @@ HEADLINES = ("offset_mean", "abs_se_v", "abs_se_omega_deg", "pose_cost_mean", "t
 
 
 def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], seconds: float) -> float:
-    """Compute the objective, in metres, of trials over `seconds` of data.
+    """Compute the objective, in metres, of a data set of `seconds` seconds from its trials.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
 
 
 def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
-    """Compute the mean of each headline over the trials that define it; 0 if none does.
+    """Compute the mean of each headline metric over the trials that define it; 0 if no trial does.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def headline_means(results: Sequence[TrialResult]) -> dict[str, float]:
 
 
 def headline_changes(before: Mapping[str, float], after: Mapping[str, float]) -> dict[str, float]:
-    """Subtract headlines: after minus before.
+    """Compute the changes of the headline metrics, after minus before.
 
     Parameters
     ----------

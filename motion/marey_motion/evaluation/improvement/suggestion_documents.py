@@ -110,13 +110,13 @@ def _redundant_to_tree(suggestions: Suggestions) -> Tree:
 
 
 def _similarity_to_tree(similarity: PoseSimilarity) -> Tree:
-    """Convert to plain values; cells without a value get 0, and are marked by `measured` 0 or `sources` below 2."""
+    """Convert to plain values. A cell without a value gets 0; its `measured` is then 0, or its `sources` below 2."""
     values = {field.name: getattr(similarity, field.name) for field in fields(similarity)}
     return {name: np.nan_to_num(value) if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def optimisation_to_tree(optimisation: Optimisation) -> Tree:
-    """Convert a log, to store or to continue from.
+    """Convert the log of an optimisation, which can be stored and continued.
 
     Parameters
     ----------

@@ -228,7 +228,7 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Read the time part of a model, or None, and its form.
+    """Read the time part of a model, which is None if it has no such part, and the form of the part.
 
     Layout 2 was written by two training programs. The first stores components as columns and uses the form
     `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.

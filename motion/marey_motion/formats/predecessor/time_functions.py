@@ -3,11 +3,11 @@
 Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as functions of a score vector
 g. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
 
-* `coefficients` (layouts 1 and 3, and layout 2 by its later trainer): t(x) is a spline whose coefficients are
+* `coefficients` (layouts 1 and 3, and layout 2 by its later training program): t(x) is a spline whose coefficients are
   cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g, so it is converted to the best
   linear function over the scores that the model draws; the largest error is returned, too.
-* `increments` (layout 2 by its first trainer): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is linear in g.
-  This is also the form of Marey's model.
+* `increments` (layout 2 by its first training program): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is
+  linear in g. This is also the form of Marey's model.
 """
 
 from __future__ import annotations

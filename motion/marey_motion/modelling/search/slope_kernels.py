@@ -126,7 +126,7 @@ def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-
 
 @compiled
 def _hat(v, out):  # type: ignore[no-untyped-def]
-    """Fill `out` with the matrix whose product with a vector is the cross product of v with it."""
+    """Fill `out` with the matrix whose product with any vector u is the cross product v × u."""
     out[0, 0], out[0, 1], out[0, 2] = 0.0, -v[2], v[1]
     out[1, 0], out[1, 1], out[1, 2] = v[2], 0.0, -v[0]
     out[2, 0], out[2, 1], out[2, 2] = -v[1], v[0], 0.0

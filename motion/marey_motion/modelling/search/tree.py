@@ -32,8 +32,8 @@ DEFAULT_TREE = TreeOptions()
 class SampleTree:
     """Samples of a primitive, grouped in a tree.
 
-    Nodes come level by level from the root; the children of a node follow one another, and each holds a part of its
-    samples. A node without children is a leaf.
+    Nodes come level by level from the root; the children of a node follow one another, and each child has a part of the
+    node's samples. A node without children is a leaf.
 
     Parameters
     ----------
