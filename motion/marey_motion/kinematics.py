@@ -280,7 +280,7 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
 
     Raises
     ------
-    MotionError    when no frame has a direction
+    MotionError    if no frame has a direction
 
     Examples
     --------

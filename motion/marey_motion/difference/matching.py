@@ -1,8 +1,8 @@
-"""Matching of frames: the monotone sequence of runs with the least cost in which two clips correspond.
+"""Matching of the frames of two clips: the monotone sequence of runs of corresponding frames that has the least cost.
 
-Within a run, each frame after corresponds to the frame before that is a fixed number of frames (the lag) away. Between
-runs, frames are removed or inserted. The runs are the cheapest path through the candidates for lags, so an insertion
-leaves the frames after it matched, and still or cyclic motion has no more runs than needed.
+Within a run, the numbers of corresponding frames differ by a constant, the lag. Between runs, frames are removed or
+inserted. The runs are the cheapest path through the candidates for lags, so frames that follow an insertion remain
+matched, and still or cyclic motion has no more runs than needed.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class Judgement:
     ----------
     grade : str    one of `GRADES`
     followed, trials : int    number of followed trials, and of all trials
-    worst : TrialResult, optional    the trial with the largest ratio of an error to its limit; None without trials
+    worst : TrialResult, optional    the trial with the largest ratio of an error to its limit; None if there are no
+        trials
     """
 
     grade: str

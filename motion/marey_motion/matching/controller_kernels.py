@@ -46,7 +46,7 @@ def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
 
 @compiled
 def _wished(wish, when):  # type: ignore[no-untyped-def]
-    """Compute position and heading of the desired path at `when` ticks; beyond its end it continues its last arc."""
+    """Compute position and heading of the desired path at `when` ticks; beyond its end, its last arc continues."""
     last = wish.headings.shape[0] - 1
     if when >= last:
         left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)

@@ -60,7 +60,7 @@ def clip_rows(
 
     Raises
     ------
-    MotionError    when no frame has a facing direction
+    MotionError    if no frame has a facing direction
     """
     rate_hz, frames = options.rate_hz, motion.frame_count
     # A loop is seen going on at both ends, so that filters and differences know nothing of a cut.

@@ -81,7 +81,7 @@ def build_index(
 
     Raises
     ------
-    MotionError    when no row is selectable or a value is not finite or larger than `LARGEST`
+    MotionError    if no row is selectable or a value is not finite or larger than `LARGEST`
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
     mask = np.ascontiguousarray(selectable, dtype=np.bool_)
@@ -196,7 +196,7 @@ def find_nearest(
     ----------
     index : SearchIndex    N rows of D dimensions
     queries : (Q, D) float64    normalised like the rows
-    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 when None
+    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 if None
     warm_rows : (Q,) int64, optional    a row likely to be near each query, or -1; it only makes the search quicker
     skips : (Q, 2) int64, optional    rows [start, stop) that each query may not choose
 

@@ -134,7 +134,7 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Make the key that sorts readings by score, then by joints.
+    """Make the key that sorts interpretations of limbs by score, then by joints.
 
     Of joints at the same position, the lower ones start the long bones, and the upper one is the wrist or ankle.
     """
