@@ -119,7 +119,7 @@ def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
-    """Return the least cost of entering a diagonal from another one before each of its frames, and at its end."""
+    """Return, before each frame of a diagonal and at its end, the least cost of entering it from another diagonal."""
     one = diagonals[place]
     least = np.full(len(one.costs), np.inf)
     for other, values in zip(diagonals, reached, strict=True):

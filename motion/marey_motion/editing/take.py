@@ -25,7 +25,7 @@ MOST_NUMBERS = 200_000_000
 
 
 UNIT_IN_SINGLE = 3e-7
-"""Largest difference between the squared length of a unit quaternion and one after rounding to single precision."""
+"""Largest deviation from 1 of the squared length of a unit quaternion after rounding to single precision."""
 
 
 @dataclass(frozen=True, eq=False)

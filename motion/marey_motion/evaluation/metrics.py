@@ -213,7 +213,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches, None if there are none, and count those without response."""
+    """Compute the mean response time to speed switches, or None, and count the switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)

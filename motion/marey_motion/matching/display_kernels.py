@@ -1,8 +1,8 @@
 """Compiled inertialisation of poses, kept apart so that importing the rest of the package does not load numba.
 
 A pose is a row of 3 + 4·J numbers: the position of joint 0 in metres and the rotations (w, x, y, z) of J joints, joint
-0 in the frame of the simulation root, the others in that of their parent. Rotations add by multiplying from the left;
-their offsets and velocities are rotation vectors.
+0 in the frame of the simulation root, the others in the frames of their parents. Rotations add by multiplying from the
+left; their offsets and velocities are rotation vectors.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class LimbReading:
 
         Returns
         -------
-        int or None    index of the joint, None if the chain has none there
+        int or None    index of the joint; None if the chain has no joint there
         """
         chain = self.pair.limbs[side].chain
         at = {-1: self.places[0] - 1, 3: self.places[2] + 1}.get(place)

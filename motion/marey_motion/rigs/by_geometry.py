@@ -153,7 +153,7 @@ def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
 
 
 def _branches(tree: BoneTree, joint: int) -> list[int]:
-    """Return the children without those whose subtree is small compared with the largest."""
+    """Return the children, except children whose subtree is small compared with the largest."""
     extents = {child: tree.extent(child) for child in tree.skeleton.children[joint]}
     return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
 
