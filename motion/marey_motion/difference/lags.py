@@ -1,4 +1,4 @@
-"""Candidates for the shift in time between two clips: frame of the clip after minus corresponding frame before."""
+"""Candidates for the lag between two clips: the frame number in the clip after minus that in the clip before."""
 
 from __future__ import annotations
 

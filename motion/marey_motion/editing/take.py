@@ -126,7 +126,7 @@ class Take:
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
     def moved(self, motion: Motion) -> Take:
-        """Replace the motion by another one of the same body and frame rate.
+        """Replace the motion with another one of the same body and frame rate.
 
         Parameters
         ----------

@@ -72,7 +72,7 @@ def _length(first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _digits(word):  # type: ignore[no-untyped-def]
-    """Count the digits at the start of the eight bytes, and return their number and the integer that they form."""
+    """Return the number of digits at the start of the eight bytes, and the integer that these digits form."""
     digits = word ^ _ZERO_DIGITS
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     count = _EIGHT

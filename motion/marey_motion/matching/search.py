@@ -72,8 +72,9 @@ def build_index(
     normalised : (N, D) float64    features divided by their scales
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
-    method : str    "auto" chooses between "boxes" and "scan" by the share of the database that searches for a few mixed
-        rows visit. The choice depends only on the data, and affects only the time of a search, not its result
+    method : str    "boxes", "scan" or "auto". "auto" makes a few searches, with mixtures of rows as queries, and
+        chooses by the share of the database that they visit. The choice depends only on the data, and affects only the
+        time of a search, not its result
 
     Returns
     -------

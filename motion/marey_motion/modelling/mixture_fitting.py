@@ -222,7 +222,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
 
 
 def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
-    """Fit one component by maximum likelihood, or shrunk towards a sphere."""
+    """Fit one component by maximum likelihood, with its covariance shrunk towards a sphere if `shrink` is set."""
     if shrink:
         from sklearn.covariance import ledoit_wolf
 
