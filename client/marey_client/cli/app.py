@@ -23,6 +23,7 @@ from marey_client.cli import (
     projects,
     searches,
     skeletons,
+    tokens,
 )
 from marey_client.cli.difference import diff
 from marey_client.cli.invocation import Invocation
@@ -67,6 +68,7 @@ def marey(
 for register in (
     processes,
     accounts,
+    tokens,
     projects,
     files,
     organise,
