@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 PACKAGES = {
     "schemas": "marey_schemas",
+    "versions": "marey_versions",
     "motion": "marey_motion",
     "reports": "marey_reports",
     "client": "marey_client",

@@ -16,6 +16,7 @@ import coverage
 
 FLOORS = {
     "marey_schemas": 90,
+    "marey_versions": 95,
     "marey_motion": 91,
     "marey_reports": 95,
     "marey_client": 73,

@@ -1,0 +1,1 @@
+"""Datasets in requests and answers: branches, tags, commits, entries and differences."""

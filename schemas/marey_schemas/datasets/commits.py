@@ -1,0 +1,102 @@
+"""Commits and entries of datasets in requests and answers."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Answer, Request, Tagged
+from marey_schemas.datasets.naming import MAIN, RefName
+from marey_schemas.kinds import Kind
+from marey_schemas.names import Digest, ItemId, Message
+
+MOST_CHANGES = 10_000
+"""Greatest number of explicit changes in one commit."""
+
+EntryPath = Annotated[
+    str,
+    StringConstraints(
+        min_length=1, max_length=1280, pattern=r"^[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*$"
+    ),
+]
+
+
+class PutEntry(Tagged):
+    """Change that adds or replaces an entry by a revision of an item of the project."""
+
+    tag = "change"
+    change: Literal["put"] = "put"
+    path: EntryPath
+    item: ItemId
+    revision: int | None = Field(None, ge=1, le=(1 << 31) - 1, description="Revision; null: the newest.")
+
+
+class RemoveEntry(Tagged):
+    """Change that removes an entry."""
+
+    tag = "change"
+    change: Literal["remove"] = "remove"
+    path: EntryPath
+    kind: Kind
+
+
+class MoveEntry(Tagged):
+    """Change that moves an entry to another path."""
+
+    tag = "change"
+    change: Literal["move"] = "move"
+    path: EntryPath
+    kind: Kind
+    to: EntryPath
+
+
+EntryChange = Annotated[PutEntry | RemoveEntry | MoveEntry, Field(discriminator="change")]
+
+
+class CommitCreate(Request):
+    """Request to record a new version on a branch."""
+
+    branch: RefName = MAIN
+    message: Message = Field(min_length=1)
+    changes: tuple[EntryChange, ...] | None = Field(
+        None,
+        max_length=MOST_CHANGES,
+        description="Changes of the newest version of the branch; null: record the content of the dataset's folder.",
+    )
+    expected: Digest | None = Field(
+        None, description="Commit that the branch must be at; null: whichever commit it is at."
+    )
+    write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
+        None, description="Name that the client chooses for this commit; a repeated request gets the same commit."
+    )
+
+    @model_validator(mode="after")
+    def _has_changes(self) -> CommitCreate:
+        if self.changes == ():
+            raise ValueError("the list of changes is empty")
+        return self
+
+
+class Commit(Answer):
+    """One version of a dataset."""
+
+    digest: str
+    tree: str = Field(description="Digest of the entries; versions with the same entries have the same.")
+    parents: tuple[str, ...]
+    author: str
+    message: str
+    at: datetime
+    entries: int = Field(description="Number of entries.")
+
+
+class Entry(Answer):
+    """An entry of a version."""
+
+    path: str
+    kind: Kind
+    parts: dict[str, str] = Field(description="Content digest of each part; it is the same on every server.")
+    tags: tuple[str, ...]
+    item: str | None = Field(description="Item of this project that has a revision with this content.")
+    revision: int | None

@@ -1,0 +1,38 @@
+"""Differences of versions of datasets in answers."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer
+from marey_schemas.datasets.commits import Commit, Entry
+from marey_schemas.kinds import Kind
+
+ChangeKind = Literal["added", "removed", "moved", "changed"]
+"""Kind of change of an entry, or of a part of one, between two versions; parts are never moved."""
+
+
+class EntryDifference(Answer):
+    """Difference of one entry between two versions."""
+
+    path: str
+    kind: Kind
+    change: ChangeKind
+    was: str | None = Field(None, description="Path before the entry was moved.")
+    parts: dict[str, ChangeKind] = Field(default_factory=dict, description="Parts that differ.")
+    tags_added: tuple[str, ...] = ()
+    tags_removed: tuple[str, ...] = ()
+    before: Entry | None = None
+    after: Entry | None = None
+
+
+class DatasetDifference(Answer):
+    """Difference of two versions of a dataset."""
+
+    before: Commit
+    after: Commit
+    counts: dict[ChangeKind, int] = Field(description="Number of entries by change.")
+    entries: tuple[EntryDifference, ...]
+    complete: bool = Field(description="Whether all differing entries are listed and counted.")

@@ -1,0 +1,90 @@
+"""Merges of versions of datasets, and checkouts into folders, in requests and answers."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.commits import Commit, Entry, EntryPath
+from marey_schemas.datasets.naming import MAIN, RefName, Version
+from marey_schemas.kinds import Kind
+from marey_schemas.names import Digest, Message
+
+MOST_CONFLICTS = 1000
+"""Greatest number of conflicts that an answer lists."""
+
+
+class Side(StrEnum):
+    """Version that a resolution takes: that of the branch, that of the version merged into it, or their base."""
+
+    OURS = "ours"
+    THEIRS = "theirs"
+    BASE = "base"
+
+
+class Resolution(Request):
+    """Decision of one conflict."""
+
+    path: EntryPath
+    kind: Kind
+    take: Side
+
+
+class MergeRequest(Request):
+    """Request to merge a version into a branch."""
+
+    into: RefName = Field(MAIN, description="Branch that gets the changes.")
+    version: Version = Field(description="Version whose changes are merged into the branch.")
+    message: Message = Field("", description="Message of the commit; empty: a sentence that names both versions.")
+    resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
+    preview: bool = Field(False, description="Compute the result without recording it.")
+    expected: Digest | None = Field(None, description="Commit that the branch must be at.")
+    write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
+        None, description="Name that the client chooses for this merge; a repeated request gets the same commit."
+    )
+
+
+class EntryConflict(Answer):
+    """Entry that both sides have changed in ways that exclude each other."""
+
+    path: str
+    kind: Kind
+    parts: tuple[str, ...] = Field(
+        description="Parts that both sides have changed; `path` if both have moved the entry or want the same path, "
+        "`entry` if one side has removed it."
+    )
+    base: Entry | None
+    ours: Entry | None
+    theirs: Entry | None
+
+
+class MergeAnswer(Answer):
+    """Result of a merge, or of its preview."""
+
+    commit: Commit | None = Field(description="New commit of the branch; null for a preview and for conflicts.")
+    base: str | None = Field(description="Digest of the common commit from which both sides started.")
+    ours: str = Field(description="Digest of the newest commit of the branch.")
+    theirs: str = Field(description="Digest of the commit that is merged.")
+    changes: int = Field(description="Number of entries of the branch that change.")
+    conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts without a resolution, by path.")
+    conflict_count: int = Field(description="Number of conflicts without a resolution.")
+
+
+class CheckoutRequest(Request):
+    """Request to give the folder of a dataset the entries of a version."""
+
+    version: Version = MAIN
+    discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")
+
+
+class CheckoutAnswer(Answer):
+    """Changes that a checkout has made in the folder of a dataset."""
+
+    commit: str = Field(description="Digest of the commit that the folder has now.")
+    added: int
+    removed: int
+    moved: int
+    changed: int

@@ -1,0 +1,72 @@
+"""Datasets with their branches and tags in requests and answers."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import Field, StringConstraints
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.names import CollectionPath
+
+MAIN = "main"
+"""Name of the branch that every dataset has from the beginning."""
+DatasetName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
+
+RefName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,126}[A-Za-z0-9])?$")]
+"""Name of a branch or a tag; it is part of URLs."""
+
+Version = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}(?:~[0-9]{1,4})?$")]
+"""A version: a branch, a tag, or a commit, of whose digest the first 8 digits are enough. With `~n` at the end, it is
+the version n commits earlier.
+"""
+
+
+class DatasetCreate(Request):
+    """Request to create a dataset."""
+
+    name: DatasetName
+    description: str = Field("", max_length=10_000)
+    collection: CollectionPath | None = Field(
+        None, description="Folder of the project whose content the commits of this dataset record."
+    )
+
+
+class Dataset(Answer):
+    """A dataset: a history of versions of named entries."""
+
+    id: str
+    name: str
+    description: str
+    collection: str | None = Field(description="Folder whose content commits record; null: commits list their changes.")
+    created_at: datetime
+    updated_at: datetime
+    rev: int
+
+
+class RefKind(StrEnum):
+    """Kind of a name for a commit: branches move to later commits, tags never move."""
+
+    BRANCH = "branch"
+    TAG = "tag"
+
+
+class RefCreate(Request):
+    """Request to create a branch or a tag."""
+
+    name: RefName
+    kind: RefKind
+    at: Version = Field(MAIN, description="Version that the new branch or tag names.")
+
+
+class Ref(Answer):
+    """A branch or a tag."""
+
+    name: str
+    kind: RefKind
+    commit: str | None = Field(description="Digest of the commit; null for a branch without commits.")
+    created_at: datetime
+    updated_at: datetime
+    rev: int

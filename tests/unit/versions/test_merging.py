@@ -1,0 +1,164 @@
+"""Differences and merges of entries: the laws of merging, and cases of which each has a right answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.support.tiers import examples
+
+from marey_schemas.datasets.differences import ChangeKind
+from marey_schemas.datasets.merges import Side
+from marey_versions.compared import ComparedEntry, compare_entries
+from marey_versions.merging import MergedEntries, merge_entries
+from marey_versions.records import DatasetEntry, key_of
+from marey_versions.tree.chunks import Value
+from marey_versions.tree.difference import Changed
+
+State = dict[str, Value]
+
+paths = st.sampled_from(["a", "b", "c", "d", "e"])
+digests = st.sampled_from(["1", "2", "3"])
+values = st.builds(
+    lambda motion, info, tags: {"parts": {"motion": motion} | ({"info": info} if info else {}), "tags": sorted(tags)},
+    digests,
+    st.none() | digests,
+    st.sets(st.sampled_from(["x", "y"])),
+)
+states = st.dictionaries(paths.map(lambda path: key_of(path, "clip")), values, max_size=5)
+
+
+def entry(motion: str, info: str | None = None, *tags: str) -> Value:
+    return {"parts": {"motion": motion} | ({"info": info} if info else {}), "tags": sorted(tags)}
+
+
+def state(**entries: Value) -> State:
+    return {key_of(path, "clip"): value for path, value in entries.items()}
+
+
+def compared(before: State, after: State) -> list[ComparedEntry]:
+    changes = [
+        Changed(key, before.get(key), after.get(key))
+        for key in sorted(before.keys() | after.keys())
+        if before.get(key) != after.get(key)
+    ]
+    return compare_entries(changes)
+
+
+def merge(
+    base: State, ours: State, theirs: State, resolutions: Mapping[str, Side] | None = None
+) -> tuple[State, MergedEntries]:
+    merged = merge_entries(compared(base, ours), compared(base, theirs), resolutions or {})
+    result: dict[str, Value | None] = {**ours, **merged.changes}
+    return {key: value for key, value in result.items() if value is not None}, merged
+
+
+def changes(before: State, after: State) -> list[tuple[ChangeKind, str | None, str | None]]:
+    return [
+        (one.change, one.before.path if one.before else None, one.after.path if one.after else None)
+        for one in compared(before, after)
+    ]
+
+
+@settings(max_examples=examples(300), deadline=None)
+@given(states, states)
+def test_a_difference_turns_one_state_into_the_other(before: State, after: State) -> None:
+    found = compared(before, after)
+    turned = {key: value for key, value in before.items() if key not in {one.before.key for one in found if one.before}}
+    assert not {one.after.key for one in found if one.after} & turned.keys()
+    turned |= {one.after.key: one.after.value for one in found if one.after}
+    assert turned == after
+
+
+@settings(max_examples=examples(300), deadline=None)
+@given(states, states)
+def test_merging_with_an_unchanged_side_gives_the_other_side(base: State, changed: State) -> None:
+    assert merge(base, base, changed) == (changed, merge(base, base, changed)[1])
+    assert merge(base, changed, base)[0] == changed
+    assert merge(base, changed, changed)[0] == changed
+    assert not merge(base, base, changed)[1].conflicts
+
+
+@settings(max_examples=examples(1000), deadline=None)
+@given(states, states, states)
+def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: State, theirs: State) -> None:
+    one, merged = merge(base, ours, theirs)
+    other, mirrored = merge(base, theirs, ours)
+    assert bool(merged.conflicts) == bool(mirrored.conflicts)
+    if not merged.conflicts:
+        assert one == other
+
+
+@settings(max_examples=examples(1000), deadline=None)
+@given(states, states, states)
+def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: State) -> None:
+    """A part that one side has changed is in the result, is named by a conflict, or was changed by both alike."""
+    result, merged = merge(base, ours, theirs)
+    in_conflict = [side for one in merged.conflicts for side in (one.base, one.ours, one.theirs) if side is not None]
+    kept = [parts for value in result.values() for parts in value["parts"].items()]
+    kept += [part for side in in_conflict for part in side.parts.items()]
+    for side, other in ((ours, theirs), (theirs, ours)):
+        removed = {one.before.key for one in compared(base, other) if one.before is not None and one.after is None}
+        for one in compared(base, side):
+            if one.after is None or (one.before is not None and one.before.key in removed):
+                continue
+            for part in one.parts:
+                if part in one.after.parts:
+                    assert (part, one.after.parts[part]) in kept
+
+
+def test_renames_are_recognised_by_content() -> None:
+    before = state(a=entry("1", "1"), b=entry("2"), c=entry("3"))
+    assert changes(before, state(z=entry("1", "1"), b=entry("2"), c=entry("3"))) == [("moved", "a", "z")]
+    assert changes(before, state(z=entry("1", "9"), b=entry("2"), c=entry("3"))) == [("moved", "a", "z")]
+    assert changes(before, state(a=entry("1", "1"), b=entry("3"), c=entry("2"))) == [
+        ("moved", "c", "b"),
+        ("moved", "b", "c"),
+    ]
+    assert changes(before, state(a=entry("9"), b=entry("2"), c=entry("3"), d=entry("1", "1"))) == [
+        ("added", None, "a"),
+        ("moved", "a", "d"),
+    ]
+
+
+def test_one_side_renames_and_the_other_changes_the_content() -> None:
+    base = state(a=entry("1", "1"))
+    result, merged = merge(base, state(z=entry("1", "1")), state(a=entry("2", "1", "x")))
+    assert (result, merged.conflicts) == (state(z=entry("2", "1", "x")), [])
+
+
+def test_different_parts_of_one_entry_are_combined_and_tags_one_by_one() -> None:
+    base = state(a=entry("1", "1", "old", "kept"))
+    result, merged = merge(base, state(a=entry("2", "1", "kept", "x")), state(a=entry("1", "2", "old", "kept", "y")))
+    assert (result, merged.conflicts) == (state(a=entry("2", "2", "kept", "x", "y")), [])
+
+
+def test_conflicts_name_the_parts_and_are_decided_part_by_part() -> None:
+    base, key = state(a=entry("1", "1")), key_of("a", "clip")
+    ours, theirs = state(a=entry("2", "1", "x")), state(a=entry("3", "2"))
+    _, merged = merge(base, ours, theirs)
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key, ("motion",))]
+    assert merge(base, ours, theirs, {key: Side.OURS})[0] == state(a=entry("2", "2", "x"))
+    assert merge(base, ours, theirs, {key: Side.THEIRS})[0] == state(a=entry("3", "2", "x"))
+    assert merge(base, ours, theirs, {key: Side.BASE})[0] == base
+
+
+def test_a_removed_entry_that_the_other_side_changed_is_a_conflict() -> None:
+    base, key = state(a=entry("1")), key_of("a", "clip")
+    _, merged = merge(base, {}, state(a=entry("2")))
+    assert [one.parts for one in merged.conflicts] == [("entry",)]
+    assert merge(base, {}, state(a=entry("2")), {key: Side.OURS})[0] == {}
+    assert merge(base, {}, state(a=entry("2")), {key: Side.THEIRS})[0] == state(a=entry("2"))
+
+
+def test_two_entries_that_come_to_one_place_are_a_conflict() -> None:
+    base = state(a=entry("1"), b=entry("2"))
+    ours, theirs = state(z=entry("1"), b=entry("2")), state(a=entry("1"), z=entry("2"))
+    _, merged = merge(base, ours, theirs)
+    assert [(one.key, one.parts) for one in merged.conflicts] == [(key_of("z", "clip"), ("path",))]
+
+
+def test_an_entry_is_what_its_key_and_value_say() -> None:
+    one = DatasetEntry("raw/a", "clip", {"motion": "1"}, ("x",))
+    assert (one.key, one.value) == ("raw/a\tclip", {"parts": {"motion": "1"}, "tags": ["x"]})

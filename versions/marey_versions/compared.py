@@ -1,0 +1,127 @@
+"""Differences of entries: what was added, removed, moved or changed, and in which parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from marey_schemas.datasets.differences import ChangeKind
+from marey_versions.records import DatasetEntry, entry_of
+from marey_versions.tree.difference import Changed
+
+
+@dataclass(frozen=True)
+class ComparedEntry:
+    """Entry that differs in two versions; `before` or `after` is None where the version does not have it."""
+
+    before: DatasetEntry | None
+    after: DatasetEntry | None
+
+    @property
+    def present(self) -> DatasetEntry:
+        """The entry after the change, or, if it was removed, before it."""
+        present = self.after or self.before
+        assert present is not None
+        return present
+
+    @property
+    def change(self) -> ChangeKind:
+        """The kind of change. A moved entry may have been changed, too."""
+        if self.before is None:
+            return "added"
+        if self.after is None:
+            return "removed"
+        return "moved" if self.before.path != self.after.path else "changed"
+
+    @cached_property
+    def parts(self) -> Mapping[str, ChangeKind]:
+        """The kind of change of each part that differs."""
+        before, after = (side.parts if side is not None else {} for side in (self.before, self.after))
+        return {
+            part: _of_sides(part in before, part in after)
+            for part in sorted(before.keys() | after.keys())
+            if before.get(part) != after.get(part)
+        }
+
+    @staticmethod
+    def tags_of(side: DatasetEntry | None) -> set[str]:
+        """Return the tags of one side, none where the version does not have the entry."""
+        return set(side.tags) if side is not None else set()
+
+
+def _of_sides(before: bool, after: bool) -> ChangeKind:
+    if before and after:
+        return "changed"
+    return "removed" if before else "added"
+
+
+def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
+    """Return the differing entries of two versions by path, with removed and added entries paired as moved.
+
+    A removed and an added entry of one kind are the same, moved, if all their parts are equal, or else if one part is.
+    Where several would fit, they are paired in the order of their paths. An entry of which all parts changed counts as
+    removed and added if either has a partner with equal parts, as when two entries exchanged their names.
+    """
+    compared = [
+        ComparedEntry(*(None if value is None else entry_of(one.key, value) for value in (one.before, one.after)))
+        for one in changes
+    ]
+    compared = _rejoined(_paired(list(_split(compared)), _whole))
+    for part in _part_names(compared):
+        compared = _paired(compared, _of_part(part))
+    return sorted(compared, key=lambda one: one.present.key)
+
+
+def _split(compared: Iterable[ComparedEntry]) -> Iterator[ComparedEntry]:
+    """Return entries of which all parts changed as removed and added, and the other entries as they are."""
+    for one in compared:
+        if one.before and one.after and one.parts.keys() == one.before.parts.keys() | one.after.parts.keys():
+            yield ComparedEntry(one.before, None)
+            yield ComparedEntry(None, one.after)
+        else:
+            yield one
+
+
+def _rejoined(compared: Sequence[ComparedEntry]) -> list[ComparedEntry]:
+    """Join a removed and an added entry of the same path and kind."""
+    added = {one.after.key: one.after for one in compared if one.before is None and one.after is not None}
+    removed = {one.before.key for one in compared if one.after is None and one.before is not None}
+    joined: list[ComparedEntry] = []
+    for one in compared:
+        if one.after is None and one.before is not None:
+            joined.append(ComparedEntry(one.before, added.get(one.before.key)))
+        elif one.before is not None or one.present.key not in removed:
+            joined.append(one)
+    return joined
+
+
+def _part_names(compared: Iterable[ComparedEntry]) -> list[str]:
+    return sorted({part for one in compared for part in one.present.parts}, key=lambda part: (part == "info", part))
+
+
+def _whole(entry: DatasetEntry) -> Hashable:
+    return entry.content
+
+
+def _of_part(part: str) -> Callable[[DatasetEntry], Hashable]:
+    return lambda entry: entry.parts.get(part)
+
+
+def _paired(compared: list[ComparedEntry], alike: Callable[[DatasetEntry], Hashable]) -> list[ComparedEntry]:
+    """Pair each removed entry with an added one of the same kind for which `alike` returns the same value."""
+    removed: dict[tuple[str, Hashable], list[ComparedEntry]] = {}
+    for one in compared:
+        if one.after is None and one.before is not None and alike(one.before) is not None:
+            removed.setdefault((one.before.kind, alike(one.before)), []).append(one)
+    gone: set[int] = set()
+    paired: list[ComparedEntry] = []
+    for one in compared:
+        fits = removed.get((one.after.kind, alike(one.after))) if one.before is None and one.after else None
+        if fits:
+            partner = fits.pop(0)
+            gone.add(id(partner))
+            paired.append(ComparedEntry(partner.before, one.after))
+        else:
+            paired.append(one)
+    return [one for one in paired if id(one) not in gone]

@@ -1,0 +1,182 @@
+"""Three-way merges: what two sides changed since a common version, entry by entry and part by part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from marey_schemas.datasets.merges import Side
+from marey_versions.compared import ComparedEntry
+from marey_versions.records import DatasetEntry
+from marey_versions.tree.chunks import Value
+
+
+class MergeConflict(NamedTuple):
+    """Entry that both sides have changed in ways that exclude each other.
+
+    A side is None where it does not have the entry; `base` is None if both sides added the entry.
+    """
+
+    base: DatasetEntry | None
+    ours: DatasetEntry | None
+    theirs: DatasetEntry | None
+    parts: tuple[str, ...]
+    """Parts that both sides have changed; `path` if both have moved the entry, `entry` if one has removed it."""
+
+    @property
+    def key(self) -> str:
+        """The key of the entry, by which a resolution names it: that of our side, or else of the base or theirs."""
+        present = self.ours or self.base or self.theirs
+        assert present is not None
+        return present.key
+
+
+@dataclass
+class MergedEntries:
+    """Result of a merge: changes of our tree, and conflicts without a resolution."""
+
+    changes: dict[str, Value | None] = field(default_factory=dict)
+    conflicts: list[MergeConflict] = field(default_factory=list)
+    decided: set[str] = field(default_factory=set)
+    """Keys of the resolutions that decided a conflict."""
+
+
+def merge_entries(
+    ours: Iterable[ComparedEntry], theirs: Iterable[ComparedEntry], resolutions: Mapping[str, Side]
+) -> MergedEntries:
+    """Merge the changes that two sides have made since their base.
+
+    Parameters
+    ----------
+    ours, theirs : the entries that differ between the base and each side
+    resolutions : the side to take for each conflict, by the key of the conflict
+
+    Returns
+    -------
+    MergedEntries
+        changes that turn our tree into the merged one, and the conflicts without a resolution
+    """
+    mine = list(ours)
+    of_base = {one.before.key: one.after for one in mine if one.before is not None}
+    added = {one.after.key: one.after for one in mine if one.before is None and one.after is not None}
+    merged = MergedEntries()
+    decided: list[_Decided] = []
+    for one in theirs:
+        at = one.present.key if one.before is None else one.before.key
+        our_entry = added.get(at) if one.before is None else of_base.get(at, one.before)
+        found = _decide(one.before, our_entry, one.after, resolutions, merged.decided)
+        if isinstance(found, MergeConflict):
+            merged.conflicts.append(found)
+        else:
+            decided.append(found)
+    _apply(decided, {one.after.key: one.after for one in mine if one.after is not None}, resolutions, merged)
+    return merged
+
+
+class _Decided(NamedTuple):
+    """Outcome for one entry: the entry of our side, and what takes its place."""
+
+    base: DatasetEntry | None
+    ours: DatasetEntry | None
+    merged: DatasetEntry | None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the merged entry comes to a place where our side does not have it."""
+        return self.merged is not None and (self.ours is None or self.ours.key != self.merged.key)
+
+
+def _decide(
+    base: DatasetEntry | None,
+    ours: DatasetEntry | None,
+    theirs: DatasetEntry | None,
+    resolutions: Mapping[str, Side],
+    used: set[str],
+) -> _Decided | MergeConflict:
+    if theirs in (ours, base):
+        return _Decided(base, ours, ours)
+    if ours == base:
+        return _Decided(base, ours, theirs)
+    clashes = _clashes(base, ours, theirs)
+    if not clashes:
+        return _Decided(base, ours, _combined(base, ours, theirs))
+    conflict = MergeConflict(base, ours, theirs, clashes)
+    choice = resolutions.get(conflict.key)
+    if choice is None:
+        return conflict
+    used.add(conflict.key)
+    if choice is Side.BASE:
+        return _Decided(base, ours, base)
+    whole = "entry" in clashes or base is None
+    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(base, ours, theirs, choice)
+    return _Decided(base, ours, chosen)
+
+
+def _apply(
+    decided: Sequence[_Decided],
+    occupied: dict[str, DatasetEntry],
+    resolutions: Mapping[str, Side],
+    merged: MergedEntries,
+) -> None:
+    """Add the changes of our tree; entries that come to an occupied place are conflicts.
+
+    `occupied` are the entries that our side has changed, by the key of their present place.
+    """
+    for one in decided:
+        if one.ours is not None and (one.moves or one.merged is None):
+            merged.changes[one.ours.key] = None
+            occupied.pop(one.ours.key, None)
+    for one in decided:
+        if one.merged is None or one.merged == one.ours:
+            continue
+        key = one.merged.key
+        if one.moves and key in occupied:
+            choice = resolutions.get(key)
+            if choice is None:
+                merged.conflicts.append(MergeConflict(None, occupied[key], one.merged, ("path",)))
+            else:
+                merged.decided.add(key)
+            if choice is not Side.THEIRS:
+                continue
+        if one.moves:
+            occupied[key] = one.merged
+        merged.changes[key] = one.merged.value
+
+
+def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
+    """Return the parts that both sides have changed in different ways."""
+    if ours is None or theirs is None:
+        return ("entry",)
+    of_base: Mapping[str, Any] = {} if base is None else base.parts
+    names = sorted(of_base.keys() | ours.parts.keys() | theirs.parts.keys())
+    parts = [name for name in names if _excludes(of_base.get(name), ours.parts.get(name), theirs.parts.get(name))]
+    moved = base is not None and _excludes(base.path, ours.path, theirs.path)
+    return (*(("path",) if moved else ()), *parts)
+
+
+def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
+    return ours not in (base, theirs) and theirs != base
+
+
+def _combined(
+    base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None, choice: Side = Side.OURS
+) -> DatasetEntry | None:
+    """Return the entry with the changes of both sides; where they exclude each other, with those of `choice`."""
+    if ours is None or theirs is None:
+        return None
+    of_base: Mapping[str, str] = {} if base is None else base.parts
+    preferred, other = (ours, theirs) if choice is Side.OURS else (theirs, ours)
+    parts = {
+        name: digest
+        for name in sorted(ours.parts.keys() | theirs.parts.keys())
+        if (digest := _newer(of_base.get(name), preferred.parts.get(name), other.parts.get(name))) is not None
+    }
+    path = preferred.path if base is None else _newer(base.path, preferred.path, other.path)
+    old = set() if base is None else set(base.tags)
+    tags = (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
+    return DatasetEntry(path or preferred.path, ours.kind, parts, tuple(sorted(tags)))
+
+
+def _newer(base: str | None, preferred: str | None, other: str | None) -> str | None:
+    return preferred if preferred != base else other

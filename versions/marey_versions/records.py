@@ -1,0 +1,158 @@
+"""Entries and commits of datasets, and digests of content that do not depend on the ids of a server.
+
+Documents refer to other items by id and revision, which differ between servers. The content digest of a document is
+that of the document in which each reference names the content digest of the revision that it refers to. So two servers
+with the same content have the same digests, and the same trees.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from marey_schemas.encoding.canonical import canonical_json
+from marey_versions.tree.chunks import Value, digest_of
+
+COMMIT_SCHEMA = "marey/commit@1"
+
+_SEPARATOR = "\t"
+"""Character between the path and the kind in a key; paths cannot contain it, and it sorts before all that they can."""
+
+
+class RevisionKey(NamedTuple):
+    """Revision of an item that a document refers to."""
+
+    item: str
+    revision: int
+
+
+class DatasetEntry(NamedTuple):
+    """Content of one path and kind in a version of a dataset."""
+
+    path: str
+    kind: str
+    parts: Mapping[str, str]
+    """Content digest of each part."""
+    tags: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """The key of the entry in the tree."""
+        return key_of(self.path, self.kind)
+
+    @property
+    def value(self) -> Value:
+        """The value of the entry in the tree."""
+        return {"parts": dict(self.parts), "tags": sorted(self.tags)}
+
+    @property
+    def content(self) -> str:
+        """The content digest of the revision, which does not depend on path and tags."""
+        return revision_content(self.kind, self.parts)
+
+
+def key_of(path: str, kind: str) -> str:
+    """Return the key of an entry. Keys sort by path, then by kind."""
+    return f"{path}{_SEPARATOR}{kind}"
+
+
+def entry_of(key: str, value: Value) -> DatasetEntry:
+    """Return the entry with a key and a value of the tree."""
+    return DatasetEntry(*path_and_kind(key), value["parts"], tuple(value["tags"]))
+
+
+def path_and_kind(key: str) -> tuple[str, str]:
+    """Return the path and the kind of the entry with a key."""
+    path, _, kind = key.partition(_SEPARATOR)
+    return path, kind
+
+
+def revision_content(kind: str, parts: Mapping[str, str]) -> str:
+    """Return the content digest of a revision from its kind and the content digests of its parts."""
+    return digest_of(canonical_json({"kind": kind, "parts": dict(parts)}))
+
+
+def references_in(body: Any) -> Iterator[RevisionKey]:
+    """Return the revisions that a stored document refers to: its objects with the members `item` and `revision`."""
+    for found in _objects(body):
+        if (reference := _reference(found)) is not None:
+            yield reference
+
+
+def document_content(body: Any, content_of: Callable[[RevisionKey], str | None]) -> str:
+    """Return the content digest of a stored document with references.
+
+    `content_of` gives the content digest of a revision; a reference for which it gives None stays as it is.
+    """
+    portable = _replaced(body, content_of)
+    return digest_of(_canonical(portable))
+
+
+def _replaced(value: Any, content_of: Callable[[RevisionKey], str | None]) -> Any:
+    if isinstance(value, dict):
+        reference = _reference(value)
+        content = content_of(reference) if reference is not None else None
+        if content is not None:
+            rest = {key: member for key, member in value.items() if key not in ("item", "revision")}
+            return {**_replaced(rest, content_of), "content": content}
+        return {key: _replaced(member, content_of) for key, member in value.items()}
+    return [_replaced(member, content_of) for member in value] if isinstance(value, list) else value
+
+
+def _objects(value: Any) -> Iterator[Mapping[str, Any]]:
+    waiting = [value]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, dict):
+            yield one
+        members: Iterable[Any] = one.values() if isinstance(one, dict) else one
+        waiting.extend(member for member in members if isinstance(member, dict | list))
+
+
+def _reference(found: Mapping[str, Any]) -> RevisionKey | None:
+    item, revision = found.get("item"), found.get("revision")
+    if isinstance(item, str) and isinstance(revision, int) and not isinstance(revision, bool):
+        return RevisionKey(item, revision)
+    return None
+
+
+def _canonical(body: Any) -> bytes:
+    """Return the canonical JSON of a tree whose numbers are canonical already, as those of stored documents are."""
+    return json.dumps(body, sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+
+
+# -- commits ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CommitRecord:
+    """One version of a dataset, with the versions that it was made from."""
+
+    tree: str
+    """Digest of the root of the tree of entries."""
+    parents: tuple[str, ...]
+    """Digests of the commits that it follows: none for the first one, two for a merge."""
+    author: str
+    """Name of the user on the server where the commit was made."""
+    message: str
+    at: str
+    """Time of the commit in UTC, such as `2026-11-23T10:00:00.000000Z`."""
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The commit as a document."""
+        return {
+            "schema": COMMIT_SCHEMA,
+            "tree": self.tree,
+            "parents": list(self.parents),
+            "author": self.author,
+            "message": self.message,
+            "at": self.at,
+        }
+
+    @property
+    def digest(self) -> str:
+        """The digest of the commit, by which every server names it."""
+        return digest_of(canonical_json(self.document))

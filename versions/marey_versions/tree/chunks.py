@@ -1,0 +1,120 @@
+"""Chunks of a tree, their canonical bytes, and where chunks are stored."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import orjson
+
+Value = dict[str, Any]
+Entry = tuple[str, Value]
+
+SCHEMA = "marey/tree-chunk@1"
+MOST_CHUNK_BYTES = 8 * 2**20
+"""Greatest size of a chunk in bytes; a chunk usually has about 4,000."""
+
+
+class DamagedChunk(Exception):
+    """A chunk that is missing, or whose bytes are not those of a chunk with its digest."""
+
+
+class Child(NamedTuple):
+    """Reference from a chunk to a chunk below."""
+
+    last_key: str
+    digest: str
+    entries: int
+    """Number of entries in the leaves below the child."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """Chunk that contains entries, sorted by key."""
+
+    entries: tuple[Entry, ...]
+
+    @property
+    def level(self) -> int:
+        """Number of levels below, which is 0."""
+        return 0
+
+    @property
+    def count(self) -> int:
+        """Number of entries."""
+        return len(self.entries)
+
+    @property
+    def last_key(self) -> str:
+        """Greatest key; the empty text for the leaf of an empty tree."""
+        return self.entries[-1][0] if self.entries else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """Chunk that refers to chunks of the level below, sorted by key."""
+
+    level: int
+    children: tuple[Child, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of entries in all leaves below."""
+        return sum(child.entries for child in self.children)
+
+    @property
+    def last_key(self) -> str:
+        """Greatest key of the leaves below."""
+        return self.children[-1].last_key
+
+
+Chunk = Leaf | Branch
+
+EMPTY = Leaf(())
+
+
+class ChunkStore(Protocol):
+    """Store of the bytes of chunks by digest."""
+
+    def load(self, digests: Iterable[str]) -> Mapping[str, bytes]:
+        """Return the bytes of chunks; chunks that the store does not have are left out."""
+
+    def save(self, chunks: Mapping[str, bytes]) -> None:
+        """Store the bytes of chunks by digest. Storing a chunk again has no effect."""
+
+
+def encode(chunk: Chunk) -> tuple[str, bytes]:
+    """Return the digest and the bytes of a chunk: canonical JSON with sorted members and without spaces."""
+    content: dict[str, Any] = {"schema": SCHEMA, "level": chunk.level}
+    if isinstance(chunk, Leaf):
+        content["entries"] = chunk.entries
+    else:
+        content["children"] = [tuple(child) for child in chunk.children]
+    data = orjson.dumps(content, option=orjson.OPT_SORT_KEYS)
+    return digest_of(data), data
+
+
+def digest_of(data: bytes) -> str:
+    """Return the digest of bytes."""
+    return f"sha256:{hashlib.sha256(data).hexdigest()}"
+
+
+def decode(digest: str, data: bytes) -> Chunk:
+    """Return the chunk with these bytes. Raises `DamagedChunk` if the bytes are not those of a chunk with `digest`."""
+    if digest_of(data) != digest:
+        raise DamagedChunk(f"the bytes of the chunk {digest} have another digest")
+    return decode_trusted(digest, data)
+
+
+def decode_trusted(digest: str, data: bytes) -> Chunk:
+    """Return the chunk with these bytes, which a store holds that has checked the digest when it stored them."""
+    try:
+        content = orjson.loads(data)
+        level = content["level"]
+        if level == 0:
+            return Leaf(tuple((key, value) for key, value in content["entries"]))
+        return Branch(level, tuple(Child(*child) for child in content["children"]))
+    except (orjson.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise DamagedChunk(f"the chunk {digest} cannot be read: {error}") from error

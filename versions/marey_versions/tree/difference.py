@@ -1,0 +1,107 @@
+"""Differences of trees. Chunks that both trees contain are skipped, so the work depends on the changes alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import NamedTuple
+
+from marey_versions.tree.chunks import Branch, Child, ChunkStore, Leaf, Value
+from marey_versions.tree.reading import ChunkReader
+
+COMPARED_TOGETHER = 256
+"""Number of chunks of one level and one tree that are compared at once; it limits the memory."""
+
+
+class Changed(NamedTuple):
+    """Key whose values in two trees differ; a value is None where the tree does not have the key."""
+
+    key: str
+    before: Value | None
+    after: Value | None
+
+
+def difference(store: ChunkStore, before: str, after: str) -> Iterator[Changed]:
+    """Return the keys whose values differ in the trees with the given roots, sorted."""
+    reader = ChunkReader(store)
+    pair = [reader.one(before), reader.one(after)]
+    level = max(chunk.level for chunk in pair)
+    sides = [[Child(chunk.last_key, root, chunk.count)] for chunk, root in zip(pair, (before, after), strict=True)]
+    levels = [chunk.level for chunk in pair]
+    while max(levels) != min(levels):
+        higher = levels.index(max(levels))
+        sides[higher] = _expanded(reader, sides[higher], levels[higher])
+        levels[higher] -= 1
+    level = levels[0]
+    return _compare(reader, level, sides[0], sides[1], KeyRange(None, None))
+
+
+class KeyRange(NamedTuple):
+    """Range of keys: greater than `after`, and at most `last`; None stands for no limit."""
+
+    after: str | None
+    last: str | None
+
+    def contains(self, key: str) -> bool:
+        return (self.after is None or key > self.after) and (self.last is None or key <= self.last)
+
+    def overlaps(self, before: str | None, child: Child) -> bool:
+        """Return whether a child, whose keys are greater than `before`, can have keys in the range."""
+        starts_in_time = self.last is None or before is None or before < self.last
+        return starts_in_time and (self.after is None or child.last_key > self.after)
+
+
+def _compare(
+    reader: ChunkReader, level: int, before: Sequence[Child], after: Sequence[Child], within: KeyRange
+) -> Iterator[Changed]:
+    """Return the differences, within a range of keys, of two rows of chunks of one level."""
+    shared = {child.digest for child in before} & {child.digest for child in after}
+    before, after = ([child for child in side if child.digest not in shared] for side in (before, after))
+    if level == 0:
+        yield from _compare_leaves(reader, before, after, within)
+        return
+    for part in _parts(before, after, within):
+        old, new = (_inside(_expanded(reader, _inside(side, part), level), part) for side in (before, after))
+        yield from _compare(reader, level - 1, old, new, part)
+
+
+def _parts(before: Sequence[Child], after: Sequence[Child], within: KeyRange) -> Iterator[KeyRange]:
+    """Split a range of keys so that each part concerns few chunks of the longer row."""
+    longer = max(before, after, key=len)
+    start = within.after
+    for place in range(COMPARED_TOGETHER - 1, len(longer) - 1, COMPARED_TOGETHER):
+        yield KeyRange(start, longer[place].last_key)
+        start = longer[place].last_key
+    yield KeyRange(start, within.last)
+
+
+def _inside(children: Sequence[Child], within: KeyRange) -> list[Child]:
+    found, before = [], None
+    for child in children:
+        if within.overlaps(before, child):
+            found.append(child)
+        before = child.last_key
+    return found
+
+
+def _expanded(reader: ChunkReader, children: Sequence[Child], level: int) -> list[Child]:
+    """Return the children of the chunks of `level` that `children` refer to."""
+    chunks = reader.below(children, level)
+    return list(chain.from_iterable(chunk.children for chunk in chunks if isinstance(chunk, Branch)))
+
+
+def _compare_leaves(
+    reader: ChunkReader, before: Sequence[Child], after: Sequence[Child], within: KeyRange
+) -> Iterator[Changed]:
+    for part in _parts(before, after, within):
+        old, new = (_entries(reader, _inside(side, part), part) for side in (before, after))
+        for key in sorted(old.keys() | new.keys()):
+            if old.get(key) != new.get(key):
+                yield Changed(key, old.get(key), new.get(key))
+
+
+def _entries(reader: ChunkReader, children: Sequence[Child], within: KeyRange) -> dict[str, Value]:
+    leaves = reader.below(children, 0)
+    return {
+        key: value for leaf in leaves if isinstance(leaf, Leaf) for key, value in leaf.entries if within.contains(key)
+    }

@@ -1,0 +1,167 @@
+"""Reading of trees: single entries, entries in order, folders, and numbers of entries."""
+
+from __future__ import annotations
+
+import sys
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+
+from marey_versions.tree.chunks import (
+    Branch,
+    Child,
+    Chunk,
+    ChunkStore,
+    DamagedChunk,
+    Entry,
+    Leaf,
+    Value,
+    decode,
+)
+
+LOADED_TOGETHER = 256
+"""Greatest number of leaves that an iteration loads with one request to the store."""
+
+
+class ChunkReader:
+    """Reads chunks from a store, several at a time, and remembers those that were read."""
+
+    def __init__(self, store: ChunkStore) -> None:
+        self._store = store
+        self._known: dict[str, Chunk] = {}
+
+    def one(self, digest: str) -> Chunk:
+        """Return a chunk. Raises `DamagedChunk`."""
+        return self.several([digest])[0]
+
+    def several(self, digests: Sequence[str]) -> list[Chunk]:
+        """Return chunks in the order of their digests. Raises `DamagedChunk` for one that is missing or damaged."""
+        missing = {digest for digest in digests if digest not in self._known}
+        if missing:
+            loaded = self._store.load(missing)
+            for digest in missing:
+                if digest not in loaded:
+                    raise DamagedChunk(f"the chunk {digest} is missing")
+                self._known[digest] = decode(digest, loaded[digest])
+        return [self._known[digest] for digest in digests]
+
+    def below(self, children: Sequence[Child], level: int) -> list[Chunk]:
+        """Return the chunks of `level` that `children` refer to.
+
+        Raises `DamagedChunk` if one differs from what its parent says about it.
+        """
+        chunks = self.several([child.digest for child in children])
+        for child, chunk in zip(children, chunks, strict=True):
+            if (chunk.level, chunk.last_key, chunk.count) != (level, child.last_key, child.entries):
+                raise DamagedChunk(f"the chunk {child.digest} is not what the chunk above says")
+        return chunks
+
+    def know(self, digest: str, chunk: Chunk) -> None:
+        """Remember a chunk that is not in the store yet."""
+        self._known[digest] = chunk
+
+
+class Tree:
+    """Tree with a given root, to be read."""
+
+    def __init__(self, store: ChunkStore, root: str) -> None:
+        self.root = root
+        self._reader = ChunkReader(store)
+
+    def __len__(self) -> int:
+        """Return the number of entries."""
+        return self._reader.one(self.root).count
+
+    def get(self, key: str) -> Value | None:
+        """Return the value of a key, or None."""
+        return self.get_several([key]).get(key)
+
+    def get_several(self, keys: Iterable[str]) -> dict[str, Value]:
+        """Return the values of the keys that the tree has."""
+        wanted = sorted(set(keys))
+        found: dict[str, Value] = {}
+        for leaf, inside in leaves_with(self._reader, self.root, wanted):
+            of_leaf = dict(leaf.entries)
+            found.update((key, of_leaf[key]) for key in inside if key in of_leaf)
+        return found
+
+    def entries(self, *, after: str = "", prefix: str = "") -> Iterator[Entry]:
+        """Return the entries whose keys start with `prefix` and are greater than `after`, sorted by key."""
+        start = max(after, prefix)
+        for key, value in self._from(self._reader.one(self.root), start):
+            if prefix and not key.startswith(prefix):
+                return
+            if not after or key > after:
+                yield key, value
+
+    def _from(self, chunk: Chunk, start: str) -> Iterator[Entry]:
+        """Return the entries below a chunk whose keys are at least `start`."""
+        if isinstance(chunk, Leaf):
+            yield from chunk.entries[bisect_left(chunk.entries, start, key=_key_of) :]
+            return
+        first = bisect_left(chunk.children, start, key=_last_key_of)
+        size = 2  # loads little where the caller may need little
+        while first < len(chunk.children):
+            for below in self._reader.below(chunk.children[first : first + size], chunk.level - 1):
+                yield from self._from(below, start)
+            first += size
+            size = min(2 * size, LOADED_TOGETHER)
+
+    def count(self, prefix: str = "") -> int:
+        """Return the number of entries whose keys start with `prefix`."""
+        until = _after_all_with(prefix)
+        return (len(self) if until is None else self._rank(until)) - (self._rank(prefix) if prefix else 0)
+
+    def _rank(self, key: str) -> int:
+        """Return the number of entries whose keys are less than `key`."""
+        chunk, rank = self._reader.one(self.root), 0
+        while isinstance(chunk, Branch):
+            place = bisect_left(chunk.children, key, key=_last_key_of)
+            rank += sum(child.entries for child in chunk.children[:place])
+            if place == len(chunk.children):
+                return rank
+            (chunk,) = self._reader.below(chunk.children[place : place + 1], chunk.level - 1)
+        return rank + bisect_left(chunk.entries, key, key=_key_of)
+
+
+def leaves_with(reader: ChunkReader, root: str, keys: Sequence[str]) -> list[tuple[Leaf, Sequence[str]]]:
+    """Return the leaves in which keys, given sorted, are or would be, each with its keys.
+
+    Each level is loaded with one request to the store.
+    """
+    parts: list[tuple[Chunk, Sequence[str]]] = [(reader.one(root), keys)]
+    level = parts[0][0].level
+    while level > 0:
+        wanted = [one for chunk, inside in parts if isinstance(chunk, Branch) for one in _spread(chunk, inside)]
+        level -= 1
+        chunks = reader.below([child for child, _ in wanted], level)
+        parts = [(chunk, inside) for chunk, (_, inside) in zip(chunks, wanted, strict=True)]
+    return [(chunk, inside) for chunk, inside in parts if isinstance(chunk, Leaf)]
+
+
+def _spread(chunk: Branch, keys: Sequence[str]) -> Iterator[tuple[Child, Sequence[str]]]:
+    """Return the children in which keys, given sorted, are or would be; the last child also gets all greater keys."""
+    start = 0
+    while start < len(keys):
+        place = min(bisect_left(chunk.children, keys[start], key=_last_key_of), len(chunk.children) - 1)
+        child = chunk.children[place]
+        is_last = place == len(chunk.children) - 1
+        until = len(keys) if is_last else bisect_right(keys, child.last_key, lo=start)
+        yield child, keys[start:until]
+        start = until
+
+
+def _after_all_with(prefix: str) -> str | None:
+    """Return the least text that is greater than all texts with the prefix; None if there is none."""
+    for place in range(len(prefix) - 1, -1, -1):
+        following = ord(prefix[place]) + 1
+        if following <= sys.maxunicode:
+            return prefix[:place] + chr(0xE000 if following == 0xD800 else following)  # skips the surrogates
+    return None
+
+
+def _key_of(entry: Entry) -> str:
+    return entry[0]
+
+
+def _last_key_of(child: Child) -> str:
+    return child.last_key
