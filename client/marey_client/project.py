@@ -8,6 +8,7 @@ from typing import Any
 
 from marey_client.access import Members, change_quotas
 from marey_client.handles.coverage_streams import CoverageStreams
+from marey_client.handles.datasets import Datasets
 from marey_client.handles.edits import Commands
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.handles.models import ModelHandle
@@ -79,6 +80,11 @@ class ProjectHandle(ProjectItems):
     def coverage_streams(self) -> CoverageStreams:
         """The coverage streams of the project: performances that are measured during their recording."""
         return CoverageStreams(self.transport, self.name)
+
+    @cached_property
+    def datasets(self) -> Datasets:
+        """The datasets of the project: versions of its items."""
+        return Datasets(self.transport, self.name)
 
     @cached_property
     def members(self) -> Members:

@@ -47,6 +47,11 @@ BODIES = {
     "CollectionCreate": {"path": CANARY},
     "CollectionChange": {"path": "elsewhere"},
     "ItemCreate": {"name": CANARY, "collection": CANARY, "parts": {"hierarchy": HIERARCHY}},
+    "DatasetCreate": {"name": "another"},
+    "RefCreate": {"name": "another", "kind": "tag"},
+    "CommitCreate": {"message": "m", "changes": [{"change": "remove", "path": CANARY, "kind": "graph"}]},
+    "MergeRequest": {"version": "spare"},
+    "CheckoutRequest": {"version": "spare", "discard": True},
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
@@ -193,4 +198,11 @@ def _furnish(owner: Any) -> dict[str, str]:
     layer = {"schema": "marey/annotation@1", "clip": {"item": made.json()["id"], "revision": 1}, "layer": CANARY}
     annotation = owner.post("/projects/lab/annotations", json={"name": CANARY, "parts": {"annotation": layer}})
     assert annotation.status_code == 201, annotation.text
-    return {"collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"]}
+    datasets = "/projects/lab/datasets"
+    assert owner.post(datasets, json={"name": CANARY, "collection": CANARY}).status_code == 201
+    assert owner.post(f"{datasets}/{CANARY}/commits", json={"message": CANARY}).status_code == 201
+    assert owner.post(f"{datasets}/{CANARY}/refs", json={"name": "spare", "kind": "tag"}).status_code == 201
+    return {
+        "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
+        "ref": "spare", "version": "spare",
+    }  # fmt: skip

@@ -23,8 +23,8 @@ from marey_client.cli import (
     projects,
     searches,
     skeletons,
-    tokens,
 )
+from marey_client.cli.datasets import versions
 from marey_client.cli.difference import diff
 from marey_client.cli.invocation import Invocation
 
@@ -68,11 +68,11 @@ def marey(
 for register in (
     processes,
     accounts,
-    tokens,
     projects,
     files,
     organise,
     diff,
+    versions,
     skeletons,
     clip_jobs,
     annotating,

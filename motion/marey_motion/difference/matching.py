@@ -1,8 +1,8 @@
-"""Matching of the frames of two clips: the monotone sequence of runs of corresponding frames that has the least cost.
+"""Matching of frames: the monotone sequence of runs with the least cost in which two clips correspond.
 
-Within a run, the numbers of corresponding frames differ by a constant, the lag. Between runs, frames are removed or
-inserted. The runs are the cheapest path through the candidates for lags, so frames that follow an insertion remain
-matched, and still or cyclic motion has no more runs than needed.
+Within a run, each frame after corresponds to the frame before that is a fixed number of frames (the lag) away. Between
+runs, frames are removed or inserted. The runs are the cheapest path through the candidates for lags, so an insertion
+leaves the frames after it matched, and still or cyclic motion has no more runs than needed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ NEW_RUN = 1.0
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further candidates are searched."""
 MOST_ROUNDS = 64
-"""Most changes of the lag that are considered."""
-SHORTEST_REPLACEMENT = 10
+"""Maximum number of changes of the lag."""
+SHORTEST_REPLACEMENT = 3
 """Minimum number of consecutive, entirely different frames that are reported as removed and inserted."""
 
 
@@ -119,7 +119,7 @@ def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
-    """Return, before each frame of a diagonal and at its end, the least cost of entering it from another diagonal."""
+    """Return the least cost of entering a diagonal from another one before each of its frames, and at its end."""
     one = diagonals[place]
     least = np.full(len(one.costs), np.inf)
     for other, values in zip(diagonals, reached, strict=True):

@@ -58,8 +58,7 @@ class PlantedMotion:
     ----------
     motion : the whole motion
     contacts : frames in which each foot touches the ground
-    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 if there are no
-        contacts
+    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 without contacts
     lowered_m : largest distance by which the root is lowered
     """
 

@@ -213,7 +213,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches, or None, and count the switches without response."""
+    """Compute the mean response time to speed switches (None without any) and count the switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -359,7 +359,7 @@ def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
 
     Returns
     -------
-    float or None    metres; None if no two trials differ only in the direction of turning
+    float or None    metres; None without pairs
     """
     offsets = {
         (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset

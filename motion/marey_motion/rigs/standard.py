@@ -52,7 +52,7 @@ def mirrored(name: str) -> str:
 
     Returns
     -------
-    str    standard name; joints of the centre keep their names
+    str    standard name; joints of the centre keep theirs
     """
     for side, other in (SIDES, SIDES[::-1]):
         if name.startswith(f"{side}_"):

@@ -25,17 +25,23 @@ from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,
     collection,
+    commit_parent,
+    dataset,
+    dataset_commit,
     document,
     document_blob,
     item,
     project,
     revision,
     revision_part,
+    tree_chunk,
     upload,
     upload_chunk,
     user,
 )
 from marey_server.store.transaction import Transaction
+from marey_versions.records import CommitRecord
+from marey_versions.tree.chunks import Branch, DamagedChunk, decode
 
 PAGE = 100
 MISCOUNTED = "counter-wrong"
@@ -65,6 +71,8 @@ def check_store(
         ("items", item, _check_item),
         ("collections", collection, _check_collection),
         ("uploads", upload, _check_upload),
+        ("tree chunks", tree_chunk, _check_chunk),
+        ("datasets", dataset, _check_dataset),
         ("projects", project, partial(_check_holding, owner=item.c.project_id)),
         ("users", user, partial(_check_holding, owner=item.c.creator_id)),
     )
@@ -235,6 +243,32 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         if size == row.offset
         else [StoreDefect("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
     )
+
+
+def _check_chunk(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Check a chunk of a tree of entries, and that the chunks below it exist."""
+    try:
+        chunk = decode(row.digest, bytes(row.data))
+    except DamagedChunk as error:
+        return [StoreDefect("chunk-corrupt", row.digest, str(error))]
+    below = {child.digest for child in chunk.children} if isinstance(chunk, Branch) else set()
+    there = set(tx.execute(select(tree_chunk.c.digest).where(tree_chunk.c.digest.in_(sorted(below)))).scalars())
+    return [StoreDefect("chunk-lost", row.digest, f"the chunk {one} below it is missing") for one in below - there]
+
+
+def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Check that the content of each commit has the commit's digest."""
+    above = select(commit_parent).where(commit_parent.c.dataset_id == row.id).order_by(commit_parent.c.position)
+    parents: dict[str, list[str]] = {}
+    for found in tx.execute(above):
+        parents.setdefault(found.digest, []).append(found.parent)
+    commits = select(dataset_commit).where(dataset_commit.c.dataset_id == row.id)
+    findings = []
+    for one in tx.execute(commits.execution_options(yield_per=1000)):
+        record = CommitRecord(one.tree, tuple(parents.get(one.digest, ())), one.author, one.message, one.at)
+        if record.digest != one.digest:
+            findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
+    return findings
 
 
 def find_faults(tx: Transaction) -> list[str]:

@@ -173,6 +173,7 @@ revision = Table(
     Column("message", Text, nullable=False, default=""),
     Column("job_id", ID, index=True),
     Column("created_us", Micros, nullable=False),
+    Column("content", DIGEST, index=True),  # digest that every server gives to the same content; null: not needed yet
 )
 
 revision_part = Table(
@@ -182,6 +183,7 @@ revision_part = Table(
     Column("number", Integer, primary_key=True),
     Column("part", String(32), primary_key=True),
     Column("document_digest", DIGEST, ForeignKey("document.digest"), nullable=False, index=True),
+    Column("content", DIGEST),  # as that of the revision; null if the document's own digest is the same everywhere
     ForeignKeyConstraint(["item_id", "number"], ["revision.item_id", "revision.number"]),
 )
 
@@ -500,6 +502,73 @@ coverage_stream = Table(
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False, index=True),
     Column("rev", Integer, nullable=False, default=1),
+)
+
+dataset = Table(
+    "dataset",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("name", String(64), nullable=False),
+    Column("description", Text, nullable=False, default=""),
+    Column("collection_id", ID, ForeignKey("collection.id")),  # folder whose content commits record
+    Column("folder_commit", DIGEST),  # commit whose entries the folder has, apart from later changes of its items
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    _alive("dataset", "project_id", "name"),
+)
+
+dataset_commit = Table(
+    "dataset_commit",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("digest", DIGEST, primary_key=True),
+    Column("tree", DIGEST, ForeignKey("tree_chunk.digest"), nullable=False),
+    Column("author", String(255), nullable=False),
+    Column("message", Text, nullable=False),
+    Column("at", String(32), nullable=False),  # in the form that the digest covers
+    Column("entries", BigInteger, nullable=False),
+    Column("generation", Integer, nullable=False),  # 0, or 1 more than the greatest generation of a parent
+    Column("write_id", String(64)),  # the name that the client gave to the commit
+    Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
+)
+
+commit_parent = Table(
+    "commit_parent",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("digest", DIGEST, primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("parent", DIGEST, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+    ForeignKeyConstraint(
+        ["dataset_id", "parent"],
+        ["dataset_commit.dataset_id", "dataset_commit.digest"],
+        name="fk_commit_parent_parent",
+    ),
+)
+
+dataset_ref = Table(  # a branch or a tag
+    "dataset_ref",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("name", Name, primary_key=True),
+    Column("kind", String(8), nullable=False),
+    Column("digest", DIGEST),  # null: a branch without commits
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+tree_chunk = Table(  # pieces of the trees of entries, which versions share
+    "tree_chunk",
+    metadata,
+    Column("digest", DIGEST, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    Column("created_us", Micros, nullable=False),
 )
 
 leader = Table(

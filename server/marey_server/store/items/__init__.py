@@ -13,6 +13,7 @@ from marey_server.store.items.changing import (
     prepare_parts,
     put_part,
     restore_item,
+    set_parts,
 )
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
@@ -60,4 +61,5 @@ __all__ = [
     "read_revision",
     "read_staleness",
     "restore_item",
+    "set_parts",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy import delete, insert
@@ -102,6 +103,29 @@ def put_part(
             return shown
         found = find_item(tx, project_row, kind, item_id)
     raise moved_on(found.rev)
+
+
+def set_parts(
+    tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, parts: Mapping[str, str], message: str
+) -> None:
+    """Create a revision with exactly the given stored documents, by part, unless the newest revision has these.
+
+    The documents must come from the server itself, because the caller's access to them is not checked. Raises
+    `PreconditionFailedProblem` if another request changes the item.
+    """
+    found = find_item(tx, project_row, kind, item_id)
+    before = read_part_digests(tx, [(item_id, found.head)])[item_id, found.head]
+    if before == parts:
+        return
+    sizes = documents.stored_bytes_of(tx, parts.values())
+    added = sum(sizes[digest] for part, digest in parts.items() if before.get(part) != digest)
+    if not write_head(tx, kind, item_id, parts, {}, item.c.rev == found.rev, added_bytes=added):
+        raise moved_on(found.rev)
+    made = NewRevision(item_id, found.head + 1, parts, message)
+    write_revisions(tx, [made], author_id=tx.principal.user_id, job_id=None)
+    quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
+    shown = _shown(tx, project_row, kind, item_id)
+    emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
 
 
 def change_item(

@@ -1,0 +1,158 @@
+"""Datasets of a project: commits, branches, tags and differences of versions."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from marey_client.access import ANY_STATE
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport
+from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange
+from marey_schemas.datasets.differences import DatasetDifference
+from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, Resolution
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind
+
+
+@dataclass(frozen=True)
+class Datasets:
+    """Datasets of a project."""
+
+    transport: Transport
+    project: str
+
+    @property
+    def url(self) -> str:
+        """The path of the resource, relative to the API's root."""
+        return f"/projects/{self.project}/datasets"
+
+    def create(self, name: str, *, collection: str | None = None, description: str = "") -> DatasetHandle:
+        """Create a dataset, whose commits record the content of the folder `collection` if one is given."""
+        request = DatasetCreate(name=name, collection=collection, description=description)
+        self.transport.post(Dataset, self.url, request)
+        return self.at(name)
+
+    def list(self) -> Iterator[Dataset]:
+        """List the datasets by name."""
+        return pages(self.transport, Dataset, self.url)
+
+    def at(self, name: str) -> DatasetHandle:
+        """Return a handle of the dataset with this name; no request is sent."""
+        return DatasetHandle(self.transport, f"{self.url}/{name}")
+
+
+@dataclass(frozen=True)
+class DatasetHandle:
+    """Handle of a dataset; requests are sent only by its methods.
+
+    A version is the name of a branch or a tag, or the digest of a commit, of which the first 8 digits are enough. With
+    `~n` at its end, it is the version n commits earlier.
+    """
+
+    transport: Transport
+    url: str
+
+    def read(self) -> Dataset:
+        """Return the dataset."""
+        return self.transport.get(Dataset, self.url)
+
+    def delete(self) -> None:
+        """Delete the dataset; its items stay."""
+        self.transport.send("DELETE", self.url, headers=ANY_STATE)
+
+    # -- versions ------------------------------------------------------------------------------------------------------
+
+    def commit(
+        self,
+        message: str,
+        *,
+        branch: str = MAIN,
+        changes: Sequence[EntryChange] | None = None,
+        expected: str | None = None,
+    ) -> Commit:
+        """Record a new version: the content of the dataset's folder, or the newest version with `changes`.
+
+        `expected` is the commit that the branch must be at. A request that is repeated because its answer was lost
+        gets the commit that it made. Raises `Conflict` if the branch has moved.
+        """
+        request = CommitCreate(
+            branch=branch,
+            message=message,
+            changes=None if changes is None else tuple(changes),
+            expected=expected,
+            write_id=secrets.token_hex(16),
+        )
+        return self.transport.post(Commit, f"{self.url}/commits", request)
+
+    def log(self, version: str = MAIN) -> Iterator[Commit]:
+        """List a version and the versions before it, newest first."""
+        return pages(self.transport, Commit, f"{self.url}/commits", {"version": version})
+
+    def at(self, version: str = MAIN) -> Commit:
+        """Return the commit that a version names."""
+        return self.transport.get(Commit, f"{self.url}/commits/{version}")
+
+    def entries(self, version: str = MAIN, *, path: str = "") -> Iterator[Entry]:
+        """List the entries of a version by path, all or those below a folder."""
+        return pages(self.transport, Entry, f"{self.url}/entries", {"version": version, "path": path, "limit": 1000})
+
+    def difference(self, before: str = f"{MAIN}~1", after: str = MAIN, *, limit: int = 1000) -> DatasetDifference:
+        """Return the entries that differ in two versions; at most `limit` of them are listed."""
+        query: Params = {"before": before, "after": after, "limit": limit}
+        return self.transport.get(DatasetDifference, f"{self.url}/difference", query)
+
+    def merge(
+        self,
+        version: str,
+        *,
+        into: str = MAIN,
+        message: str = "",
+        resolutions: Sequence[Resolution] = (),
+        preview: bool = False,
+        expected: str | None = None,
+    ) -> MergeAnswer:
+        """Merge a version into a branch, entry by entry and part by part; with `preview`, only compute the result.
+
+        Raises `Conflict` with the code `merge-conflicts` if both sides have changed the same part of an entry and
+        `resolutions` do not decide it; `context` then has the content of `MergeAnswer`.
+        """
+        request = MergeRequest(
+            into=into,
+            version=version,
+            message=message,
+            resolutions=tuple(resolutions),
+            preview=preview,
+            expected=expected,
+            write_id=secrets.token_hex(16),
+        )
+        return self.transport.post(MergeAnswer, f"{self.url}/merges", request)
+
+    def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
+        """Give the folder of the dataset the entries of a version.
+
+        Raises `Conflict` if the folder has changes that no commit has recorded, unless they are to be discarded.
+        """
+        request = CheckoutRequest(version=version, discard=discard)
+        return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
+
+    # -- branches and tags ---------------------------------------------------------------------------------------------
+
+    def refs(self) -> Iterator[Ref]:
+        """List the branches and tags by name."""
+        return pages(self.transport, Ref, f"{self.url}/refs")
+
+    def create_branch(self, name: str, at: str = MAIN) -> Ref:
+        """Create a branch at a version."""
+        return self._create(RefCreate(name=name, kind=RefKind.BRANCH, at=at))
+
+    def create_tag(self, name: str, at: str = MAIN) -> Ref:
+        """Create a tag at a version; it never moves."""
+        return self._create(RefCreate(name=name, kind=RefKind.TAG, at=at))
+
+    def _create(self, request: RefCreate) -> Ref:
+        return self.transport.post(Ref, f"{self.url}/refs", request)
+
+    def delete_ref(self, name: str) -> None:
+        """Delete a branch or a tag; the commits stay."""
+        self.transport.send("DELETE", f"{self.url}/refs/{name}", headers=ANY_STATE)

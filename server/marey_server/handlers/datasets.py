@@ -1,0 +1,234 @@
+"""Resources of datasets: versions, branches, tags and differences."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from marey_schemas.base import Request
+from marey_schemas.datasets.commits import Commit, CommitCreate, Entry
+from marey_schemas.datasets.differences import DatasetDifference
+from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, Version
+from marey_schemas.names import CollectionPath
+from marey_schemas.sizes import MIB
+from marey_server.http.declarations import Access, RequestBody, reads, writes
+from marey_server.http.queries import PageQuery
+from marey_server.http.reply import Rendered, Reply
+from marey_server.http.resource import Resource
+from marey_server.store import datasets
+
+MAX_COMMIT_BYTES = 16 * MIB
+
+
+class ProjectDatasets(Resource):
+    """Datasets of a project."""
+
+    path = "/projects/{project}/datasets"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=PageQuery, answer=Dataset, paged=True)
+    async def get(self, project: str, query: PageQuery) -> Rendered:
+        """List the datasets by name."""
+        return await self.answer(datasets.list_datasets, project, cursor=query.cursor, limit=query.limit)
+
+    @writes(access=Access.CONTRIBUTOR, body=DatasetCreate, answer=Dataset, status=201, etag=True, idempotency="key")
+    async def post(self, project: str, body: DatasetCreate) -> Rendered:
+        """Create a dataset, which has the branch `main` and no commits."""
+        return await self.answer_with(
+            lambda made: Reply(made, rev=made.rev, location=f"/projects/{project}/datasets/{made.name}"),
+            datasets.create_dataset,
+            project,
+            body,
+        )
+
+
+class DatasetResource(Resource):
+    """A dataset."""
+
+    path = "/projects/{project}/datasets/{dataset}"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, answer=Dataset, etag=True)
+    async def get(self, project: str, dataset: str) -> Rendered:
+        """Return a dataset."""
+        return await self.answer(datasets.read_dataset, project, dataset)
+
+    @writes(access=Access.MAINTAINER, precondition="required")
+    async def delete(self, project: str, dataset: str) -> Rendered:
+        """Delete a dataset; its items stay."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(datasets.delete_dataset, project, dataset, expected_rev=expected_rev)
+
+
+class DatasetRefs(Resource):
+    """Branches and tags of a dataset."""
+
+    path = "/projects/{project}/datasets/{dataset}/refs"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=PageQuery, answer=Ref, paged=True)
+    async def get(self, project: str, dataset: str, query: PageQuery) -> Rendered:
+        """List the branches and tags by name."""
+        return await self.answer(datasets.list_refs, project, dataset, cursor=query.cursor, limit=query.limit)
+
+    @writes(access=Access.CONTRIBUTOR, body=RefCreate, answer=Ref, status=201, etag=True, idempotency="key")
+    async def post(self, project: str, dataset: str, body: RefCreate) -> Rendered:
+        """Create a branch or a tag at a version."""
+        return await self.answer(datasets.create_ref, project, dataset, body)
+
+
+class DatasetRef(Resource):
+    """A branch or a tag."""
+
+    path = "/projects/{project}/datasets/{dataset}/refs/{ref}"
+    tag = "ProjectDatasets"
+
+    @writes(access=Access.MAINTAINER, precondition="required")
+    async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
+        """Delete a branch or a tag; the commits stay."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(datasets.delete_ref, project, dataset, ref, expected_rev=expected_rev)
+
+
+class CommitsQuery(PageQuery):
+    """Query of a list of commits."""
+
+    version: Version = Field(MAIN, description="Version at which the list begins.")
+
+
+class DatasetCommits(Resource):
+    """Commits of a dataset."""
+
+    path = "/projects/{project}/datasets/{dataset}/commits"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=CommitsQuery, answer=Commit, paged=True)
+    async def get(self, project: str, dataset: str, query: CommitsQuery) -> Rendered:
+        """List a version and the versions before it, newest first."""
+        return await self.answer(
+            datasets.list_commits, project, dataset, query.version, cursor=query.cursor, limit=query.limit
+        )
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(CommitCreate, max_bytes=MAX_COMMIT_BYTES),
+        answer=Commit,
+        status=201,
+        idempotency="key",
+    )
+    async def post(self, project: str, dataset: str, body: CommitCreate) -> Rendered:
+        """Record a new version on a branch: the content of the dataset's folder, or a list of changes."""
+        prepared = await self.look_up(datasets.prepare_commit, project, dataset, body)
+        return await self.answer(datasets.record_commit, project, dataset, prepared)
+
+
+class DatasetMerges(Resource):
+    """Merges of versions into branches."""
+
+    path = "/projects/{project}/datasets/{dataset}/merges"
+    tag = "ProjectDatasets"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(MergeRequest, max_bytes=MAX_COMMIT_BYTES),
+        answer=MergeAnswer,
+        idempotency="key",
+    )
+    async def post(self, project: str, dataset: str, body: MergeRequest) -> Rendered:
+        """Merge a version into a branch, entry by entry and part by part, or preview the result.
+
+        Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
+        """
+        merge = await self.look_up(datasets.prepare_merge, project, dataset, body)
+        return await self.answer(datasets.record_merge, project, dataset, body, merge)
+
+
+class FolderCheckout(Resource):
+    """Checkout of a version into the folder of a dataset."""
+
+    path = "/projects/{project}/datasets/{dataset}/checkout"
+    tag = "ProjectDatasets"
+
+    @writes(access=Access.MAINTAINER, body=CheckoutRequest, answer=CheckoutAnswer)
+    async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
+        """Give the folder of the dataset the entries of a version: items are added, changed, moved and removed.
+
+        Changes in the folder that no commit has recorded are refused with 409, unless they are to be discarded.
+        Removed items can be restored, and earlier revisions stay.
+        """
+        return await self.answer(datasets.check_out, project, dataset, body)
+
+
+class DatasetCommit(Resource):
+    """A commit."""
+
+    path = "/projects/{project}/datasets/{dataset}/commits/{version}"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, answer=Commit)
+    async def get(self, project: str, dataset: str, version: str) -> Rendered:
+        """Return the commit that a version names."""
+        return await self.answer(datasets.read_commit, project, dataset, version)
+
+
+class EntriesQuery(PageQuery):
+    """Query of a list of entries."""
+
+    version: Version = Field(MAIN, description="Version whose entries are listed.")
+    path: CollectionPath = Field("", description="Folder below which entries are listed; empty: all entries.")
+
+
+class DatasetEntries(Resource):
+    """Entries of a version."""
+
+    path = "/projects/{project}/datasets/{dataset}/entries"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True)
+    async def get(self, project: str, dataset: str, query: EntriesQuery) -> Rendered:
+        """List the entries of a version by path."""
+        return await self.answer(
+            datasets.list_entries,
+            project,
+            dataset,
+            query.version,
+            path=query.path,
+            cursor=query.cursor,
+            limit=query.limit,
+        )
+
+
+class DifferenceQuery(Request):
+    """Query of the difference of two versions."""
+
+    before: Version = Field(f"{MAIN}~1", description="The earlier version.")
+    after: Version = Field(MAIN, description="The later version.")
+    limit: int = Field(1000, ge=1, le=10_000, description="Greatest number of entries that are listed.")
+
+
+class VersionDifference(Resource):
+    """Difference of two versions."""
+
+    path = "/projects/{project}/datasets/{dataset}/difference"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=DifferenceQuery, answer=DatasetDifference)
+    async def get(self, project: str, dataset: str, query: DifferenceQuery) -> Rendered:
+        """Return the entries that were added, removed, moved or changed between two versions."""
+        return await self.answer(
+            datasets.compare_versions, project, dataset, query.before, query.after, limit=query.limit
+        )
+
+
+RESOURCES: tuple[type[Resource], ...] = (
+    ProjectDatasets,
+    DatasetResource,
+    DatasetRefs,
+    DatasetRef,
+    DatasetCommits,
+    DatasetMerges,
+    FolderCheckout,
+    DatasetCommit,
+    DatasetEntries,
+    VersionDifference,
+)

@@ -1,0 +1,36 @@
+"""Datasets: versions of named entries, with branches, tags, commits and differences."""
+
+from marey_server.store.datasets.checkout import check_out
+from marey_server.store.datasets.committing import PreparedCommit, prepare_commit, record_commit
+from marey_server.store.datasets.history import compare_versions, list_commits, list_entries, read_commit
+from marey_server.store.datasets.merging import PreparedMerge, prepare_merge, record_merge
+from marey_server.store.datasets.naming import (
+    create_dataset,
+    create_ref,
+    delete_dataset,
+    delete_ref,
+    list_datasets,
+    list_refs,
+    read_dataset,
+)
+
+__all__ = [
+    "PreparedCommit",
+    "PreparedMerge",
+    "check_out",
+    "compare_versions",
+    "create_dataset",
+    "create_ref",
+    "delete_dataset",
+    "delete_ref",
+    "list_commits",
+    "list_datasets",
+    "list_entries",
+    "list_refs",
+    "prepare_commit",
+    "prepare_merge",
+    "read_commit",
+    "read_dataset",
+    "record_commit",
+    "record_merge",
+]

@@ -1,0 +1,179 @@
+"""Checkout of versions into the folders of datasets."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, exists, select, update
+
+from marey_schemas.datasets.commits import MOST_CHANGES
+from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest
+from marey_schemas.items import ItemChange
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.store import items, projects
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.folders import FolderState, read_folder
+from marey_server.store.datasets.history import revisions_with, tree_of
+from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import collection, dataset, item
+from marey_server.store.transaction import Transaction
+from marey_versions.compared import ComparedEntry, compare_entries
+from marey_versions.records import DatasetEntry
+from marey_versions.tree.difference import Changed
+from marey_versions.tree.reading import Tree
+
+
+def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
+    """Give the folder of a dataset the entries of a version, and let the next commit of the folder follow it.
+
+    Items of the folder keep their ids where an entry was moved or changed. An entry that was removed since gets its
+    item back, or else a new item.
+
+    Raises `ConflictProblem` if the folder has changes that no commit has recorded, unless they are to be discarded, or
+    if another request changes the folder, and `InvalidProblem` if too many entries differ.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    digest = resolve(tx, found.id, request.version)
+    state = read_folder(tx, project_row, found)
+    store = StoredChunks(tx)
+    if not request.discard:
+        _require_recorded(tx, found, state, store)
+    wanted = Tree(store, tree_of(tx, found.id, digest))
+    back = state.changes_since(wanted)
+    targets = wanted.get_several(back)
+    changes = [Changed(key, state.entries.get(key), targets.get(key)) for key in sorted(back)]
+    if len(changes) > MOST_CHANGES:
+        raise InvalidProblem(
+            f"{counted(len(changes), 'entry')} of the folder differ from this version; a checkout changes at most "
+            f"{MOST_CHANGES:,}.",
+            code="large-checkout",
+        )
+    compared = compare_entries(changes)
+    _Checkout(tx, project_row, found, state).apply(compared)
+    tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
+    counts = Counter(one.change for one in compared)
+    return CheckoutAnswer(
+        commit=digest, added=counts["added"], removed=counts["removed"], moved=counts["moved"],
+        changed=counts["changed"],
+    )  # fmt: skip
+
+
+def _require_recorded(tx: Transaction, found: Row[Any], state: FolderState, store: StoredChunks) -> None:
+    if found.folder_commit is None:
+        changed: Sequence[str] = sorted(state.entries)
+    else:
+        changed = sorted(state.changes_since(Tree(store, tree_of(tx, found.id, found.folder_commit))))
+    if changed:
+        raise ConflictProblem(
+            f"The folder {found.path!r} has changes that no commit has recorded; commit or discard them.",
+            code="uncommitted-changes",
+            context={"count": len(changed)},
+        )
+
+
+@dataclass(frozen=True)
+class _Checkout:
+    """Checkout in progress."""
+
+    tx: Transaction
+    project: ProjectRow
+    dataset: Row[Any]
+    state: FolderState
+
+    def apply(self, compared: Sequence[ComparedEntry]) -> None:
+        """Change the folder, in an order in which every place is free when an item comes to it."""
+        documents = self._documents(one.after for one in compared if one.after is not None)
+        of_kind: defaultdict[str, list[ComparedEntry]] = defaultdict(list)
+        for one in compared:
+            of_kind[one.change].append(one)
+        for one in of_kind["removed"]:
+            self._delete(one)
+        for one in of_kind["moved"]:
+            self._place(one, f".{self._item(one)}")
+        for one in of_kind["moved"]:
+            self._place(one, None)
+        for one in (*of_kind["moved"], *of_kind["changed"]):
+            self._change(one, documents)
+        for one in of_kind["added"]:
+            self._add(one, documents)
+
+    def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
+        """Return an item with the documents of a revision of it for each content digest."""
+        held = revisions_with(self.tx, self.project.id, {entry.content for entry in entries})
+        parts = read_part_digests(self.tx, set(held.values()))
+        return {content: (key[0], parts[key]) for content, key in held.items()}
+
+    def _item(self, one: ComparedEntry) -> str:
+        assert one.before is not None
+        return str(self.state.items[one.before.key].id)
+
+    def _delete(self, one: ComparedEntry) -> None:
+        kind = Kind(one.present.kind)
+        items.delete_item(self.tx, self.project.name, kind, self._item(one), expected_rev=None)
+
+    def _place(self, one: ComparedEntry, temporary: str | None) -> None:
+        folder, _, name = one.present.path.rpartition("/")
+        change = ItemChange(name=temporary or name, collection=self._folder(folder))
+        kind = Kind(one.present.kind)
+        items.change_item(self.tx, self.project.name, kind, self._item(one), change, expected_rev=None)
+
+    def _folder(self, folder: str) -> str:
+        return "/".join(filter(None, (self.dataset.path, folder)))
+
+    def _change(self, one: ComparedEntry, documents: Mapping[str, tuple[str, Mapping[str, str]]]) -> None:
+        assert one.after is not None
+        kind, item_id = Kind(one.after.kind), self._item(one)
+        if one.parts:
+            items.set_parts(self.tx, self.project, kind, item_id, documents[one.after.content][1], self._message)
+        if one.before is not None and set(one.before.tags) != set(one.after.tags):
+            tags = ItemChange(tags=one.after.tags)
+            items.change_item(self.tx, self.project.name, kind, item_id, tags, expected_rev=None)
+
+    @property
+    def _message(self) -> str:
+        return f"Checkout of the dataset {self.dataset.name}"
+
+    def _add(self, one: ComparedEntry, documents: Mapping[str, tuple[str, Mapping[str, str]]]) -> None:
+        assert one.after is not None
+        kind = Kind(one.after.kind)
+        item_id, parts = documents[one.after.content]
+        folder, _, name = one.after.path.rpartition("/")
+        if self._can_restore(kind, item_id):
+            items.restore_item(self.tx, self.project.name, kind, item_id)
+            place = ItemChange(name=name, collection=self._folder(folder), tags=one.after.tags)
+            items.change_item(self.tx, self.project.name, kind, item_id, place, expected_rev=None)
+            items.set_parts(self.tx, self.project, kind, item_id, parts, self._message)
+            return
+        draft = Draft(
+            name_in_batch="", kind=kind, item_name=name, collection=self._folder(folder), tags=one.after.tags,
+            parts={part: StoredDocument(digest) for part, digest in parts.items()}, reuse="new",
+            message=self._message,
+        )  # fmt: skip
+        items.publish(self.tx, self.project, [draft], author_id=self.tx.principal.user_id)
+
+    def _can_restore(self, kind: Kind, item_id: str) -> bool:
+        """Return whether an item is deleted and no other item has its former place."""
+        former = (
+            select(item.c.name, collection.c.path)
+            .join(collection, collection.c.id == item.c.collection_id)
+            .where(item.c.id == item_id, item.c.deleted_us.is_not(None))
+        )
+        row = self.tx.execute(former).first()
+        if row is None:
+            return False
+        there = (
+            exists()
+            .where(item.c.collection_id == collection.c.id, collection.c.project_id == self.project.id)
+            .where(collection.c.path == row.path, collection.c.deleted_us.is_(None))
+            .where(item.c.kind == kind.value, item.c.name == row.name, item.c.deleted_us.is_(None))
+        )
+        return not self.tx.execute(select(there)).scalar()

@@ -1,0 +1,44 @@
+"""Chunks of trees in the database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from sqlalchemy import bindparam, select
+
+from marey_server.store import blobs
+from marey_server.store.database.prepared import Prepared, padded
+from marey_server.store.tables import tree_chunk
+from marey_server.store.transaction import IN_LIST, Transaction
+
+_CHUNKS = Prepared(
+    select(tree_chunk.c.digest, tree_chunk.c.data).where(tree_chunk.c.digest.in_(bindparam("digests", expanding=True)))
+)
+
+
+class StoredChunks:
+    """Chunks of the database; new ones are collected, and stored by `store_chunks`."""
+
+    def __init__(self, tx: Transaction) -> None:
+        self._tx = tx
+        self.new: dict[str, bytes] = {}
+
+    def load(self, digests: Iterable[str]) -> Mapping[str, bytes]:
+        """Return the bytes of chunks; chunks that do not exist are left out."""
+        wanted = list(digests)
+        found = {digest: self.new[digest] for digest in wanted if digest in self.new}
+        missing = [digest for digest in wanted if digest not in found]
+        for start in range(0, len(missing), IN_LIST):
+            rows = self._tx.run(_CHUNKS, {"digests": padded(missing[start : start + IN_LIST])})
+            found.update((row.digest, bytes(row.data)) for row in rows)
+        return found
+
+    def save(self, chunks: Mapping[str, bytes]) -> None:
+        """Collect new chunks."""
+        self.new.update(chunks)
+
+
+def store_chunks(tx: Transaction, chunks: Mapping[str, bytes]) -> None:
+    """Store chunks by digest. Storing a chunk again has no effect."""
+    rows = [{"digest": digest, "data": data, "created_us": tx.now_us} for digest, data in chunks.items()]
+    blobs.insert_new(tx, tree_chunk, rows)

@@ -1,0 +1,272 @@
+"""Commits: a read prepares the new version, and a short write records it.
+
+The write checks that the branch is still at the commit that the read has found, so that a version is never based on
+one state and recorded after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sqlalchemy import Row, insert, select, update
+
+from marey_schemas.datasets.commits import Commit, CommitCreate, EntryChange, MoveEntry, PutEntry, RemoveEntry
+from marey_schemas.datasets.naming import RefKind
+from marey_schemas.wording import counted
+from marey_server import faults
+from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
+from marey_server.store import projects
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.datasets.chunks import StoredChunks, store_chunks
+from marey_server.store.datasets.contents import Contents, find_contents_of, store_contents
+from marey_server.store.datasets.folders import read_folder, tags_of
+from marey_server.store.datasets.history import read_commit, tree_of
+from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
+from marey_server.store.transaction import IN_LIST, Transaction
+from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import Value
+from marey_versions.tree.editing import change
+from marey_versions.tree.reading import Tree
+
+
+@dataclass(frozen=True)
+class PreparedCommit:
+    """Move of a branch to a new commit, computed but not recorded."""
+
+    dataset_id: str
+    branch: str
+    head: str | None
+    """Commit at which the branch must still be."""
+    parents: tuple[str, ...]
+    message: str
+    write_id: str | None
+    tree: str = ""
+    entries: int = 0
+    chunks: Mapping[str, bytes] = field(default_factory=dict)
+    contents: Contents = field(default_factory=Contents)
+    of_folder: bool = False
+    existing: str | None = None
+    """Existing commit to which the branch moves, in place of a new one."""
+    recorded: str | None = None
+    """Commit that an earlier request with the same `write_id` has recorded, so that nothing is left to do."""
+
+
+def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCreate) -> PreparedCommit:
+    """Compute the version that a request describes.
+
+    Raises `NotFoundProblem` for an unknown branch, entry or item, `ConflictProblem` if the branch is not at the
+    expected commit, and `InvalidProblem` if the version has the same entries as the one before.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    recorded = recorded_as(tx, found.id, request.write_id)
+    head = head_of(tx, found.id, request.branch, None if recorded else request.expected)
+    parents = () if head is None else (head,)
+    prepared = PreparedCommit(
+        found.id, request.branch, head, parents, request.message, request.write_id, recorded=recorded
+    )
+    if recorded is not None:
+        return prepared
+    store = StoredChunks(tx)
+    before = None if head is None else tree_of(tx, found.id, head)
+    if request.changes is None:
+        _require_checked_out(found, head)
+        tree, contents = _from_folder(tx, project_row, found, store, before)
+    else:
+        tree, contents = _from_changes(tx, project_row, store, before, request.changes)
+    if tree == before:
+        raise InvalidProblem(f"Nothing has changed since the newest commit of {request.branch!r}.", code="no-changes")
+    return replace(
+        prepared, tree=tree, entries=len(Tree(store, tree)), chunks=store.new, contents=contents,
+        of_folder=request.changes is None,
+    )  # fmt: skip
+
+
+def record_commit(tx: Transaction, project: str, name: str, prepared: PreparedCommit) -> Commit:
+    """Record a prepared commit, and move the branch to it.
+
+    Raises `ConflictProblem` if the branch has moved since the commit was prepared.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    if found.id != prepared.dataset_id:
+        raise _moved(prepared.branch, None)
+    recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
+    if recorded is not None:
+        return read_commit(tx, project, name, recorded)
+    store_chunks(tx, prepared.chunks)
+    store_contents(tx, prepared.contents)
+    digest = prepared.existing or _insert(tx, prepared)
+    if prepared.of_folder:
+        tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
+    _move_branch(tx, found.id, prepared, digest)
+    tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
+    faults.point("dataset_commit.before_commit")
+    tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
+    return read_commit(tx, project, name, digest)
+
+
+def _move_branch(tx: Transaction, dataset_id: str, prepared: PreparedCommit, digest: str) -> None:
+    moved = (
+        update(dataset_ref)
+        .where(
+            dataset_ref.c.dataset_id == dataset_id,
+            dataset_ref.c.name == prepared.branch,
+            dataset_ref.c.kind == RefKind.BRANCH.value,
+            dataset_ref.c.digest.is_not_distinct_from(prepared.head),
+        )
+        .values(digest=digest, updated_us=tx.now_us, rev=dataset_ref.c.rev + 1)
+    )
+    if tx.execute(moved).rowcount == 0:
+        current = find_ref(tx, dataset_id, prepared.branch)
+        raise _moved(prepared.branch, None if current is None else current.digest)
+
+
+def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
+    """Return the digest of the commit that a request with this `write_id` has recorded, or None."""
+    if write_id is None:
+        return None
+    statement = select(dataset_commit.c.digest).where(
+        dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.write_id == write_id
+    )
+    found: str | None = tx.execute(statement).scalar()
+    return found
+
+
+def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None) -> str | None:
+    """Return the digest of the newest commit of a branch, None if it has none.
+
+    Raises `NotFoundProblem` for an unknown branch, `InvalidProblem` for a tag, and `ConflictProblem` if the branch is
+    not at the expected commit.
+    """
+    ref = find_ref(tx, dataset_id, branch)
+    if ref is None:
+        raise NotFoundProblem(f"The dataset has no branch {branch!r}.", code="no-version")
+    if ref.kind != RefKind.BRANCH:
+        raise InvalidProblem(f"{branch!r} is a tag, which never moves; name a branch.", code="is-tag")
+    head: str | None = ref.digest
+    if expected is not None and expected != head:
+        raise _moved(branch, head)
+    return head
+
+
+def _moved(branch: str, head: str | None) -> ConflictProblem:
+    return ConflictProblem(
+        f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
+        code="branch-moved",
+        context={"commit": head},
+    )
+
+
+def _insert(tx: Transaction, prepared: PreparedCommit) -> str:
+    at = datetime_of(tx.now_us).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    record = CommitRecord(prepared.tree, prepared.parents, _author(tx), prepared.message, at)
+    above = select(dataset_commit.c.generation).where(
+        dataset_commit.c.dataset_id == prepared.dataset_id, dataset_commit.c.digest.in_(prepared.parents)
+    )
+    row = {
+        "dataset_id": prepared.dataset_id, "digest": record.digest, "tree": record.tree, "author": record.author,
+        "message": record.message, "at": record.at, "entries": prepared.entries, "write_id": prepared.write_id,
+        "generation": max((number + 1 for number in tx.execute(above).scalars()), default=0),
+    }  # fmt: skip
+    tx.execute(insert(dataset_commit).values(**row))
+    places = [
+        {"dataset_id": prepared.dataset_id, "digest": record.digest, "position": place, "parent": parent}
+        for place, parent in enumerate(prepared.parents)
+    ]
+    if places:
+        tx.execute(insert(commit_parent), places)
+    return record.digest
+
+
+def _author(tx: Transaction) -> str:
+    name = tx.execute(select(user.c.name).where(user.c.id == tx.principal.user_id)).scalar()
+    return str(name or tx.principal.actor)
+
+
+# -- the content of a folder ------------------------------------------------------------------------------------------
+
+
+def _require_checked_out(found: Row[Any], parent: str | None) -> None:
+    """Raise `ConflictProblem` if the folder was not made from the newest commit of the branch."""
+    if found.folder_commit != parent:
+        raise ConflictProblem(
+            f"The folder {found.path!r} has the entries of another version than the newest one of this branch. "
+            "Check out the branch, or commit to the branch that is checked out.",
+            code="folder-elsewhere",
+            context={"folder_commit": found.folder_commit, "commit": parent},
+        )
+
+
+def _from_folder(
+    tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
+) -> tuple[str, Contents]:
+    """Return the tree of the items in the dataset's folder, and their contents."""
+    state = read_folder(tx, project_row, found)
+    if before is None:
+        return build(store, sorted(state.entries.items())), state.contents
+    return change(store, before, state.changes_since(Tree(store, before))), state.contents
+
+
+# -- explicit changes -------------------------------------------------------------------------------------------------
+
+
+def _from_changes(
+    tx: Transaction, project_row: ProjectRow, store: StoredChunks, before: str | None, changes: Sequence[EntryChange]
+) -> tuple[str, Contents]:
+    """Return the tree that results from changes, applied in their order, and the contents of the revisions in it."""
+    before = before or build(store, [])
+    put = [one for one in changes if isinstance(one, PutEntry)]
+    rows = _items_named(tx, project_row, put)
+    contents = find_contents_of(tx, {RevisionKey(one.item, one.revision or rows[one.item].head) for one in put})
+    tags = tags_of(tx, [one.item for one in put])
+    keys = {key_of(one.path, one.kind) for one in changes if isinstance(one, RemoveEntry | MoveEntry)}
+    keys |= {key_of(one.to, one.kind) for one in changes if isinstance(one, MoveEntry)}
+    state: dict[str, Value | None] = dict.fromkeys(keys)
+    state.update(Tree(store, before).get_several(keys))
+    for one in changes:
+        if isinstance(one, PutEntry):
+            reference = RevisionKey(one.item, one.revision or rows[one.item].head)
+            if reference not in contents.parts:
+                raise NotFoundProblem(f"The item {one.item!r} has no revision {one.revision}.", code="no-revision")
+            entry = DatasetEntry(one.path, rows[one.item].kind, contents.parts[reference], tags.get(one.item, ()))
+            state[entry.key] = entry.value
+        else:
+            _take_away(state, one)
+    return change(store, before, state), contents
+
+
+def _items_named(tx: Transaction, project_row: ProjectRow, put: Sequence[PutEntry]) -> dict[str, Row[Any]]:
+    wanted = sorted({one.item for one in put})
+    rows: dict[str, Row[Any]] = {}
+    for start in range(0, len(wanted), IN_LIST):
+        statement = select(item.c.id, item.c.kind, item.c.head).where(
+            item.c.project_id == project_row.id,
+            item.c.deleted_us.is_(None),
+            item.c.id.in_(wanted[start : start + IN_LIST]),
+        )
+        rows.update((row.id, row) for row in tx.execute(statement))
+    if missing := [one for one in wanted if one not in rows]:
+        raise NotFoundProblem(
+            f"{counted(len(missing), 'item')} of the changes are not in this project, the first {missing[0]!r}.",
+            code="no-item",
+        )
+    return rows
+
+
+def _take_away(state: dict[str, Value | None], one: RemoveEntry | MoveEntry) -> None:
+    key = key_of(one.path, one.kind)
+    value = state.get(key)
+    if value is None:
+        raise NotFoundProblem(f"The version has no {one.kind.value} at {one.path!r}.", code="no-entry")
+    state[key] = None
+    if isinstance(one, MoveEntry):
+        target = key_of(one.to, one.kind)
+        if state.get(target) is not None:
+            raise ConflictProblem(f"The version has a {one.kind.value} at {one.to!r} already.", code="path-taken")
+        state[target] = value

@@ -1,0 +1,178 @@
+"""Reading of datasets: commits, entries and differences of versions."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import Row, literal, select
+
+from marey_schemas.datasets.commits import Commit, Entry
+from marey_schemas.datasets.differences import DatasetDifference, EntryDifference
+from marey_schemas.items import Page
+from marey_schemas.kinds import Kind
+from marey_server.errors import BadRequestProblem, NotFoundProblem
+from marey_server.store import listing, projects
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.naming import find_dataset, first_parents, resolve
+from marey_server.store.tables import commit_parent, dataset_commit, item, revision
+from marey_server.store.transaction import IN_LIST, Transaction
+from marey_versions.compared import ComparedEntry, compare_entries
+from marey_versions.records import DatasetEntry, entry_of
+from marey_versions.tree.difference import difference
+from marey_versions.tree.reading import Tree
+
+MOST_DIFFERENCES = 100_000
+"""Greatest number of differing entries that are counted in one answer."""
+
+
+def read_commit(tx: Transaction, project: str, name: str, version: str) -> Commit:
+    """Return the commit that a version names."""
+    row = find_dataset(tx, projects.require(tx, project), name)
+    return _commit(tx, row.id, resolve(tx, row.id, version))
+
+
+def _commit(tx: Transaction, dataset_id: str, digest: str) -> Commit:
+    of_dataset = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == digest)
+    row = tx.execute(select(dataset_commit).where(*of_dataset)).first()
+    if row is None:
+        raise NotFoundProblem(f"The dataset has no commit {digest!r}.", code="no-version")
+    return _shown(row, _parents(tx, dataset_id, [digest]).get(digest, ()))
+
+
+def tree_of(tx: Transaction, dataset_id: str, digest: str) -> str:
+    """Return the root of the tree of a commit."""
+    of_dataset = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == digest)
+    return str(tx.execute(select(dataset_commit.c.tree).where(*of_dataset)).scalar_one())
+
+
+def _shown(row: Row[Any], parents: Sequence[str]) -> Commit:
+    return Commit(
+        digest=row.digest, tree=row.tree, parents=tuple(parents), author=row.author, message=row.message,
+        at=datetime.fromisoformat(row.at), entries=row.entries,
+    )  # fmt: skip
+
+
+def _parents(tx: Transaction, dataset_id: str, digests: Sequence[str]) -> dict[str, list[str]]:
+    statement = (
+        select(commit_parent.c.digest, commit_parent.c.parent)
+        .where(commit_parent.c.dataset_id == dataset_id, commit_parent.c.digest.in_(digests))
+        .order_by(commit_parent.c.digest, commit_parent.c.position)
+    )
+    found: dict[str, list[str]] = {}
+    for row in tx.execute(statement):
+        found.setdefault(row.digest, []).append(row.parent)
+    return found
+
+
+def list_commits(tx: Transaction, project: str, name: str, version: str, *, cursor: str | None, limit: int) -> Page:
+    """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed."""
+    row = find_dataset(tx, projects.require(tx, project), name)
+    order = listing.parse_order("place", {"place": literal(0)}, unique="place")
+    identity = ["commits", row.id, version]
+    start = resolve(tx, row.id, version) if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
+    chain = first_parents(row.id, start, limit)
+    found = tx.execute(
+        select(dataset_commit)
+        .join(chain, chain.c.digest == dataset_commit.c.digest)
+        .where(dataset_commit.c.dataset_id == row.id)
+        .order_by(chain.c.place)
+    ).all()
+    parents = _parents(tx, row.id, [one.digest for one in found])
+    shown = [_shown(one, parents.get(one.digest, ())) for one in found]
+    following = None
+    if len(shown) > limit:
+        following = listing.make_cursor(tx, order, identity, [shown[limit].digest])
+    return Page(items=tuple(shown[:limit]), next_cursor=following)
+
+
+# -- entries ----------------------------------------------------------------------------------------------------------
+
+
+def list_entries(
+    tx: Transaction, project: str, name: str, version: str, *, path: str, cursor: str | None, limit: int
+) -> Page:
+    """List the entries of a version by path, all or those below a folder."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    commit = _commit(tx, row.id, resolve(tx, row.id, version))
+    order = listing.parse_order("key", {"key": literal("")}, unique="key")
+    identity = ["entries", row.id, commit.digest, path]
+    after = "" if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
+    tree = Tree(StoredChunks(tx), commit.tree)
+    found = list(islice(tree.entries(after=after, prefix=f"{path}/" if path else ""), limit + 1))
+    entries = [entry_of(*one) for one in found[:limit]]
+    following = listing.make_cursor(tx, order, identity, [entries[-1].key]) if len(found) > limit else None
+    return Page(items=_shown_entries(tx, project_row.id, entries), next_cursor=following)
+
+
+def _shown_entries(tx: Transaction, project_id: str, entries: Sequence[DatasetEntry]) -> tuple[Entry, ...]:
+    held = revisions_with(tx, project_id, {entry.content for entry in entries})
+    return tuple(shown_entry(entry, held) for entry in entries)
+
+
+def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Entry:
+    """Return an entry as a document; `held` gives a revision of the project for content digests."""
+    item_id, number = held.get(entry.content, (None, None))
+    return Entry(
+        path=entry.path, kind=Kind(entry.kind), parts=dict(entry.parts), tags=entry.tags, item=item_id, revision=number
+    )
+
+
+def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
+    """Return a revision of the project for each content digest that one has, of existing items rather than deleted."""
+    wanted = sorted(set(contents))
+    found: dict[str, tuple[str, int]] = {}
+    for start in range(0, len(wanted), IN_LIST):
+        statement = (
+            select(revision.c.content, revision.c.item_id, revision.c.number)
+            .join(item, item.c.id == revision.c.item_id)
+            .where(revision.c.content.in_(wanted[start : start + IN_LIST]), item.c.project_id == project_id)
+            .order_by(item.c.deleted_us.is_(None), revision.c.item_id, revision.c.number)
+        )
+        found.update((row.content, (row.item_id, row.number)) for row in tx.execute(statement))
+    return found
+
+
+# -- differences ------------------------------------------------------------------------------------------------------
+
+
+def compare_versions(
+    tx: Transaction, project: str, name: str, before: str, after: str, *, limit: int
+) -> DatasetDifference:
+    """Return the entries that differ in two versions; at most `limit` of them are listed."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    old, new = (_commit(tx, row.id, resolve(tx, row.id, version)) for version in (before, after))
+    found = list(islice(difference(StoredChunks(tx), old.tree, new.tree), MOST_DIFFERENCES + 1))
+    if len(found) > MOST_DIFFERENCES:
+        raise BadRequestProblem(
+            f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions that are closer.",
+            code="large-difference",
+        )
+    compared = compare_entries(found)
+    shown = compared[:limit]
+    sides = [side for one in shown for side in (one.before, one.after) if side is not None]
+    held = revisions_with(tx, project_row.id, {side.content for side in sides})
+    return DatasetDifference(
+        before=old,
+        after=new,
+        counts=dict(Counter(one.change for one in compared)),
+        entries=tuple(_shown_difference(one, held) for one in shown),
+        complete=len(shown) == len(compared),
+    )
+
+
+def _shown_difference(one: ComparedEntry, held: dict[str, tuple[str, int]]) -> EntryDifference:
+    before, after = (None if side is None else shown_entry(side, held) for side in (one.before, one.after))
+    return EntryDifference(
+        path=one.present.path, kind=Kind(one.present.kind), change=one.change,
+        was=before.path if before is not None and one.change == "moved" else None,
+        parts=dict(one.parts),
+        tags_added=tuple(sorted(one.tags_of(one.after) - one.tags_of(one.before))),
+        tags_removed=tuple(sorted(one.tags_of(one.before) - one.tags_of(one.after))),
+        before=before, after=after,
+    )  # fmt: skip

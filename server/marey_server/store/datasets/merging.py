@@ -1,0 +1,157 @@
+"""Merges of versions into branches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from sqlalchemy import select
+
+from marey_schemas.datasets.merges import MOST_CONFLICTS, EntryConflict, MergeAnswer, MergeRequest
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.store import projects
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.committing import PreparedCommit, head_of, record_commit, recorded_as
+from marey_server.store.datasets.history import revisions_with, shown_entry, tree_of
+from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.tables import commit_parent
+from marey_server.store.transaction import Transaction
+from marey_versions.compared import ComparedEntry, compare_entries
+from marey_versions.merging import MergeConflict, merge_entries
+from marey_versions.records import key_of, path_and_kind
+from marey_versions.tree.building import build
+from marey_versions.tree.difference import difference
+from marey_versions.tree.editing import change
+from marey_versions.tree.reading import Tree
+
+
+@dataclass(frozen=True)
+class PreparedMerge:
+    """Merge that was computed, but not recorded; without conflicts it has a commit to record."""
+
+    answer: MergeAnswer
+    commit: PreparedCommit
+
+
+def prepare_merge(tx: Transaction, project: str, name: str, request: MergeRequest) -> PreparedMerge:
+    """Compute the merge of a version into a branch.
+
+    Raises `InvalidProblem` if the branch has all commits of the version, and `ConflictProblem` if the branch is not at
+    the expected commit, or if the two have several nearest common commits.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    recorded = recorded_as(tx, found.id, request.write_id)
+    ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
+    theirs = resolve(tx, found.id, request.version)
+    if ours is None:
+        raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
+    message = request.message or f"Merge {request.version} into {request.into}"
+    commit = PreparedCommit(found.id, request.into, ours, (ours, theirs), message, request.write_id, recorded=recorded)
+    answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
+    if recorded is not None:
+        return PreparedMerge(answer, commit)
+    base = _common(tx, found.id, ours, theirs)
+    if base == theirs:
+        raise InvalidProblem(
+            f"The branch {request.into!r} already has all commits of {request.version!r}.", code="already-merged"
+        )
+    return _merge(tx, project_row.id, request, answer.model_copy(update={"base": base}), commit)
+
+
+def _merge(
+    tx: Transaction, project_id: str, request: MergeRequest, answer: MergeAnswer, commit: PreparedCommit
+) -> PreparedMerge:
+    store = StoredChunks(tx)
+    trees = {digest: tree_of(tx, commit.dataset_id, digest) for digest in {answer.base, *commit.parents} if digest}
+    base = build(store, []) if answer.base is None else trees[answer.base]
+    mine, their = (_changed(store, base, trees[one]) for one in commit.parents)
+    resolutions = {key_of(one.path, one.kind): one.take for one in request.resolutions}
+    merged = merge_entries(mine, their, resolutions)
+    if unknown := sorted(resolutions.keys() - merged.decided):
+        path, kind = path_and_kind(unknown[0])
+        raise InvalidProblem(f"There is no conflict at {path!r} of the kind {kind} to decide.", code="no-conflict")
+    tree = change(store, trees[answer.ours], merged.changes)
+    held = revisions_with(tx, project_id, _contents(merged.conflicts))
+    conflicts = sorted(merged.conflicts, key=lambda one: one.key)
+    answer = answer.model_copy(
+        update={
+            "changes": len(_changed(store, trees[answer.ours], tree)),
+            "conflicts": tuple(_shown(one, held) for one in conflicts[:MOST_CONFLICTS]),
+            "conflict_count": len(conflicts),
+        }
+    )
+    existing = answer.theirs if answer.base == answer.ours else None
+    entries = len(Tree(store, tree))
+    return PreparedMerge(answer, replace(commit, tree=tree, entries=entries, chunks=store.new, existing=existing))
+
+
+def record_merge(tx: Transaction, project: str, name: str, request: MergeRequest, merge: PreparedMerge) -> MergeAnswer:
+    """Record a merge, unless it is a preview, and return the result.
+
+    Raises `ConflictProblem` if there are conflicts without a resolution, or if the branch has moved.
+    """
+    if request.preview:
+        projects.require(tx, project)
+        return merge.answer
+    if merge.answer.conflict_count:
+        raise ConflictProblem(
+            f"{counted(merge.answer.conflict_count, 'entry')} changed on both sides; send a resolution for each.",
+            code="merge-conflicts",
+            context=merge.answer.model_dump(mode="json"),
+        )
+    commit = record_commit(tx, project, name, merge.commit)
+    return merge.answer.model_copy(update={"commit": commit})
+
+
+def _changed(store: StoredChunks, base: str, tree: str) -> list[ComparedEntry]:
+    return compare_entries(difference(store, base, tree))
+
+
+def _contents(conflicts: Iterable[MergeConflict]) -> set[str]:
+    return {side.content for one in conflicts for side in (one.base, one.ours, one.theirs) if side is not None}
+
+
+def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConflict:
+    base, ours, theirs = (
+        None if side is None else shown_entry(side, held) for side in (one.base, one.ours, one.theirs)
+    )
+    path, kind = path_and_kind(one.key)
+    return EntryConflict(path=path, kind=Kind(kind), parts=one.parts, base=base, ours=ours, theirs=theirs)
+
+
+def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | None:
+    """Return the nearest commit that both sides have, None if they have none.
+
+    Raises `ConflictProblem` if there are several, none of which precedes another.
+    """
+    rows = tx.execute(
+        select(commit_parent.c.digest, commit_parent.c.parent).where(commit_parent.c.dataset_id == dataset_id)
+    )
+    parents: dict[str, list[str]] = {}
+    for row in rows:
+        parents.setdefault(row.digest, []).append(row.parent)
+    shared = _with_ancestors(parents, [ours]) & _with_ancestors(parents, [theirs])
+    earlier = _with_ancestors(parents, [parent for one in shared for parent in parents.get(one, ())])
+    nearest = sorted(shared - earlier)
+    if len(nearest) > 1:
+        raise ConflictProblem(
+            "The two versions have several nearest common commits, because earlier merges crossed. Merge one side into "
+            "a new branch at the other first.",
+            code="several-bases",
+            context={"commits": nearest},
+        )
+    return nearest[0] if nearest else None
+
+
+def _with_ancestors(parents: Mapping[str, list[str]], commits: Iterable[str]) -> set[str]:
+    found: set[str] = set()
+    waiting = list(commits)
+    while waiting:
+        one = waiting.pop()
+        if one not in found:
+            found.add(one)
+            waiting += parents.get(one, ())
+    return found

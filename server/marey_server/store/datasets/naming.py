@@ -1,0 +1,232 @@
+"""Datasets with their branches and tags, and the commits that these name."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sqlalchemy import CTE, Row, delete, func, insert, literal_column, select
+
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind
+from marey_schemas.items import Page
+from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
+from marey_server.store import collections, listing, projects
+from marey_server.store.database.clock import datetime_of
+from marey_server.store.database.violations import taken
+from marey_server.store.ids import new_id
+from marey_server.store.projects import ProjectRow
+from marey_server.store.revs import ExpectedRev, change_row
+from marey_server.store.tables import collection, commit_parent, dataset, dataset_commit, dataset_ref
+from marey_server.store.transaction import Transaction
+
+MOST_DATASETS = 1000
+"""Greatest number of datasets in a project."""
+MOST_REFS = 10_000
+"""Greatest number of branches and tags in a dataset."""
+
+_VERSION = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]{0,127})(?:~([0-9]{1,4}))?")
+_DIGITS = re.compile(r"(?:sha256:)?([0-9a-f]{8,64})")
+_ALIVE = dataset.c.deleted_us.is_(None)
+
+
+def find_dataset(tx: Transaction, project_row: ProjectRow, name: str) -> Row[Any]:
+    """Return the row of a dataset, with the path of its folder as `path`. Raises `NotFoundProblem`."""
+    row = tx.execute(_shown_rows(project_row).where(dataset.c.name == name)).first()
+    if row is None:
+        raise NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")
+    return row
+
+
+def _shown_rows(project_row: ProjectRow) -> Any:
+    return (
+        select(dataset, collection.c.path, collection.c.deleted_us.label("folder_deleted_us"))
+        .select_from(dataset.outerjoin(collection, collection.c.id == dataset.c.collection_id))
+        .where(dataset.c.project_id == project_row.id, _ALIVE)
+    )
+
+
+def _shown(row: Row[Any]) -> Dataset:
+    return Dataset(
+        id=row.id, name=row.name, description=row.description, collection=row.path,
+        created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us), rev=row.rev,
+    )  # fmt: skip
+
+
+# -- datasets ---------------------------------------------------------------------------------------------------------
+
+
+def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dataset:
+    """Create a dataset with the branch `main`, which has no commits yet.
+
+    Raises `ConflictProblem` if the name is taken.
+    """
+    project_row = projects.require(tx, project)
+    held = tx.execute(select(func.count()).where(dataset.c.project_id == project_row.id, _ALIVE)).scalar_one()
+    _require_room(held, MOST_DATASETS, "datasets in a project")
+    folder = None if request.collection is None else collections.ensure(tx, project_row, request.collection)
+    dataset_id = new_id("dataset")
+    row = {
+        "id": dataset_id, "project_id": project_row.id, "name": request.name,
+        "description": request.description, "collection_id": folder,
+        "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
+    }  # fmt: skip
+    with taken(ConflictProblem(f"There is a dataset {request.name!r} already.", code="name-taken")):
+        tx.execute(insert(dataset).values(**row))
+    tx.execute(insert(dataset_ref).values(**_new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
+    tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
+    return _shown(find_dataset(tx, project_row, request.name))
+
+
+def _require_room(held: int, most: int, of_what: str) -> None:
+    if held >= most:
+        raise ConflictProblem(f"The greatest number of {of_what} is {most:,}; delete one first.", code="too-many")
+
+
+def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
+    """Return a dataset as a document."""
+    return _shown(find_dataset(tx, projects.require(tx, project), name))
+
+
+def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: int) -> Page:
+    """List the datasets of a project by name."""
+    project_row = projects.require(tx, project)
+    order = listing.parse_order("name", {"name": dataset.c.name, "id": dataset.c.id})
+    rows, following = listing.read_page(
+        tx, _shown_rows(project_row), order, ["datasets", project_row.id], cursor, limit
+    )
+    return Page(items=tuple(map(_shown, rows)), next_cursor=following)
+
+
+def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: ExpectedRev) -> None:
+    """Hide a dataset. Its name can be used again, and its commits stay in the database."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    absent = NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")
+    values = {"deleted_us": tx.now_us, "updated_us": tx.now_us}
+    change_row(tx, dataset, (dataset.c.id == row.id, _ALIVE), values, expected_rev=expected_rev, absent=absent)
+    tx.emit("dataset.deleted", row.id, project_id=project_row.id, name=name)
+
+
+# -- branches and tags ------------------------------------------------------------------------------------------------
+
+
+def _new_ref(tx: Transaction, dataset_id: str, name: str, kind: RefKind, digest: str | None) -> dict[str, Any]:
+    return {
+        "dataset_id": dataset_id, "name": name, "kind": kind.value, "digest": digest,
+        "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
+    }  # fmt: skip
+
+
+def _shown_ref(row: Row[Any]) -> Ref:
+    return Ref(
+        name=row.name, kind=RefKind(row.kind), commit=row.digest, created_at=datetime_of(row.created_us),
+        updated_at=datetime_of(row.updated_us), rev=row.rev,
+    )  # fmt: skip
+
+
+def list_refs(tx: Transaction, project: str, name: str, *, cursor: str | None, limit: int) -> Page:
+    """List the branches and tags of a dataset by name."""
+    row = find_dataset(tx, projects.require(tx, project), name)
+    order = listing.parse_order("name", {"name": dataset_ref.c.name}, unique="name")
+    statement = select(dataset_ref).where(dataset_ref.c.dataset_id == row.id)
+    rows, following = listing.read_page(tx, statement, order, ["refs", row.id], cursor, limit)
+    return Page(items=tuple(map(_shown_ref, rows)), next_cursor=following)
+
+
+def find_ref(tx: Transaction, dataset_id: str, name: str, *, lock: bool = False) -> Row[Any] | None:
+    """Return the row of a branch or tag, or None; with `lock`, it stays as it is until the transaction ends."""
+    statement = select(dataset_ref).where(dataset_ref.c.dataset_id == dataset_id, dataset_ref.c.name == name)
+    return tx.execute(statement.with_for_update() if lock else statement).first()
+
+
+def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
+    """Create a branch or a tag at a version. Raises `ConflictProblem` if the name is taken by either."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    digest = resolve(tx, row.id, request.at)
+    held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
+    _require_room(held, MOST_REFS, "branches and tags in a dataset")
+    with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
+        tx.execute(insert(dataset_ref).values(**_new_ref(tx, row.id, request.name, request.kind, digest)))
+    tx.emit(f"{request.kind.value}.created", row.id, project_id=project_row.id, name=request.name, commit=digest)
+    made = find_ref(tx, row.id, request.name)
+    assert made is not None
+    return _shown_ref(made)
+
+
+def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
+    """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    if ref == MAIN:
+        raise InvalidProblem(f"The branch {MAIN!r} cannot be deleted.", code="is-main")
+    which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == ref)
+    changed = change_row(
+        tx, dataset_ref, which, {"updated_us": tx.now_us}, expected_rev=expected_rev, absent=_no_version(ref)
+    )
+    tx.execute(delete(dataset_ref).where(*which))
+    tx.emit(f"{changed.kind}.deleted", row.id, project_id=project_row.id, name=ref, commit=changed.digest)
+
+
+# -- versions ---------------------------------------------------------------------------------------------------------
+
+
+def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
+    """Return the digest of the commit that a version names.
+
+    Raises `NotFoundProblem`, and `InvalidProblem` for digits with which several commits begin.
+    """
+    match = _VERSION.fullmatch(version)
+    if match is None:
+        raise _no_version(version)
+    name, back = match[1], int(match[2] or 0)
+    ref = find_ref(tx, dataset_id, name)
+    if ref is not None and ref.digest is None:
+        raise NotFoundProblem(f"The branch {name!r} has no commits yet.", code="no-commits")
+    digest = _by_digits(tx, dataset_id, name) if ref is None else str(ref.digest)
+    chain = first_parents(dataset_id, digest, back)
+    found = tx.execute(select(chain.c.digest).where(chain.c.place == back)).scalar()
+    if found is None:
+        raise NotFoundProblem(f"There are fewer than {back} commits before {name!r}.", code="no-version")
+    return str(found)
+
+
+def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
+    """Return the query of a commit and of its first parent, that one's first parent and so on, by `digest` and `place`.
+
+    `start` has the place 0; the query ends at the place `steps`.
+    """
+    first = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == start)
+    chain = select(dataset_commit.c.digest, literal_column("0").label("place")).where(*first).cte(recursive=True)
+    return chain.union_all(
+        select(commit_parent.c.parent, chain.c.place + 1).where(
+            commit_parent.c.dataset_id == dataset_id,
+            commit_parent.c.digest == chain.c.digest,
+            commit_parent.c.position == 0,
+            chain.c.place < steps,
+        )
+    )
+
+
+def _by_digits(tx: Transaction, dataset_id: str, name: str) -> str:
+    match = _DIGITS.fullmatch(name)
+    if match is None:
+        raise _no_version(name)
+    first = f"sha256:{match[1]}"
+    statement = select(dataset_commit.c.digest).where(
+        dataset_commit.c.dataset_id == dataset_id,
+        dataset_commit.c.digest >= first,
+        dataset_commit.c.digest <= f"{first}g",
+    )
+    found = tx.execute(statement.limit(2)).scalars().all()
+    if not found:
+        raise _no_version(name)
+    if len(found) > 1:
+        raise InvalidProblem(f"Several commits begin with {name!r}; write more digits.", code="ambiguous-version")
+    return str(found[0])
+
+
+def _no_version(name: str) -> NotFoundProblem:
+    return NotFoundProblem(
+        f"The dataset has no branch, tag or commit {name!r}.", code="no-version", context={"version": name}
+    )

@@ -1,0 +1,299 @@
+"""Datasets over HTTP: commits, branches, tags, differences, merges and checkouts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import update
+from tests.support.rest_server import Server
+
+from marey_schemas.access import Role
+from marey_server.access.principal import SYSTEM
+from marey_server.store.database.connections import Database
+from marey_server.store.fsck import check_store
+from marey_server.store.tables import dataset_commit, tree_chunk
+from marey_server.store.transaction import Transaction
+
+LAB = "/projects/lab"
+GAITS = f"{LAB}/datasets/gaits"
+
+
+def ok(response: httpx.Response, status: int = 200) -> Any:
+    assert response.status_code == status, response.text
+    return response.json()
+
+
+def refused(response: httpx.Response, status: int, code: str) -> Any:
+    assert (response.status_code, response.json().get("code")) == (status, code), response.text
+    return response.json()
+
+
+def skeleton(name: str, joint: str = "Hips", *, folder: str = "gaits", mapped: bool = False) -> dict[str, Any]:
+    """The body of a request for a skeleton with one joint."""
+    parts: dict[str, Any] = {"hierarchy": hierarchy(joint)}
+    if mapped:
+        parts["mapping"] = {"schema": "marey/skeleton-mapping@1", "joints": {joint: "hips"}}
+    return {"name": name, "collection": folder, "parts": parts}
+
+
+def hierarchy(joint: str) -> dict[str, Any]:
+    return {"schema": "marey/skeleton@1", "joints": [{"name": joint, "parent": -1, "offset": [0, 1, 0]}]}
+
+
+@pytest.fixture
+def gaits(owner: httpx.Client) -> Callable[..., Any]:
+    """Makes the dataset `gaits`, whose folder has the skeletons `a` and `b`; the function commits its folder."""
+    for name in ("a", "b"):
+        ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}")), 201)
+    ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)
+
+    def commit(message: str = "m", **fields: Any) -> Any:
+        return ok(owner.post(f"{GAITS}/commits", json={"message": message, **fields}), 201)
+
+    commit("first")
+    return commit
+
+
+def item_at(owner: httpx.Client, path: str) -> Any:
+    (found,) = ok(owner.get(f"{LAB}/skeletons", params={"path": path}))["items"]
+    return found
+
+
+def change(owner: httpx.Client, path: str, **fields: Any) -> Any:
+    url = f"{LAB}/skeletons/{item_at(owner, path)['id']}"
+    return ok(owner.patch(url, json=fields, headers={"If-Match": "*"}))
+
+
+def put(owner: httpx.Client, path: str, joint: str) -> Any:
+    """Replace the only joint of a skeleton."""
+    url = f"{LAB}/skeletons/{item_at(owner, path)['id']}/parts/hierarchy"
+    return ok(owner.put(url, json=hierarchy(joint), headers={"If-Match": "*"}))
+
+
+def entries(owner: httpx.Client, version: str = "main") -> dict[str, Any]:
+    found = ok(owner.get(f"{GAITS}/entries", params={"version": version, "limit": 1000}))["items"]
+    return {one["path"]: one for one in found}
+
+
+def difference(owner: httpx.Client, before: str, after: str) -> list[tuple[str, str, str | None]]:
+    found = ok(owner.get(f"{GAITS}/difference", params={"before": before, "after": after}))
+    return [(one["change"], one["path"], one.get("was")) for one in found["entries"]]
+
+
+def test_commits_record_the_folder_and_name_its_items(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    first = entries(owner)
+    assert sorted(first) == ["a", "b"]
+    assert first["a"]["item"] == item_at(owner, "gaits/a")["id"]
+    put(owner, "gaits/a", "Pelvis")
+    change(owner, "gaits/b", name="c", tags=["slow"])
+    ok(owner.post(f"{LAB}/skeletons", json=skeleton("d", folder="gaits/more")), 201)
+    second = gaits("second")
+    assert (second["entries"], len(second["parents"])) == (3, 1)
+    assert difference(owner, "main~1", "main") == [
+        ("changed", "a", None), ("moved", "c", "b"), ("added", "more/d", None),
+    ]  # fmt: skip
+    assert entries(owner, "main~1") == first
+    log = ok(owner.get(f"{GAITS}/commits", params={"limit": 1}))
+    assert [one["message"] for one in log["items"]] == ["second"]
+    rest = ok(owner.get(f"{GAITS}/commits", params={"limit": 1, "cursor": log["next_cursor"]}))
+    assert ([one["message"] for one in rest["items"]], rest["next_cursor"]) == (["first"], None)
+
+
+def test_equal_content_has_the_same_tree_whatever_the_ids(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    for name in ("a", "b"):
+        ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}", folder="copy")), 201)
+    ok(owner.post(f"{LAB}/datasets", json={"name": "copy", "collection": "copy"}), 201)
+    copied = ok(owner.post(f"{LAB}/datasets/copy/commits", json={"message": "m"}), 201)
+    assert copied["tree"] == ok(owner.get(f"{GAITS}/commits/main"))["tree"]
+
+
+def test_references_are_named_by_content(owner: httpx.Client) -> None:
+    """Clips of equal skeletons have equal content, although each names its skeleton by another id."""
+    trees = []
+    for folder in ("one", "two"):
+        used = ok(owner.post(f"{LAB}/skeletons", json=skeleton("rig", folder=folder)), 201)["id"]
+        motion = {
+            "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"],
+            "skeleton": {"item": used, "revision": 1},
+            "poses": {"dtype": "<f4", "shape": [1, 7], "data": [[0, 1, 0, 1, 0, 0, 0]]},
+        }  # fmt: skip
+        clip = {"name": "walk", "collection": folder, "parts": {"motion": motion}}
+        ok(owner.post(f"{LAB}/clips", json=clip), 201)
+        ok(owner.post(f"{LAB}/datasets", json={"name": folder, "collection": folder}), 201)
+        trees.append(ok(owner.post(f"{LAB}/datasets/{folder}/commits", json={"message": "m"}), 201)["tree"])
+    assert trees[0] == trees[1]
+
+
+def test_a_repeated_commit_is_made_once(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    change(owner, "gaits/a", tags=["slow"])
+    request = {"message": "again", "write_id": "12345678"}
+    first = ok(owner.post(f"{GAITS}/commits", json=request), 201)
+    assert ok(owner.post(f"{GAITS}/commits", json=request), 201) == first
+    refused(owner.post(f"{GAITS}/commits", json={"message": "nothing"}), 422, "no-changes")
+
+
+def test_a_commit_for_another_state_of_the_branch_is_refused(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    before = ok(owner.get(f"{GAITS}/commits/main"))["digest"]
+    change(owner, "gaits/a", tags=["slow"])
+    gaits("second")
+    change(owner, "gaits/a", tags=["fast"])
+    moved = refused(owner.post(f"{GAITS}/commits", json={"message": "late", "expected": before}), 409, "branch-moved")
+    assert moved["context"]["commit"] == ok(owner.get(f"{GAITS}/commits/main"))["digest"]
+
+
+def test_explicit_changes_need_no_folder(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    a = item_at(owner, "gaits/a")["id"]
+    ok(owner.post(f"{LAB}/datasets", json={"name": "chosen"}), 201)
+    url = f"{LAB}/datasets/chosen"
+    refused(owner.post(f"{url}/commits", json={"message": "m"}), 422, "no-folder")
+    added = {"change": "put", "path": "best/a", "item": a}
+    ok(owner.post(f"{url}/commits", json={"message": "m", "changes": [added]}), 201)
+    moved = {"change": "move", "path": "best/a", "kind": "skeleton", "to": "a"}
+    made = ok(owner.post(f"{url}/commits", json={"message": "m", "changes": [moved]}), 201)
+    assert made["entries"] == 1
+    missing = {"change": "remove", "path": "best/a", "kind": "skeleton"}
+    refused(owner.post(f"{url}/commits", json={"message": "m", "changes": [missing]}), 404, "no-entry")
+    other = {"change": "put", "path": "x", "item": "skeleton_of_nobody"}
+    refused(owner.post(f"{url}/commits", json={"message": "m", "changes": [other]}), 404, "no-item")
+
+
+def test_versions_are_named_by_branch_tag_digest_and_steps_back(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    first = ok(owner.get(f"{GAITS}/commits/main"))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag"}), 201)
+    change(owner, "gaits/a", tags=["slow"])
+    gaits("second")
+    digits = first["digest"].removeprefix("sha256:")[:8]
+    for version in ("v1", "main~1", digits, first["digest"]):
+        assert ok(owner.get(f"{GAITS}/commits/{version}")) == first
+    refused(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "branch"}), 409, "name-taken")
+    for version in ("v2", "main~2", "0" * 64, "main~x", "~1", "main~99999"):
+        refused(owner.get(f"{GAITS}/commits/{version}"), 404, "no-version")
+    refused(owner.post(f"{GAITS}/commits", json={"message": "m", "branch": "v1"}), 422, "is-tag")
+    refused(owner.delete(f"{GAITS}/refs/main", headers={"If-Match": "*"}), 422, "is-main")
+    assert owner.delete(f"{GAITS}/refs/v1", headers={"If-Match": "*"}).status_code == 204
+    assert [one["name"] for one in ok(owner.get(f"{GAITS}/refs"))["items"]] == ["main"]
+
+
+def test_a_checkout_gives_the_folder_a_version_and_keeps_ids(
+    owner: httpx.Client, gaits: Callable[..., Any], database: Database
+) -> None:
+    ids = {name: item_at(owner, f"gaits/{name}")["id"] for name in ("a", "b")}
+    put(owner, "gaits/a", "Pelvis")
+    owner.delete(f"{LAB}/skeletons/{ids['b']}", headers={"If-Match": "*"})
+    ok(owner.post(f"{LAB}/skeletons", json=skeleton("c")), 201)
+    refused(owner.post(f"{GAITS}/checkout", json={}), 409, "uncommitted-changes")
+    gaits("second")
+    back = ok(owner.post(f"{GAITS}/checkout", json={"version": "main~1"}))
+    assert {name: back[name] for name in ("added", "removed", "moved", "changed")} == {
+        "added": 1, "removed": 1, "moved": 0, "changed": 1,
+    }  # fmt: skip
+    assert {name: item_at(owner, f"gaits/{name}")["id"] for name in ("a", "b")} == ids
+    assert item_at(owner, "gaits/a")["revision"] == 3
+    refused(owner.post(f"{GAITS}/commits", json={"message": "m"}), 409, "folder-elsewhere")
+    ok(owner.post(f"{GAITS}/checkout", json={}))
+    assert sorted(entries(owner)) == ["a", "c"]
+    assert not list(check_store(database))
+
+
+def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    ids = {name: item_at(owner, f"gaits/{name}")["id"] for name in ("a", "b")}
+    change(owner, "gaits/a", name="x")
+    change(owner, "gaits/b", name="a")
+    change(owner, "gaits/x", name="b")
+    gaits("swapped")
+    ok(owner.post(f"{GAITS}/checkout", json={"version": "main~1"}))
+    assert {name: item_at(owner, f"gaits/{name}")["id"] for name in ("a", "b")} == ids
+
+
+@pytest.fixture
+def two_branches(
+    owner: httpx.Client, gaits: Callable[..., Any]
+) -> Callable[[Callable[[], Any], Callable[[], Any]], None]:
+    """Commits one change to the branch `trial` and another to `main`; the folder has the entries of `main`."""
+
+    def diverge(on_trial: Callable[[], Any], on_main: Callable[[], Any]) -> None:
+        ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
+        on_trial()
+        gaits("on trial", branch="trial")
+        ok(owner.post(f"{GAITS}/checkout", json={"version": "main"}))
+        on_main()
+        gaits("on main")
+
+    return diverge
+
+
+def test_a_merge_combines_changes_of_different_parts_of_an_entry(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: change(owner, "gaits/a", name="c", tags=["slow"]))
+    preview = ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "preview": True}))
+    assert (preview["commit"], preview["changes"], preview["conflict_count"]) == (None, 1, 0)
+    merged = ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))["commit"]
+    assert merged["parents"] == [preview["ours"], preview["theirs"]]
+    found = entries(owner)
+    assert sorted(found) == ["b", "c"]
+    assert found["c"]["tags"] == ["slow"]
+    assert found["c"]["parts"] == entries(owner, "trial")["a"]["parts"]
+    refused(owner.post(f"{GAITS}/merges", json={"version": "trial"}), 422, "already-merged")
+    ok(owner.post(f"{GAITS}/checkout", json={}))
+    joints = ok(owner.get(f"{LAB}/skeletons/{item_at(owner, 'gaits/c')['id']}/parts/hierarchy"))["joints"]
+    assert [joint["name"] for joint in joints] == ["Pelvis"]
+
+
+def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Callable[..., None]) -> None:
+    two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: put(owner, "gaits/a", "Root"))
+    before = ok(owner.get(f"{GAITS}/commits/main"))
+    conflict = refused(owner.post(f"{GAITS}/merges", json={"version": "trial"}), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"]) for one in conflict["conflicts"]] == [("a", ["hierarchy"])]
+    assert ok(owner.get(f"{GAITS}/commits/main")) == before
+    other = [{"path": "b", "kind": "skeleton", "take": "ours"}]
+    refused(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": other}), 422, "no-conflict")
+    theirs = [{"path": "a", "kind": "skeleton", "take": "theirs"}]
+    ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "resolutions": theirs}))
+    assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
+
+
+def test_a_branch_that_has_not_moved_is_moved_by_a_merge(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
+    change(owner, "gaits/a", tags=["slow"])
+    made = gaits("on trial", branch="trial")
+    assert ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))["commit"] == made
+
+
+def test_histories_that_crossed_are_not_merged(owner: httpx.Client, two_branches: Callable[..., None]) -> None:
+    two_branches(lambda: change(owner, "gaits/a", tags=["x"]), lambda: change(owner, "gaits/b", tags=["y"]))
+    ok(owner.post(f"{GAITS}/refs", json={"name": "old", "kind": "branch"}), 201)
+    ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))
+    ok(owner.post(f"{GAITS}/merges", json={"version": "old", "into": "trial"}))
+    crossed = refused(owner.post(f"{GAITS}/merges", json={"version": "trial"}), 409, "several-bases")
+    assert len(crossed["context"]["commits"]) == 2
+
+
+def test_readers_read_and_contributors_commit(server: Server, gaits: Callable[..., Any]) -> None:
+    reader = server.client(server.make_user("rita"))
+    refused(reader.get(f"{GAITS}/entries"), 404, "no-project")
+    owner = server.client(next(token for token in server._clients if token and token.startswith("marey_")))
+    ok(owner.put(f"{LAB}/members/rita", json={"role": Role.READER.value}))
+    assert sorted(entries(reader)) == ["a", "b"]
+    refused(reader.post(f"{GAITS}/commits", json={"message": "m"}), 403, "insufficient-role")
+    refused(reader.post(f"{GAITS}/merges", json={"version": "main", "preview": True}), 403, "insufficient-role")
+
+
+def test_a_deleted_folder_is_not_committed_as_empty(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    (folder,) = ok(owner.get(f"{LAB}/collections", params={"path": "gaits"}))["items"]
+    assert owner.delete(f"{LAB}/collections/{folder['id']}", headers={"If-Match": "*"}).status_code == 204
+    refused(owner.post(f"{GAITS}/commits", json={"message": "m"}), 422, "folder-deleted")
+    assert sorted(entries(owner)) == ["a", "b"]
+
+
+def test_damaged_versions_are_found(owner: httpx.Client, gaits: Callable[..., Any], database: Database) -> None:
+    def damage(tx: Transaction) -> None:
+        tx.execute(update(tree_chunk).values(data=b'{"level":0,"entries":[]}'))
+        tx.execute(update(dataset_commit).values(message="forged"))
+
+    assert not list(check_store(database))
+    database.write(SYSTEM, damage)
+    assert {one.code for one in check_store(database)} == {"chunk-corrupt", "commit-corrupt"}
