@@ -210,7 +210,7 @@ def as_kernel_input(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def as_local_rotations(skeleton: Skeleton, rotations: AnyFloats) -> AnyFloats:
-    """Convert rotations in the world to local ones.
+    """Convert rotations in the world to local rotations.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def forward_directions(positions: AnyFloats, left: Sequence[int], right: Sequenc
 
     Raises
     ------
-    MotionError    when no frame has a direction
+    MotionError    if no frame has a direction
 
     Examples
     --------

@@ -75,8 +75,8 @@ def _load_offsets(offsets, translations, slots, start, count, points):  # type: 
 def positions(poses, offsets, parents, translations, slots, turned, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 3·P) with global positions of P points: J joints, then end sites.
 
-    poses (F, 3 + 4·J); offsets (P, 3); parents (P,); translations (F, k, 3) with slots (P,) into its second axis or -1;
-    turned (J,) says whether a joint's global rotation is needed by a child.
+    The inputs are poses (F, 3 + 4·J), offsets (P, 3), parents (P,) and translations (F, k, 3). `slots` (P,) is the
+    index of each point's translation, or -1. `turned` (J,) marks the joints whose global rotation a child needs.
     """
     joints = turned.shape[0]
     rotation = np.zeros(joints * QUATERNION, poses.dtype)
@@ -97,7 +97,7 @@ def positions(poses, offsets, parents, translations, slots, turned, out):  # typ
 
 @contracted
 def rotations(local, parents, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (F, 4·J) with global rotations of the local ones (F, 4·J)."""
+    """Convert local rotations `local` (F, 4·J) to global rotations `out` (F, 4·J)."""
     rotation = np.zeros(parents.shape[0] * QUATERNION, local.dtype)
     for start in range(0, local.shape[0], BLOCK):
         block = local[start : start + BLOCK]

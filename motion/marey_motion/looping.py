@@ -1,4 +1,4 @@
-"""Loops: clips whose last frame leads into their first one, elsewhere on the ground.
+"""Loops: clips whose last frame leads into their first frame, which may be at another position on the ground.
 
 Ground positions are (x, z) in metres, headings radians that grow to the left.
 """

@@ -61,7 +61,7 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
     Raises
     ------
-    MotionError    when `partners` is not a pairing of the skeleton's joints
+    MotionError    if `partners` is not a pairing of the skeleton's joints
 
     Notes
     -----
@@ -89,7 +89,7 @@ def mirror_motion(skeleton: Skeleton, partners: AnyInts, motion: Motion) -> Moti
 
     Raises
     ------
-    MotionError    when `partners` is not a pairing of the skeleton's joints
+    MotionError    if `partners` is not a pairing of the skeleton's joints
     """
     mirror = _mirror_of(skeleton, tuple(int(partner) for partner in partners))
     rotations = quaternions.multiply(mirror.outer, motion.rotations[:, mirror.sources])

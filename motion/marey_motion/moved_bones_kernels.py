@@ -47,9 +47,9 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
 
 @compiled
 def turn_joints(world, parents, joints, turns, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (F, 4·J) with local rotations of the global ones `world` (F, J, 4), some of them turned.
+    """Turn some of the global rotations `world` (F, J, 4), and fill `out` (F, 4·J) with the new local rotations.
 
-    `joints` (B,) are turned by `turns` (B, F, 4); parents (J,).
+    `joints` (B,) are turned by `turns` (B, F, 4). `parents` (J,) is the hierarchy.
     """
     turned = np.empty((parents.shape[0], 4))
     for f in range(world.shape[0]):

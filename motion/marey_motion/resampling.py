@@ -39,7 +39,7 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
 
     Raises
     ------
-    ClipError    when the rate is not a positive number
+    ClipError    if the rate is not a positive number
     """
     if _are_same(frame_rate_hz, clip.frame_rate_hz):
         return clip
@@ -62,7 +62,7 @@ def resample_motion(motion: Motion, from_hz: float, to_hz: float, *, seam: LoopS
 
     Raises
     ------
-    ClipError    when the rate is not a positive number
+    ClipError    if the rate is not a positive number
     """
     if not (np.isfinite(to_hz) and to_hz > 0):
         raise ClipError(f"the frame rate must be a positive number, not {to_hz}", where="frame_rate_hz")

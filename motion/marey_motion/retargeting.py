@@ -118,7 +118,7 @@ def plan_retarget(
     target : Skeleton    the skeleton to which clips are transferred
     target_mapping : JointMapping    its standard joints
     target_axes : mapping of str to JointAxes    its axes
-    scale : float, optional    target metres per source metre of travel; the ratio of the hip heights when None
+    scale : float, optional    target metres per source metre of travel; the ratio of the hip heights if None
 
     Returns
     -------

@@ -16,7 +16,9 @@ CARRIED = 2
 def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
-    local (F, 4·J) source rotations, parents (J,); ways, sources (K,), corrections, rests (K, 4), target_parents (K,).
+    `local` (F, 4·J) are the local rotations of the source and `parents` (J,) its hierarchy. Each target joint has a way
+    (K,), which is AT_REST, MAPPED or CARRIED, a source joint (K,), a correction (K, 4) of its source's global rotation,
+    a rest rotation (K, 4) and a parent (K,).
     """
     joints, targets = parents.shape[0], target_parents.shape[0]
     source = np.empty((joints, 4))

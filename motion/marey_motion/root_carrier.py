@@ -23,7 +23,7 @@ def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats,
     """Place a joint in the world and let the root follow.
 
     The root moves along, and the joints it carries keep their rotations; translations of `carrier` and of joints above
-    it are merged into those of the root.
+    it are merged into the root's translations.
 
     Parameters
     ----------

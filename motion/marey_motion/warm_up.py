@@ -283,7 +283,7 @@ STAGES: Mapping[str, Callable[[Clip], None]] = {
     "alignment": _align,
     "coverage": _measure,
 }
-"""Functions that use kernels, by name; first the one that the others need, then the longest first."""
+"""Functions that use kernels, by name; first the function that the others need, then the others, the longest first."""
 
 
 def main() -> None:

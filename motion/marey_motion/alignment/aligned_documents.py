@@ -93,7 +93,7 @@ def example_to_tree(
 
 
 def set_from_examples(examples: Sequence[StoredExample]) -> AlignedSet:
-    """Assemble a set from stored examples, ordered by name and uid. Some of the set's examples may be missing.
+    """Assemble a set from stored examples, in the order of name and uid, even if some of its examples are missing.
 
     Parameters
     ----------

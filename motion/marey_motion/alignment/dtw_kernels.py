@@ -99,7 +99,7 @@ def total(costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def align_limited(costs, max_run, path):  # type: ignore[no-untyped-def]
-    """Fill `path` like `align`, with at most `max_run` consecutive steps 1-0, or 0-1."""
+    """Fill `path` like `align`, with at most `max_run` consecutive steps in one motion alone."""
     n, m = costs.shape
     # Least totals of the paths to each cell whose last step is not in the first alone, and not in the second alone.
     not_first, not_second = np.empty((n, m)), np.empty((n, m))
@@ -125,10 +125,10 @@ def total_limited(costs, max_run):  # type: ignore[no-untyped-def]
 
 @compiled
 def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first, not_second):  # type: ignore[no-untyped-def]
-    """Fill a row of totals from the row before; row r of `runs` (max_run, m) is for runs of r + 1 steps 1-0.
+    """Fill a row of totals from the row before; row r of `runs` is for r + 1 steps in the first motion alone.
 
-    A run of steps 0-1 starts from totals that depend only on the row before. No cell therefore waits for its left
-    neighbour, and every loop runs over whole vectors.
+    `runs` has the shape (max_run, m). A run of steps in the second motion alone starts from totals that depend only on
+    the row before. No cell therefore waits for its left neighbour, and every loop runs over whole vectors.
     """
     m, max_run = costs.shape[0], runs.shape[0]
     if i == 0:
@@ -162,7 +162,8 @@ def _limited_row(costs, i, first_before, second_before, runs, scratch, not_first
 def _walk_back_limited(costs, max_run, not_first, not_second, path):  # type: ignore[no-untyped-def]
     """Fill `path`, last cell first, one run of equal steps at a time; return the number of cells.
 
-    Among equally cheap steps a step 1-1 is preferred to 1-0, and 1-0 to 0-1.
+    Among equally cheap steps, a step in both motions is preferred to a step in the first alone, and that to a step in
+    the second alone.
     """
     i, j, length = costs.shape[0] - 1, costs.shape[1] - 1, 0
     barred = BOTH  # what the step that was taken last, in time, forbids: to go on as another run of its own kind

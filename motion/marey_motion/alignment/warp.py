@@ -24,9 +24,9 @@ def time_function(path: NDArray[np.integer]) -> Floats:
     """Compute the time function of an alignment path between a reference and a source.
 
     A canonical frame that is matched with several source frames is mapped to their mean. A source frame that is matched
-    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. First frames
-    and last frames correspond exactly. If a slope is below `LEAST_SLOPE`, all slopes are replaced by the nearest ones,
-    in least squares, that are at least `LEAST_SLOPE`.
+    with several canonical frames is assigned to their mean; the frames between are interpolated linearly. The first
+    frames of both motions correspond exactly, and so do the last frames. If a slope is below `LEAST_SLOPE`, all slopes
+    are replaced by the nearest ones, in least squares, that are at least `LEAST_SLOPE`.
 
     Parameters
     ----------

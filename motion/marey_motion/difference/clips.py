@@ -90,7 +90,7 @@ def _translated(clip: Clip) -> tuple[str, ...]:
 def _translation_changes(
     before: Clip, after: Clip, joints: JointPairs, timing: Timing, course: Course, threshold_cm: float
 ) -> tuple[JointChange, ...]:
-    """Compare the translations of joints that are translated in either clip; the offset replaces an absent one."""
+    """Compare the translations of joints that are translated in either clip; offsets replace missing translations."""
     moved = [
         (old, new)
         for old, new in zip(joints.before, joints.after, strict=True)

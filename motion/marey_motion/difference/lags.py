@@ -1,4 +1,4 @@
-"""Candidates for the shift in time between two clips: frame of the clip after minus corresponding frame before."""
+"""Candidates for the lag between two clips: the frame number in the clip after minus that in the clip before."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
     Returns
     -------
-    tuple of int    frame after minus frame before, the most frequent first
+    tuple of int    number of the frame in `after` minus that of the equal frame in `before`, the most frequent first
     """
     votes: Counter[int] = Counter()
     for hashed in (_hashes, _body_hashes):
@@ -50,7 +50,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
 
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
-    """Find shifts at which windows of frames before are most similar to frames after.
+    """Find shifts at which windows of `before` are most similar to frames of `after`.
 
     Each window is compared with every place of the other clip at once, by correlation in the frequency domain.
 
@@ -61,7 +61,7 @@ def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, 
 
     Returns
     -------
-    tuple of int    frame after minus frame before
+    tuple of int    number of the frame in `after` minus that of the similar frame in `before`
     """
     length = min(before.frame_count, after.frame_count, max(SHORTEST_WINDOW, before.frame_count // WINDOWS))
     size = 1 << int(np.ceil(np.log2(after.frame_count + length)))

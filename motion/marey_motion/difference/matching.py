@@ -1,8 +1,8 @@
-"""Matching of frames: the monotone sequence of runs with the least cost in which two clips correspond.
+"""Matching of the frames of two clips: the monotone sequence of runs of corresponding frames that has the least cost.
 
-Within a run, each frame after corresponds to the frame before that is a fixed number of frames (the lag) away. Between
-runs, frames are removed or inserted. The runs are the cheapest path through the candidates for lags, so an insertion
-leaves the frames after it matched, and still or cyclic motion has no more runs than needed.
+Within a run, the numbers of corresponding frames differ by a constant, the lag. Between runs, frames are removed or
+inserted. The runs are the cheapest path through the candidates for lags, so frames that follow an insertion remain
+matched, and still or cyclic motion has no more runs than needed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Matching(NamedTuple):
 
     Parameters
     ----------
-    pairs : (n, 2) int    frame before and frame after, both increasing
+    pairs : (n, 2) int    frames of the clip before and matched frames of the clip after, both increasing
     costs : (n,) float64    costs of the pairs
     total : float    cost of the matching, including removed and inserted frames
     """
@@ -119,7 +119,7 @@ def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
-    """Return the least cost of entering a diagonal from another one before each of its frames, and at its end."""
+    """Return, before each frame of a diagonal and at its end, the least cost of entering it from another diagonal."""
     one = diagonals[place]
     least = np.full(len(one.costs), np.inf)
     for other, values in zip(diagonals, reached, strict=True):

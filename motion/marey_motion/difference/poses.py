@@ -71,7 +71,7 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
     Parameters
     ----------
     before, after : Poses    frames of the same J joints
-    pairs : (n, 2) int    frame before and frame after
+    pairs : (n, 2) int    frame of `before` and frame of `after`
 
     Returns
     -------
@@ -94,7 +94,7 @@ def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
     Parameters
     ----------
     before, after : Poses    frames of the same J joints
-    pairs : (n, 2) int    frame before and frame after
+    pairs : (n, 2) int    frame of `before` and frame of `after`
 
     Returns
     -------
@@ -116,11 +116,12 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
     Parameters
     ----------
     before, after : Poses    frames of the same J joints
-    pairs : (n, 2) int    frame before and frame after
+    pairs : (n, 2) int    frame of `before` and frame of `after`
 
     Returns
     -------
-    offsets : (n,) float64    frames by which the frame after is later in the clip before than its partner
+    offsets : (n,) float64    number of frames by which the pose of a frame of `after` occurs later in `before` than the
+        frame paired with it
     weights : (n,) float64    reliability: squared speeds, 0 where nothing moves
     """
     offsets, weights = np.zeros(len(pairs)), np.zeros(len(pairs))

@@ -45,7 +45,7 @@ def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
 
     Returns
     -------
-    JointPairs    in the order of the skeleton after
+    JointPairs    pairs in the order of the skeleton `after`
     """
     places = {name: joint for joint, name in enumerate(before.joint_names)}
     kept = set(before.joint_names) & set(after.joint_names)
@@ -64,7 +64,7 @@ def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
 def _renamed_from(
     before: Skeleton, after: Skeleton, joint: int, found: Mapping[int, int], kept: set[str]
 ) -> int | None:
-    """Return the only joint before that may have had another name, or None."""
+    """Return the only joint of `before` that may have been renamed to joint `joint` of `after`, or None."""
     parent = int(after.parents[joint])
     if parent >= 0 and parent not in found:
         return None

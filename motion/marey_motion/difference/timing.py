@@ -159,7 +159,7 @@ def _unmatched(before: tuple[int, int], after: tuple[int, int]) -> list[FrameRun
 
 
 def _edges(timing: Timing, count_before: int) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Return the ranges before and after of each run of matched frames, in frames of the stored clips."""
+    """Return the ranges of each run of matched frames in both clips, in frames of the stored clips."""
     pairs = timing.matching.pairs
     if not len(pairs):
         return []

@@ -17,7 +17,7 @@ PER_RIG = 10_000_000
 """Work of finding the limbs of a skeleton and the axes they bend about, in nanoseconds."""
 PER_PLANTED_NUMBER = 600
 PER_TAP, MOST_OF_TAPS = 0.35, 200.0
-"""Work of a moving mean per number of the motion: per frame of its window, and the maximum for long windows."""
+"""Work of a moving mean for each number of the motion, in nanoseconds: per frame of the window, and the maximum."""
 PER_MEETING, PER_MET_NUMBER = 1_000_000, 10
 """Work of solving and blending in one range of constraints, and additional work for each number in its frames."""
 

@@ -244,7 +244,7 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Return the toe contacts of the command; a heel is in contact in those of these frames in which it is slow."""
+    """Return the toe contacts of the command, and heel contacts in those of the same frames in which heels are slow."""
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):

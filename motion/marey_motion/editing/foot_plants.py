@@ -58,7 +58,8 @@ class PlantedMotion:
     ----------
     motion : the whole motion
     contacts : frames in which each foot touches the ground
-    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 without contacts
+    slide_before_m, slide_after_m : distance that a toe slides per contact, mean over contacts; 0 if there are no
+        contacts
     lowered_m : largest distance by which the root is lowered
     """
 

@@ -24,7 +24,7 @@ SAME_AXES_RAD = 0.02
 
 
 def paste(take: Take, command: Paste) -> Take:
-    """Replace the motion of joints by a range of another clip (Herrmann et al. 2019, section 4.1.4).
+    """Replace the motion of joints with a range of another clip (Herrmann et al. 2019, section 4.1.4).
 
     The range is resampled with cubic splines to the frames it fills; equal lengths are copied exactly. Within the
     borders rotations are blended along the shorter arc, translations along straight lines.

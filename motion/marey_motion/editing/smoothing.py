@@ -26,7 +26,7 @@ LEAST_LENGTH = 0.1
 
 
 def smooth(take: Take, command: Smooth) -> Take:
-    """Replace the joints' rotations and translations and the root's path by weighted averages over time.
+    """Replace the joints' rotations and translations and the root's path with weighted averages over time.
 
     No frame is lost: beyond its ends, the motion is continued by its point reflection through the end poses, so that
     the first and the last frame, and straight paths, do not change. Rotations are averaged as quaternions of continuous

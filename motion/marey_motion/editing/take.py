@@ -25,7 +25,7 @@ MOST_NUMBERS = 200_000_000
 
 
 UNIT_IN_SINGLE = 3e-7
-"""Largest difference between the squared length of a unit quaternion and one after rounding to single precision."""
+"""Largest deviation from 1 of the squared length of a unit quaternion after rounding to single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class Take:
         return int(motion.root_translations.size + motion.rotations.size + motion.translations.size)
 
     def moved(self, motion: Motion) -> Take:
-        """Replace the motion by another one of the same body and frame rate.
+        """Replace the motion with another one of the same body and frame rate.
 
         Parameters
         ----------

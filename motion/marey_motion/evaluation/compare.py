@@ -33,7 +33,7 @@ LESS_IS_BETTER = (
     "pose_cost_p95",
     "response_s",
 )
-"""Metrics of which a lower value is better; of all others only the change is reported."""
+"""Metrics of which a lower value is better; for all other metrics, only the change is reported."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ A trial counts as followed if the character meets three limits, on average over 
 
 * its distance from the desired position is at most the distance that it travels in half a second at the desired speed,
 * its speed differs from the desired speed by at most 15 %,
-* its turn rate differs from the desired one by at most 10 degrees a second.
+* its turn rate differs from the desired turn rate by at most 10 degrees a second.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
 poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade can be reached.
@@ -46,7 +46,8 @@ class Judgement:
     ----------
     grade : str    one of `GRADES`
     followed, trials : int    number of followed trials, and of all trials
-    worst : TrialResult, optional    the trial with the largest ratio of an error to its limit; None without trials
+    worst : TrialResult, optional    the trial with the largest ratio of an error to its limit; None if there are no
+        trials
     """
 
     grade: str
@@ -88,7 +89,7 @@ def is_followed(outcome: TrialResult) -> bool:
 
 
 def strain(outcome: TrialResult) -> Strain:
-    """Compute the ratio of a trial's errors to each limit.
+    """Compute the ratio of each of a trial's errors to its limit.
 
     Parameters
     ----------

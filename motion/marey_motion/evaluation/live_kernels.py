@@ -16,7 +16,7 @@ RECEIVED, SMOOTHED = 0, 1
 
 @compiled
 def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
-    """Estimate a column of the raw root at a frame by the polynomial through the frames around it."""
+    """Estimate a column of the raw root at a frame by the polynomial fitted to the frames around it."""
     width = smoother.shape[0]
     first = max(min(frame - width // 2, take.counters[RECEIVED] - width), 0)
     total = 0.0

@@ -213,7 +213,7 @@ def _offset_metrics(series: TrialSeries, window: Flags) -> dict[str, float | Non
 
 
 def _response_metrics(series: TrialSeries, window: Flags) -> dict[str, float | None]:
-    """Compute the mean response time to speed switches (None without any) and count the switches without response."""
+    """Compute the mean response time to speed switches, or None, and count the switches without response."""
     times = [
         _response_s(series, first, stop)
         for first, stop in _stretches(series.pieces)
@@ -237,7 +237,7 @@ def _hold_steps(series: TrialSeries) -> int:
 
 
 def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
-    """Compute the seconds from a switch until the speed stays correct; None if the next switch comes first."""
+    """Compute the seconds from a speed switch until the speed stays correct; None if the next switch comes first."""
     wanted = series.wanted_speeds_m_s[first:stop]
     right = np.abs(series.speeds_m_s[first:stop] - wanted) < RESPONSE_SHARE * wanted
     hold = _hold_steps(series)
@@ -359,7 +359,7 @@ def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
 
     Returns
     -------
-    float or None    metres; None without pairs
+    float or None    metres; None if no two trials differ only in the direction of turning
     """
     offsets = {
         (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset

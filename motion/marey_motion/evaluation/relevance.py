@@ -18,7 +18,7 @@ TREADING_S = 1 / 3
 
 
 class Jumps(NamedTuple):
-    """Jumps of a character from one place in the clips to another.
+    """Jumps of a character from a row to another row that does not follow it.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]
 
     Returns
     -------
-    float or None    0 to 1; None without jumps
+    float or None    0 to 1; None if there are no jumps
     """
     made = back = 0
     for record in records:

@@ -73,7 +73,7 @@ class Reference:
 
     Parameters
     ----------
-    tick_count : number T of ticks of the trial itself; the arrays have L more rows
+    tick_count : number T of ticks of the trial itself; the arrays have L more rows, the look-ahead
     positions : (T + L, 2) float64    metres on the ground
     headings, speeds_m_s, turn_rates_rad_s : (T + L,) float64
     """

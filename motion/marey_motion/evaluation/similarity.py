@@ -39,8 +39,9 @@ class PoseSimilarity:
         source
     measured : (V, O) int64    number of frames compared; evenly chosen if there are more than `MOST_FRAMES`
     distance_m : (V, O) median distance; NaN with fewer than two sources
-    blendable_share : (V, O) share of the measured frames within the threshold; 0 with one source, NaN without frames
-    share : mean of `blendable_share`, weighted by the frames of each cell; None without frames
+    blendable_share : (V, O) share of the measured frames within the threshold; 0 if the cell has one source, NaN if it
+        has no frames
+    share : mean of `blendable_share`, weighted by the frames of each cell; None if there are no frames
     """
 
     threshold_m: float
@@ -61,7 +62,7 @@ def accepted_distance(records: Sequence[TrialRecord]) -> float | None:
 
     Returns
     -------
-    float or None    metres; None without transitions
+    float or None    metres; None if there are no transitions
     """
     costs = [record.pose_cost[:-1][record.status[1:] == Status.REPLACING] for record in records]
     joined = np.concatenate([np.empty(0), *costs])
@@ -181,7 +182,7 @@ def source_of_rows(database: MatchingDatabase) -> NDArray[np.int64]:
 
     Returns
     -------
-    (N,) int64    number of the source; a clip and its mirrored copy share one
+    (N,) int64    number of the source, which a clip shares with its mirrored copy
     """
     of_clip = np.empty(len(database.clips), dtype=np.int64)
     for number, own in enumerate(clips_by_source(database.clips).values()):

@@ -234,7 +234,7 @@ def evaluate(
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    options of the evaluation
-    threads : int, optional    trials at once, one per processor when None
+    threads : int, optional    trials at once, one per processor if None
     with_baseline : bool    whether to also evaluate generated clips
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
@@ -245,7 +245,7 @@ def evaluate(
 
     Raises
     ------
-    EvaluationCancelled    when cancelled
+    EvaluationCancelled    if cancelled
     """
     trials = suite_trials(options)
     records = run_suite(database, options, trials=trials, threads=threads, progress=progress, cancelled=cancelled)
@@ -265,7 +265,7 @@ def evaluate_baseline(
     Parameters
     ----------
     options : EvaluationOptions    options of the evaluation
-    threads : int, optional    trials at once, one per processor when None
+    threads : int, optional    trials at once, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -275,7 +275,7 @@ def evaluate_baseline(
 
     Raises
     ------
-    EvaluationCancelled    when cancelled
+    EvaluationCancelled    if cancelled
     """
     if options not in _baselines:
         trials = suite_trials(options)

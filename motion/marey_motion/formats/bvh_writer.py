@@ -108,7 +108,7 @@ def _hierarchy(clip: Clip, order: list[int], axes: NDArray[np.int64], scale: flo
 
 
 def _written_name(name: str) -> str:
-    """Replace the characters of a joint name that BVH does not allow by underscores."""
+    """Write underscores for the characters that BVH does not allow in a joint name."""
     return "".join("_" if character in "{}\n\r" else character for character in name)
 
 

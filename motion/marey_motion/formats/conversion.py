@@ -37,9 +37,7 @@ _TO_Y_UP: dict[UpAxis, list[list[int]]] = {
 _CONVERTED: LruCache[tuple[Anatomy, tuple[tuple[int, bytes], ...], bytes, float], Skeleton] = LruCache(
     max_entries=KEPT_SKELETONS
 )
-"""Cache of converted skeletons, by all values from which they are computed: skeleton, end sites, axes and unit of the
-file.
-"""
+"""Cache of converted skeletons, by their inputs: the skeleton, end sites, axes and unit of the file."""
 
 
 def convert(source: SourceMotion, file: str, options: ImportOptions) -> ImportedMotion:

@@ -31,9 +31,9 @@ _POSITION, _LINE, _VALUES, _IN_LINE, _ROWS, _RAGGED_LINE, _RAGGED_COUNT, _LONG_T
 class NumberTable:
     """Numbers of a text block, row after row.
 
-    `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the number, from 1, of the first line
-    that does not have the expected number of values, or 0 if there is none; that line has `ragged_count` values.
-    `last_line` is the last line read.
+    `values` is flat; `rows` is the number of lines with numbers. `ragged_line` is the first line, counted from 1, that
+    does not have the expected number of values, and `ragged_count` is its number of values; `ragged_line` is 0 if there
+    is no such line. `last_line` is the last line read.
     """
 
     values: NDArray[np.float64]

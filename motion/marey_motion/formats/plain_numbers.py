@@ -4,7 +4,7 @@ Files of motion consist almost only of numbers such as -12.345678 and 1.5e-05. A
 the processor cannot predict where each number ends. The functions of this module load eight bytes as one integer, a
 word, whose lowest byte is the first of the text, and treat all bytes of a word at once.
 
-The results are those of `numeric_text.parse_number`, which reads all other numbers.
+The results are the same as those of `numeric_text.parse_number`, which reads all numbers that are not plain.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _length(first, second):  # type: ignore[no-untyped-def]
 
 @compiled
 def _digits(word):  # type: ignore[no-untyped-def]
-    """Count the digits at the start of the eight bytes, and return their number and the integer that they form."""
+    """Return the number of digits at the start of the eight bytes, and the integer that these digits form."""
     digits = word ^ _ZERO_DIGITS
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     count = _EIGHT

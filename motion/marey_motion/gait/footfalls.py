@@ -1,9 +1,9 @@
 """Footholds of each foot, and its motion from one to the next.
 
-The position of a foot is that of its ball, the joint about which the toes turn. While the foot is loaded, the heel or
-the ball is a fixed point of the floor: the foot rolls about the heel when it lands with the toes up, is flat, then
-rolls about the ball. While the foot is in the air, the ball follows a cubic curve in the frame of the root; at both
-ends of the curve it moves with the floor, so the motion has no jumps.
+The position of a foot is the position of its ball, the joint about which the toes turn. While the foot is loaded, the
+heel or the ball is a fixed point of the floor: the foot rolls about the heel when it lands with the toes up, is flat,
+then rolls about the ball. While the foot is in the air, the ball follows a cubic curve in the frame of the root; at
+both ends of the curve it moves with the floor, so the motion has no jumps.
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ class Footfalls:
 def _seen_from(root: RootState, points: Complexes, velocities: Complexes) -> tuple[Complexes, Complexes]:
     """Transform points on the floor, and their velocities, from the world into the root's moving frame.
 
-    The velocities are those seen from that frame: the root's own travel and turning are subtracted.
+    The velocities are relative to that frame: the root's own travel and turning are subtracted.
     """
     to_root = np.exp(-1j * root.headings)
     local = (points - root.positions) * to_root

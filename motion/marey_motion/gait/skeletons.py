@@ -161,7 +161,10 @@ def game_skeleton() -> Skeleton:
 def _both_sides(
     table: Mapping[str, _Bone], tips: Mapping[str, Point], sides: tuple[str, str]
 ) -> tuple[dict[str, tuple[str | None, AnyFloats]], dict[str, AnyFloats]]:
-    """Return joints depth first as {name: (parent, position)} and tips as {name: position}, left and mirrored right."""
+    """Return all joints, depth first, as {name: (parent, position)}, and tips as {name: position}.
+
+    The joints and tips of the right side are mirrored from the left side.
+    """
 
     def expanded(name: str) -> list[tuple[str, int, str]]:
         if "{side}" not in name:

@@ -19,14 +19,14 @@ BANK_LIMIT_RAD = 0.35
 
 @dataclass(frozen=True)
 class GaitStyle:
-    """Factors on the neutral gait, 1 for neutral and 0 for none.
+    """Factors that scale features of the neutral gait: 1 keeps a feature unchanged, and 0 removes it.
 
-    With `bounce`, `lean`, `sway` and `arm_swing` at 0 the upper body rides rigidly on the root.
+    With `bounce`, `lean`, `sway` and `arm_swing` at 0, the upper body moves rigidly with the root.
 
     Parameters
     ----------
     stride : length of strides at a given speed
-    step_width : distance between the lines the feet walk on
+    step_width : distance between the lines on which the feet walk
     lift : height of the swinging feet
     bounce : rise and fall of the pelvis and its sideways tilt
     lean : forward lean of the trunk and banking into turns

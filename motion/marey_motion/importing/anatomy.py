@@ -38,7 +38,7 @@ class Anatomy:
 
     @cached_property
     def leg(self) -> float | None:
-        """Mean length of the legs, from hips to ankle in the skeleton's unit; None without two feet or bones."""
+        """Mean length of the legs in the skeleton's unit, from hips to ankle; None if unknown or zero."""
         landmarks = self.landmarks
         if not landmarks.feet or landmarks.hips is None:
             return None

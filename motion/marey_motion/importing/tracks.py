@@ -24,7 +24,7 @@ class BodyPoints:
 
     `points` are joints, followed by end sites, and `column` is the index of each point in them; `soles` and `all_soles`
     are the columns of the joints and end sites from each ankle down. `limbs` are the joints of arms and legs, `span_m`
-    is the length of both arms and `leg_m` of the left leg; they are empty and zero without hands or feet.
+    is the length of both arms and `leg_m` of the left leg; they are empty and zero if there are no hands or no feet.
     """
 
     landmarks: Landmarks

@@ -358,7 +358,7 @@ def _is_leg(length_m: float) -> bool:
 
 
 def _hip_height(body: _Measurements, up_axis: UpAxis) -> float:
-    """Compute the median height of the hips above the ground, in the file's unit; 0 without feet."""
+    """Compute the median height of the hips above the ground, in the file's unit; 0 if the body has no feet."""
     if body.leg is None:
         return 0.0
     return float(median(hip_heights(body.positions.transpose(1, 0, 2), body.landmarks, up_axis)))

@@ -99,7 +99,7 @@ def with_normaliser(database: MatchingDatabase, normaliser: Normaliser) -> Match
 
     Raises
     ------
-    MotionError    when the normaliser has other dimensions
+    MotionError    if the normaliser has other dimensions
     """
     normaliser.require_fit(database.layout)
     kept = [note for note in database.notes if note.code != "scale-floored"]

@@ -57,7 +57,7 @@ class TrajectoryArrays(NamedTuple):
 
 
 class ControllerConstants(NamedTuple):
-    """Options for compiled code: durations in ticks, and factors of one tick."""
+    """Options for compiled code: durations in ticks, and factors that apply once per tick."""
 
     follow: int
     by_distance: bool
@@ -163,7 +163,7 @@ def controller_constants(options: ControllerOptions, rate_hz: float) -> Controll
 
     Returns
     -------
-    named tuple    durations in ticks, and factors of one tick
+    named tuple    durations in ticks, and factors that apply once per tick
 
     Raises
     ------

@@ -46,7 +46,7 @@ def _outward(heading, left, forward):  # type: ignore[no-untyped-def]
 
 @compiled
 def _wished(wish, when):  # type: ignore[no-untyped-def]
-    """Compute position and heading of the desired path at `when` ticks; beyond its end it continues its last arc."""
+    """Compute position and heading of the desired path at `when` ticks; beyond its end, its last arc continues."""
     last = wish.headings.shape[0] - 1
     if when >= last:
         left, forward, turn = _arc(wish.speeds[last], wish.turn_rates[last], (when - last) * wish.tick_s)
@@ -164,7 +164,7 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
     """Choose the next row; return it, its cost, and the cost of continuing from `row`, NaN if its clip has ended.
 
-    The pose of the query is that of `row`, so continuing has only the cost of the trajectory.
+    The query has the pose of `row`, so continuing has only the cost of the trajectory.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:

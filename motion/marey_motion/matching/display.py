@@ -53,8 +53,8 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
     """Compute the distances between the displayed pose and the next one.
 
     Both are in the frame of the root. The displayed pose includes the remaining offsets of earlier switches. The next
-    pose is that of the row chosen for the next tick, without offsets; at the last tick, that of the row that would
-    follow.
+    pose belongs to the row chosen for the next tick, or, at the last tick, to the row that would follow; it has no
+    offsets.
 
     Parameters
     ----------

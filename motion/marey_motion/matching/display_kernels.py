@@ -1,8 +1,8 @@
 """Compiled inertialisation of poses, kept apart so that importing the rest of the package does not load numba.
 
 A pose is a row of 3 + 4·J numbers: the position of joint 0 in metres and the rotations (w, x, y, z) of J joints, joint
-0 in the frame of the simulation root, the others in that of their parent. Rotations add by multiplying from the left;
-their offsets and velocities are rotation vectors.
+0 in the frame of the simulation root, the others in the frames of their parents. Rotations add by multiplying from the
+left; their offsets and velocities are rotation vectors.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _add_velocity(poses, places, successors, joints, moved, row, rate, velocitie
 
 @compiled
 def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ignore[no-untyped-def]
-    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with a row and its offsets (1 + M + K, 3)."""
+    """Fill `shown` (3 + 4·K) and `shown_places` (M, 3) with the pose of a row, plus offsets (1 + M + K, 3)."""
     for c in range(3):
         shown[c] = pose[c] + offsets[0, c]
         for m in range(moved.shape[0]):
@@ -83,7 +83,7 @@ def _show(pose, place, joints, moved, offsets, shown, shown_places):  # type: ig
 
 @compiled
 def _show_row(pose, place, joints, moved, shown, shown_places):  # type: ignore[no-untyped-def]
-    """Fill like `_show`, without offsets."""
+    """Fill the same arrays as `_show`, but without offsets."""
     shown[:3] = pose[:3]
     for m in range(moved.shape[0]):
         shown_places[m] = place[moved[m]]
@@ -123,9 +123,10 @@ def inertialised(  # type: ignore[no-untyped-def]
 ):
     """Fill `out` (T, 3 + 4·K) and `out_places` (T, M, 3) with the poses of K joints, M of them translated.
 
-    poses (N, 3 + 4·J) and places (N, L, 3), local translations, of the database; joints (K,) and moved (M,), indices of
-    the wanted ones of the J joints and of the L translations; rows (T,) displayed at each tick; cuts (T,), the row that
-    replaces the displayed row after each tick, or -1; decay (2, 2) of offsets and velocities in one tick.
+    `poses` (N, 3 + 4·J) and the local translations `places` (N, L, 3) are those of the database. `joints` (K,) and
+    `moved` (M,) are indices of the wanted joints and translations. `rows` (T,) are displayed at each tick. `cuts` (T,)
+    are the rows that replace the displayed rows after their ticks, or -1. `decay` (2, 2) advances offsets and
+    velocities by one tick.
     """
     offsets = np.zeros((1 + moved.shape[0] + joints.shape[0], 3))
     velocities = np.zeros_like(offsets)

@@ -16,7 +16,7 @@ from marey_motion.errors import MotionError
 from marey_motion.matching.features import FeatureLayout
 
 LEAST_SCALE = 1e-3
-"""Least scale of a feature; smaller ones are raised to it, so that a feature without variation does not dominate."""
+"""Least scale of a feature; smaller scales are raised to it, so that a feature without variation does not dominate."""
 UNMATCHED_SCALE = 1e30
 """Scale of groups with weight 0."""
 

@@ -60,7 +60,7 @@ def clip_rows(
 
     Raises
     ------
-    MotionError    when no frame has a facing direction
+    MotionError    if no frame has a facing direction
     """
     rate_hz, frames = options.rate_hz, motion.frame_count
     # A loop is seen going on at both ends, so that filters and differences know nothing of a cut.
@@ -128,7 +128,7 @@ def _hang(poses: Floats, rotations: Floats, facing: Floats, motion: Motion, body
 
 
 def _translations(motion: Motion, body: MatchingBody) -> dict[str, Any]:
-    """Collect translations of the joints below the carrier; joint 0 includes those on the path to it."""
+    """Collect translations of the joints below the carrier; joint 0 includes the translations on the path to it."""
     path = body.skeleton.path_to_root(body.carrier)
     joints = [joint for joint in motion.translated_joints if joint not in path]
     kept = [slot for slot, joint in enumerate(motion.translated_joints) if joint in joints]

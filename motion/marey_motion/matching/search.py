@@ -72,8 +72,9 @@ def build_index(
     normalised : (N, D) float64    features divided by their scales
     starts : (C + 1,) int64    first row of each clip, and N
     selectable : (N,) bool    rows a search may choose
-    method : str    "auto" chooses between "boxes" and "scan" by the share of the database that searches for a few mixed
-        rows visit. The choice depends only on the data, and affects only the time of a search, not its result
+    method : str    "boxes", "scan" or "auto". "auto" makes a few searches, with mixtures of rows as queries, and
+        chooses by the share of the database that they visit. The choice depends only on the data, and affects only the
+        time of a search, not its result
 
     Returns
     -------
@@ -81,7 +82,7 @@ def build_index(
 
     Raises
     ------
-    MotionError    when no row is selectable or a value is not finite or larger than `LARGEST`
+    MotionError    if no row is selectable or a value is not finite or larger than `LARGEST`
     """
     rows = np.ascontiguousarray(normalised, dtype=np.float64)
     mask = np.ascontiguousarray(selectable, dtype=np.bool_)
@@ -196,7 +197,7 @@ def find_nearest(
     ----------
     index : SearchIndex    N rows of D dimensions
     queries : (Q, D) float64    normalised like the rows
-    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 when None
+    weights : (D,) float64, optional    factors, at least 0, of each dimension's squared difference; 1 if None
     warm_rows : (Q,) int64, optional    a row likely to be near each query, or -1; it only makes the search quicker
     skips : (Q, 2) int64, optional    rows [start, stop) that each query may not choose
 

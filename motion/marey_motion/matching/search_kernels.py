@@ -126,7 +126,7 @@ def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyp
 
 @inlined
 def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best of (row, cost) and the screened rows of a block, given as bits; also return its limit."""
+    """Find the best among (row, cost), the best so far, and a block's screened rows; also return its limit."""
     while lanes:
         lane = _lane_of_least(query.sums, lanes)
         if query.sums[lane] > limit:
@@ -143,7 +143,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
 
 @inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best of (row, cost) and the rows of a group's blocks, the nearest box first; also return its limit."""
+    """Find the best among (row, cost), the best so far, and the rows of a group; also return its limit."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
     boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
@@ -183,7 +183,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 @compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best of (row, cost) and all rows of the blocks [start, stop); also return its limit."""
+    """Find the best among (row, cost), the best so far, and the rows of blocks [start, stop); also return its limit."""
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
         if lanes:
@@ -216,7 +216,7 @@ def nearest(index, query, warm_row, skip_start, skip_stop):  # type: ignore[no-u
 
 @compiled
 def nearest_weighted(index, query, weights, skip_start, skip_stop):  # type: ignore[no-untyped-def]
-    """Find the row like `nearest`, with squared differences multiplied by weights (D,), at least 0."""
+    """Find the row like `nearest`, but multiply the squared differences by non-negative weights (D,)."""
     return _nearest(index, query, weights, -1, skip_start, skip_stop)
 
 

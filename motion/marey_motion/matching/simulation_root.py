@@ -48,13 +48,13 @@ def simulation_root(positions: Floats, body: MatchingBody, rate_hz: float) -> Si
 
     Raises
     ------
-    MotionError    when no frame has a facing direction
+    MotionError    if no frame has a facing direction
 
     Notes
     -----
     Savitzky-Golay filters of third order over 0.5 s and 1 s are used, as is usual for motion matching; for short clips,
-    they are shorter. A loop is filtered across its seam when it comes with frames of the rounds before and after it
-    (`looping.continue_motion`).
+    they are shorter. A loop is filtered across its seam if it has been extended by frames of the rounds before and
+    after it (`looping.continue_motion`).
     """
     raw = raw_root(positions, body)
     facing = np.stack((np.sin(raw.headings), np.cos(raw.headings)), axis=-1)
@@ -78,7 +78,7 @@ def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
 
     Raises
     ------
-    MotionError    when no frame has a facing direction
+    MotionError    if no frame has a facing direction
     """
     facing = forward_directions(positions, body.lefts, body.rights)
     return SimulationRoot(positions[:, body.torso, ::2], headings(facing))
@@ -100,7 +100,7 @@ def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
 
     Raises
     ------
-    MotionError    when the rest pose has no facing direction
+    MotionError    if the rest pose has no facing direction
     """
     skeleton = body.skeleton
     rest = rest_heading(body)
@@ -122,7 +122,7 @@ def rest_heading(body: MatchingBody) -> float:
 
     Raises
     ------
-    MotionError    when it has no facing direction
+    MotionError    if it has no facing direction
     """
     positions = body.skeleton.rest_global_positions[None]
     return float(headings(forward_directions(positions, body.lefts, body.rights))[0])

@@ -222,7 +222,7 @@ def _fitted(latents: Floats, count: int, options: MixtureOptions, seed: int) -> 
 
 
 def _normal(latents: Floats, regularisation: float, *, shrink: bool) -> LatentMixture:
-    """Fit one component by maximum likelihood, or shrunk towards a sphere."""
+    """Fit one component by maximum likelihood, with its covariance shrunk towards a sphere if `shrink` is set."""
     if shrink:
         from sklearn.covariance import ledoit_wolf
 
@@ -238,7 +238,7 @@ def _single(mean: Floats, covariance: Floats) -> LatentMixture:
 
 
 def _ordered(weights: Floats, means: Floats, covariances: Floats) -> LatentMixture:
-    """Sort components, the heaviest first; equal ones by their means."""
+    """Sort components, the heaviest first; components of equal weight are sorted by their means."""
     order = np.lexsort((*means.T[::-1], -weights))
     symmetric = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
     return LatentMixture(weights[order] / weights.sum(), means[order], symmetric[order])

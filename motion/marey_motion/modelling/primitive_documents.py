@@ -137,7 +137,7 @@ def _components_from_tree(tree: Mapping[str, Any], columns: NDArray[np.int64] | 
 
 
 def _columns(joints: list[str], skeleton: Skeleton) -> NDArray[np.int64] | None:
-    """Find the channels of the skeleton's joints among those of a document; None if they are in order."""
+    """Find the channels of the skeleton's joints among a document's channels; None if they are in order."""
     if tuple(joints) == skeleton.joint_names:
         return None
     if sorted(joints) != sorted(skeleton.joint_names) or joints[0] != skeleton.joint_names[0]:

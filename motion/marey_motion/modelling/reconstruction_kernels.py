@@ -41,7 +41,7 @@ def _place_joints(pose, local, parents, offsets, world, positions):  # type: ign
 
 @compiled
 def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for raw poses (B, T, D)."""
+    """Fill `out` (B,) with the mean distance of joints from targets (T, J, 3), for unnormalised poses (B, T, D)."""
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))
     lengths, positions = np.empty(joints), np.empty((joints, 3))

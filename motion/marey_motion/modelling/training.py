@@ -233,7 +233,7 @@ def _assemble(
 
 
 def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
-    """Compute the range of durations of samples: that of the examples, extended by a fifth."""
+    """Compute the range of durations of samples: the range of the examples, extended by a fifth."""
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
 

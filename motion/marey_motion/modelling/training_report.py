@@ -69,9 +69,9 @@ class TrainingReport:
     spatial_energy, temporal_energy : cumulative share of the variance, over all components of the examples
     mixture_method : see `FittedMixture`
     candidates : mixtures compared, with their criteria
-    log_likelihood : mean over the examples
-    held_out_log_likelihood : mean over the examples, each under a mixture fitted without it
-    examples : in the order of the aligned set
+    log_likelihood : mean log-likelihood of the examples
+    held_out_log_likelihood : mean log-likelihood of the examples, each under a mixture fitted without it
+    examples : reports of the examples, in the order of the aligned set
     time_error_frames : root mean square error of time functions that are rebuilt from splines and kept components
     """
 

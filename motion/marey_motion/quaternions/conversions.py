@@ -136,7 +136,7 @@ def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> 
     """Make rotations from Euler angles.
 
     Intrinsic rotations turn about the axes of the moving frame in the order written, as in the channels of BVH: "zxy"
-    is Z·X·Y. Extrinsic ones turn about fixed axes, so that the first letter acts first.
+    is Z·X·Y. Extrinsic rotations turn about fixed axes, so that the first letter acts first.
 
     Parameters
     ----------

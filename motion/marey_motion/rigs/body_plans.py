@@ -80,7 +80,7 @@ class LimbReading:
 
         Returns
         -------
-        int or None    index of the joint, None if the chain has none there
+        int or None    index of the joint; None if the chain has no joint there
         """
         chain = self.pair.limbs[side].chain
         at = {-1: self.places[0] - 1, 3: self.places[2] + 1}.get(place)
@@ -134,7 +134,7 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Make the key that sorts readings by score, then by joints.
+    """Make the key that sorts interpretations of limbs by score, then by joints.
 
     Of joints at the same position, the lower ones start the long bones, and the upper one is the wrist or ankle.
     """

@@ -153,7 +153,7 @@ def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
 
 
 def _branches(tree: BoneTree, joint: int) -> list[int]:
-    """Return the children without those whose subtree is small compared with the largest."""
+    """Return the children, except children whose subtree is small compared with the largest."""
     extents = {child: tree.extent(child) for child in tree.skeleton.children[joint]}
     return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
 
@@ -169,7 +169,7 @@ def _left_direction(skeleton: Skeleton, legs: LimbReading, joints: dict[str, int
 
 
 def _foot(skeleton: Skeleton, ankle: int | None, toe: int | None) -> Floats:
-    """Compute the vector from an ankle to its toe, or to the tip of a foot without one; zero without either."""
+    """Compute the vector from an ankle to its toe, or else to the tip of the foot; zero if there is neither."""
     if ankle is not None and toe is not None:
         way: Floats = skeleton.rest_global_positions[toe] - skeleton.rest_global_positions[ankle]
         return way

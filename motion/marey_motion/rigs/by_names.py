@@ -100,7 +100,7 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 
 
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
-    """List prefixes that all names of a file may share, from the joints whose name ends like the rig's pelvis."""
+    """List prefixes that all names of a file may share: the beginnings of names that end like the rig's pelvis."""
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]
         for name in pelvis

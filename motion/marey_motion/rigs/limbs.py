@@ -153,7 +153,7 @@ class BoneTree:
 
         Returns
         -------
-        int    index of the ancestor, which may be one of them
+        int    index of the ancestor, which may be one of the two joints
         """
         above = set(self.path_to_root(a))
         return next(joint for joint in self.path_to_root(b) if joint in above)

@@ -47,7 +47,7 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """List the names that must share a mark: all but the root's, which exporters often make themselves."""
+    """List the names that must share a mark: all except the root's, since exporters often add the root themselves."""
     return names[1:]
 
 

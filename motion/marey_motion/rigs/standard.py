@@ -52,7 +52,7 @@ def mirrored(name: str) -> str:
 
     Returns
     -------
-    str    standard name; joints of the centre keep theirs
+    str    standard name; joints of the centre keep their names
     """
     for side, other in (SIDES, SIDES[::-1]):
         if name.startswith(f"{side}_"):

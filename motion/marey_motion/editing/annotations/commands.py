@@ -130,7 +130,7 @@ def merge_segment(layer: Layer, at: int, neighbour: Literal["next", "previous", 
 def move_boundary(layer: Layer, at: int, edge: Literal["start", "end"], to: int) -> Layer:
     """Move the start or the end of the segment that holds a frame.
 
-    An adjacent segment stays adjacent, and an overlapped one is shortened. Neither may become empty.
+    An adjacent segment stays adjacent, and an overlapped segment is shortened. No segment may become empty.
 
     Parameters
     ----------

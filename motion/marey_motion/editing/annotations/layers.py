@@ -89,13 +89,13 @@ class Layer:
 
         Returns
         -------
-        first, stop : int    range of indices; an empty range is where to insert a new segment
+        first, stop : int    range of indices; if it is empty, a new segment is to be inserted there
         """
         first = bisect_right(self.segments, start, key=_end)
         return first, max(first, bisect_left(self.segments, end, key=_start))
 
     def with_segments(self, first: int, stop: int, *segments: Segment) -> Layer:
-        """Replace a range of segments by others. Only the new segments and their neighbours are checked.
+        """Replace a range of segments with others. Only the new segments and their neighbours are checked.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class Layer:
         return bisect_left(self.keyframes, _moment(keyframe), key=_moment)
 
     def with_keyframes(self, first: int, stop: int, *keyframes: Keyframe) -> Layer:
-        """Replace a range of keyframes by others. Only the new keyframes and their neighbours are checked.
+        """Replace a range of keyframes with others. Only the new keyframes and their neighbours are checked.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class Layer:
         return self._changed(self.segments, (*self.keyframes[:first], *keyframes, *self.keyframes[stop:]))
 
     def _changed(self, segments: tuple[Segment, ...], keyframes: tuple[Keyframe, ...]) -> Layer:
-        """Replace fields by values that are known to be valid."""
+        """Replace fields with values that are known to be valid."""
         made = object.__new__(Layer)
         for name, value in (("frame_count", self.frame_count), ("segments", segments), ("keyframes", keyframes)):
             object.__setattr__(made, name, value)

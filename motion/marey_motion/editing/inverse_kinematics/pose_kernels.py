@@ -135,7 +135,7 @@ def within_limits(row, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _within_ellipse(x, y, width, height):  # type: ignore[no-untyped-def]
-    """Move the point (x, y) towards the centre of an ellipse with these half axes until it is inside."""
+    """Move the point (x, y) towards the centre until it is inside the ellipse with half axes `width` and `height`."""
     if width <= 0.0:
         x = 0.0
     if height <= 0.0:

@@ -104,7 +104,7 @@ def limb_ending_at(
 
     Returns
     -------
-    TwoBoneLimb or None    None if the joint is neither
+    TwoBoneLimb or None    None if the joint is neither a wrist nor an ankle
     """
     for side in ("left", "right"):
         for root, middle, end in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):

@@ -82,7 +82,7 @@ def suggest(
     collections : mapping of str to MatchingDatabase, optional    other collections to search for clips, by name; of any
         skeleton
     options : SuggestionOptions, optional    options
-    threads : int, optional    threads to use, one per processor when None
+    threads : int, optional    threads to use, one per processor if None
     progress : callable, optional    called as progress(done, total, name)
     cancelled : callable, optional    returns True to stop
 
@@ -93,7 +93,7 @@ def suggest(
     Raises
     ------
     MotionError    if the evaluation does not belong to this database
-    EvaluationCancelled    when cancelled
+    EvaluationCancelled    if cancelled
     """
     how, others = options or SuggestionOptions(), dict(collections or {})
     _require_same(database, result)

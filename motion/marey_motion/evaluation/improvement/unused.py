@@ -94,7 +94,7 @@ def find_unused(
     trials : sequence of Trial    the trials
     records : sequence of TrialRecord    their records
     options : EvaluationOptions    options of the evaluation
-    index : SearchIndex, optional    the index that the trials were run with, built when None
+    index : SearchIndex, optional    the index that the trials were run with, built if None
 
     Returns
     -------

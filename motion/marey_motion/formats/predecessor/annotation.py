@@ -72,7 +72,7 @@ def layer_of_document(
     file : str    name of the file, for messages
     frame_count : int    frames of the clip
     end_index : str    "inclusive" or "exclusive"
-    labels : sequence of str, optional    read only these
+    labels : sequence of str, optional    labels to read; all labels by default
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Conversion between the time functions of the predecessor's models and those of Marey's, in both directions.
+"""Conversion of time functions between the predecessor's models and Marey's, in both directions.
 
 Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as functions of a score vector
 g. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:

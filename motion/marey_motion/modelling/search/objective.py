@@ -236,7 +236,7 @@ def _row(
     tracked: dict[Tracked, int],
     moments: dict[float, int],
 ) -> _ResidualRow:
-    """Convert a constraint to numbers, and add the points it needs to the tracked ones, each once."""
+    """Convert a constraint to numbers, and add the points that it needs to the tracked points, each once."""
     frame = frame_at(primitive, constraint.at)
 
     def place(one: Tracked) -> int:

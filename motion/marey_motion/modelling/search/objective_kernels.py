@@ -92,7 +92,7 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
 
 @compiled
 def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
-    """Compute the angle over its sine, and the derivative of that by the cosine."""
+    """Compute an angle divided by its sine, and the derivative of this ratio by the cosine."""
     angle = math.atan2(sine, cosine)
     if angle < _SMALL:
         return 1.0 + angle * angle / 6.0, -1.0 / 3.0

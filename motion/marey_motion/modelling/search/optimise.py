@@ -63,7 +63,7 @@ class LeastSquares(Protocol):
 
         Returns
         -------
-        residuals : (r,) float64    in tolerances
+        residuals : (r,) float64    errors in multiples of their tolerances
         derivatives : (r, W) float64    by the latent vectors
         """
 

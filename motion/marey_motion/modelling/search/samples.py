@@ -62,7 +62,7 @@ def search_tree(objective: Objective, tree: SampleTree, *, candidates: int = CAN
 def search_closely(
     objective: Objective, tree: SampleTree, *, candidates: int = CANDIDATES, passes: int = PASSES
 ) -> FoundSamples:
-    """Find the best sample, then better ones close to it: `search_tree` several times.
+    """Find the best sample, then better latent vectors close to it, by several runs of `search_tree`.
 
     Each further pass descends the same tree once more, with all samples drawn together about the best motion so far, so
     that they are a quarter as far apart as in the pass before. A result is about as likely as a sample.

@@ -182,7 +182,7 @@ class SeveralSteps:
 
         Returns
         -------
-        residuals : (r,) float64    in tolerances
+        residuals : (r,) float64    errors in multiples of their tolerances
         derivatives : (r, W) float64    by the latent vectors
         """
         walked = list(self._walk(stacked, len(self.links)))

@@ -49,7 +49,7 @@ def _place_centres(features, members, randoms, nearest, centres):  # type: ignor
 
 @compiled
 def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
-    """Assign each member to its nearest centre, the first of equals; return the number of changes."""
+    """Assign each member to its nearest centre, or to the first of equally near ones; return the number of changes."""
     changed = 0
     for m in range(members.shape[0]):
         best, label = np.inf, 0
@@ -64,7 +64,7 @@ def _assign(features, members, centres, labels):  # type: ignore[no-untyped-def]
 
 @compiled
 def _average(features, members, labels, centres, sizes):  # type: ignore[no-untyped-def]
-    """Move each centre to the mean of its members; a centre without members stays."""
+    """Move each centre to the mean of its members; a centre without members does not move."""
     sums = np.zeros(centres.shape)
     sizes[:] = 0
     for m in range(members.shape[0]):
