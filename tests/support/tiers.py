@@ -70,6 +70,10 @@ def _slow(item: pytest.Item) -> bool:
     return item.get_closest_marker("slow") is not None
 
 
+def _soak_only(item: pytest.Item) -> bool:
+    return item.get_closest_marker("soak") is not None
+
+
 def _fault_on_other_database(item: pytest.Item) -> bool:
     """Return whether a fault case runs on the other database; its name decides, so that each gets about half."""
     backend = backend_of(item)
@@ -89,7 +93,7 @@ TIERS = {
             "slow": _slow,
         },
     ),
-    "test": Tier(1, {"fault cases on the other database": _fault_on_other_database}),
+    "test": Tier(1, {"for the tier soak": _soak_only, "fault cases on the other database": _fault_on_other_database}),
     "soak": Tier(SOAK_EFFORT, {}),
 }
 
@@ -121,6 +125,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         choices=range(2, 1001),
         metavar="TIMES",
         help=f"In the tier soak, how many times as many examples to draw as in the tier test (default: {SOAK_EFFORT}).",
+    )
+    parser.addoption(
+        "--fuzz-minutes",
+        type=float,
+        default=1.0,
+        metavar="MINUTES",
+        help="In the tier soak, how long each kind of caller sends generated requests on each database (default: 1).",
     )
 
 
@@ -203,6 +214,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     terminalreporter.write_line(f"tier {config.getoption('tier')} left out {left_out.total()} tests")
     for reason, count in left_out.items():
         terminalreporter.write_line(f"  {count:5} {reason}")
+
+
+@pytest.fixture(scope="session")
+def fuzz_minutes(request: pytest.FixtureRequest) -> float:
+    """Return the number of minutes for which each kind of caller sends generated requests."""
+    return float(request.config.getoption("fuzz_minutes"))
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,75 @@
+"""Requests that schemathesis generates from the API's document, for minutes as each kind of caller."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.support.generated_requests import AnyCase, FuzzedServer, fuzzed_server, generate, probes
+from tests.support.who_may import PEOPLE
+
+from marey_server.store.database.connections import Database
+
+pytestmark = [pytest.mark.soak, pytest.mark.timeout(7200)]
+
+LONGEST_ANSWER_S = 10.0
+AT_ONCE = 3
+"""Number of requests to an operation before the next operation has its turn."""
+MOST_FAULTS = 20
+
+
+@pytest.fixture
+def fuzzed(database: Database, tmp_path: Path) -> Iterator[FuzzedServer]:
+    """A server with a private project, on SQLite and on Postgres."""
+    with fuzzed_server(database, tmp_path) as server:
+        yield server
+
+
+class Round:
+    """Generated requests of one caller to all operations, again and again with other seeds, until the time is over."""
+
+    def __init__(self, fuzzed: FuzzedServer, caller: str) -> None:
+        self._fuzzed = fuzzed
+        self._caller = caller
+        self._sent = 0
+        self._slowest = 0.0, ""
+        self._faults: list[str] = []
+
+    def run(self, seconds: float) -> None:
+        """Send requests, and fail if an answer is not as published or takes too long."""
+        end = time.monotonic() + seconds
+        for of_seed in itertools.count():
+            self._restore_project()
+            for operation, mode, name in probes():
+                for requests in self._fuzzed.requests(operation, mode):
+                    if time.monotonic() > end or len(self._faults) >= MOST_FAULTS:
+                        self._report()
+                        return
+                    try:
+                        generate(requests, AT_ONCE, of_seed, self._send)
+                    except Exception as error:
+                        self._faults.append(f"{name}, seed {of_seed}: {error!r}"[:4000])
+
+    def _send(self, case: AnyCase) -> None:
+        self._sent += 1
+        took_s = self._fuzzed.send(case, self._caller)
+        self._slowest = max(self._slowest, (took_s, case.operation.label))
+        assert took_s < LONGEST_ANSWER_S, f"{case.as_curl_command()} took {took_s:.1f} s"
+
+    def _restore_project(self) -> None:
+        """Restore the project, because owners and administrators may have deleted it."""
+        house = self._fuzzed.house
+        house.people.client(house.tokens["administrator"]).post("/projects/lab/restore")
+
+    def _report(self) -> None:
+        took_s, slowest = self._slowest
+        print(f"{self._caller}: {self._sent} requests, the slowest answer took {took_s:.2f} s ({slowest})")
+        assert not self._faults, "\n\n".join(self._faults)
+
+
+@pytest.mark.parametrize("caller", PEOPLE)
+def test_no_request_of_a_caller_fails_or_takes_long(fuzzed: FuzzedServer, caller: str, fuzz_minutes: float) -> None:
+    Round(fuzzed, caller).run(60 * fuzz_minutes)

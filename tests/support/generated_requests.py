@@ -1,0 +1,133 @@
+"""Requests that schemathesis generates from the OpenAPI document, for a furnished server and every kind of caller."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import schemathesis
+from hypothesis import HealthCheck, Phase, assume, given, seed, settings
+from schemathesis import APIOperation, Case
+from schemathesis.checks import not_a_server_error
+from schemathesis.generation import GenerationMode
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+from tests.support.furnished_house import CANARY, INVENTED, House, build_house
+from tests.support.rest_server import running
+
+from marey_server.handlers.catalogue import RESOURCES
+from marey_server.handlers.jobs import LONGEST_WAIT_S
+from marey_server.http.openapi import build_document
+from marey_server.http.routes import RouteTable
+from marey_server.store.database.connections import Database
+
+LONGEST_QUERY = 50_000
+"""Of a longer head the server takes no notice but to close the connection."""
+CHECKS = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_headers_conformance,
+    response_schema_conformance,
+]
+AnyOperation = APIOperation[Any, Any, Any, Any]
+AnyCase = Case[Any]
+
+
+@dataclass(frozen=True)
+class FuzzedServer:
+    """A furnished server, and checks of its answers."""
+
+    house: House
+
+    def send(self, case: AnyCase, name: str) -> float:
+        """Send a request as a caller, check the answer, and return the time in seconds that the server took.
+
+        The time for which the request asked the server to wait for jobs is not included.
+        """
+        answer = case.call(base_url=self.house.people.address, headers=self._headers(name, case), timeout=120)
+        case.validate_response(answer, checks=CHECKS)
+        if name == "anonymous" and CANARY not in str(case.formatted_path):
+            assert CANARY not in answer.text
+        return answer.elapsed - _requested_wait_s(case)
+
+    def _headers(self, name: str, case: AnyCase) -> dict[str, str]:
+        """Return the credential of a caller; one that signs out gets a token for it."""
+        token = self.house.tokens[name]
+        if case.operation.label.endswith("/logout"):
+            wanted = {"name": "fuzz", "scopes": ["read"]}
+            made = self.house.people.client(token).post("/tokens", json=wanted)
+            token = made.json()["secret"] if made.is_success else INVENTED
+        return {"Authorization": f"Bearer {token}"} if token else {}
+
+    def requests(self, operation: AnyOperation, mode: GenerationMode) -> Iterator[Any]:
+        """Yield the strategies of requests for what is in the project, and for things that do not exist."""
+        names = {parameter.name for parameter in operation.path_parameters}
+        nothing: dict[str, str] = {}
+        for known in (self.house.variables, nothing):
+            chosen = {name: value for name, value in known.items() if name in names}
+            yield operation.as_strategy(mode, path_parameters=chosen or None)
+
+
+def _requested_wait_s(case: AnyCase) -> float:
+    """Return for how many seconds a request asks the server to wait, in its body or in the header `Prefer`."""
+    body = case.body if isinstance(case.body, dict) else {}
+    waits = [float(found) for found in re.findall(r"wait=(\d{1,4})", str(dict(case.headers or {})))]
+    if isinstance(body.get("wait_s"), int | float):
+        waits.append(body["wait_s"])
+    return min(LONGEST_WAIT_S, max(waits, default=0.0))
+
+
+@contextlib.contextmanager
+def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
+    """Serve a private project to all kinds of callers until the block ends."""
+    with running(database, folder, login_tries_per_minute=1_000_000) as server:
+        house = build_house(server)
+        server.make_user("fred")
+        house.variables["user"] = "fred"  # whom the administrator may change without taking somebody's token away
+        yield FuzzedServer(house)
+
+
+def operations() -> list[AnyOperation]:
+    """Return every operation of the document."""
+    document = build_document(RouteTable(None, RESOURCES), version("marey"))
+    schema = schemathesis.openapi.from_dict(document, config=schemathesis.config.SchemathesisConfig())
+    results: Any = schema.get_all_operations()
+    return [result.ok() for result in results]
+
+
+def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
+    """Yield operations with fitting requests, and with unfit ones where there is something to get wrong."""
+    for operation in operations():
+        yield operation, GenerationMode.POSITIVE, f"{operation.label} fitting"
+        if operation.query or operation.body:
+            yield operation, GenerationMode.NEGATIVE, f"{operation.label} unfit"
+
+
+def generate(requests: Any, number: int, of_seed: int, send: Callable[[AnyCase], object]) -> None:
+    """Call `send` with a number of generated requests."""
+
+    @seed(of_seed)
+    @settings(
+        max_examples=number,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=requests)
+    def probe(case: AnyCase) -> None:
+        assume(len(quote(str(case.query or ""))) < LONGEST_QUERY)
+        send(case)
+
+    probe()
