@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import random
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.support.furnished_house import start_attempt
 from tests.support.generated_requests import AnyCase, FuzzedServer, fuzzed_server, generate, probes
 from tests.support.who_may import PEOPLE
 
@@ -19,6 +22,7 @@ LONGEST_ANSWER_S = 10.0
 AT_ONCE = 3
 """Number of requests to an operation before the next operation has its turn."""
 MOST_FAULTS = 20
+PROBES = list(probes())
 
 
 @pytest.fixture
@@ -34,7 +38,7 @@ class Round:
     def __init__(self, fuzzed: FuzzedServer, caller: str) -> None:
         self._fuzzed = fuzzed
         self._caller = caller
-        self._sent = 0
+        self._statuses: Counter[int] = Counter()
         self._slowest = 0.0, ""
         self._faults: list[str] = []
 
@@ -42,8 +46,8 @@ class Round:
         """Send requests, and fail if an answer is not as published or takes too long."""
         end = time.monotonic() + seconds
         for of_seed in itertools.count():
-            self._restore_project()
-            for operation, mode, name in probes():
+            for operation, mode, name in random.Random(f"{self._caller} {of_seed}").sample(PROBES, len(PROBES)):
+                self._restore()
                 for requests in self._fuzzed.requests(operation, mode):
                     if time.monotonic() > end or len(self._faults) >= MOST_FAULTS:
                         self._report()
@@ -54,19 +58,27 @@ class Round:
                         self._faults.append(f"{name}, seed {of_seed}: {error!r}"[:4000])
 
     def _send(self, case: AnyCase) -> None:
-        self._sent += 1
-        took_s = self._fuzzed.send(case, self._caller)
+        status, took_s = self._fuzzed.send(case, self._caller)
+        self._statuses[status] += 1
         self._slowest = max(self._slowest, (took_s, case.operation.label))
         assert took_s < LONGEST_ANSWER_S, f"{case.as_curl_command()} took {took_s:.1f} s"
 
-    def _restore_project(self) -> None:
-        """Restore the project, because owners and administrators may have deleted it."""
+    def _restore(self) -> None:
+        """Restore what earlier requests have ended: owners and administrators delete the project, attempts end."""
         house = self._fuzzed.house
-        house.people.client(house.tokens["administrator"]).post("/projects/lab/restore")
+        if self._caller in ("owner", "administrator"):
+            house.people.client(house.tokens["administrator"]).post("/projects/lab/restore")
+        if self._caller == "attempt":
+            beat = "/jobs/{job}/attempts/{fence}/heartbeat".format(**house.variables)
+            if not house.people.client(house.tokens["attempt"]).post(beat, json={}).is_success:
+                lease = start_attempt(house.people, house.tokens, house.variables["item"])
+                house.tokens["attempt"] = lease["attempt_token"]
+                house.variables |= {"job": lease["job"], "fence": str(lease["fence"])}
 
     def _report(self) -> None:
         took_s, slowest = self._slowest
-        print(f"{self._caller}: {self._sent} requests, the slowest answer took {took_s:.2f} s ({slowest})")
+        statuses = ", ".join(f"{count} with {status}" for status, count in sorted(self._statuses.items()))
+        print(f"{self._caller}: {self._statuses.total()} answers, {statuses}; slowest {took_s:.2f} s, {slowest}")
         assert not self._faults, "\n\n".join(self._faults)
 
 

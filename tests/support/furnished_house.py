@@ -143,14 +143,7 @@ def build_house(people: People) -> House:
     owner, contributor = people.client(tokens["owner"]), people.client(tokens["contributor"])
     variables = _furnish(owner)
     stream = contributor.post("/projects/lab/coverage-streams", json=BODIES["CoverageStreamCreate"])
-    clip = {"item": variables["item"]}
-    for cache in ("off", "refresh"):
-        job = contributor.post(
-            "/projects/lab/jobs", json={"kind": "export", "inputs": {"clips": [clip]}, "cache": cache}
-        )
-        assert job.status_code == 202, job.text
-    request = {"worker": "w", "kinds": ["export"], "max": 2}
-    running, ended = people.client(tokens["worker"]).post("/leases", json=request).json()["leases"]
+    ended, running = (start_attempt(people, tokens, variables["item"]) for _ in range(2))
     tokens |= {"attempt": running["attempt_token"], "ended": ended["attempt_token"]}
     end = f"/jobs/{ended['job']}/attempts/{ended['fence']}/fail"
     assert people.client(tokens["ended"]).post(end, json={"write_id": "12345678", "code": "x"}).is_success
@@ -165,6 +158,17 @@ def build_house(people: People) -> House:
         "stream": stream.json()["id"], "token": "token_of_nobody", "upload": "upload_of_nobody",
     }  # fmt: skip
     return House(people, tokens, variables)
+
+
+def start_attempt(people: People, tokens: Mapping[str, str | None], clip: str) -> dict[str, Any]:
+    """Submit a job of the contributor that exports a clip of `lab`, claim it as the worker, and return the lease."""
+    body = {"kind": "export", "inputs": {"clips": [{"item": clip}]}, "cache": "refresh", "priority": 5}
+    job = people.client(tokens["contributor"]).post("/projects/lab/jobs", json=body)
+    assert job.status_code == 202, job.text
+    request = {"worker": "w", "kinds": ["export"], "max": 1}
+    lease: dict[str, Any] = people.client(tokens["worker"]).post("/leases", json=request).json()["leases"][0]
+    assert lease["job"] == job.json()["id"]
+    return lease
 
 
 def _tokens_of_users(people: People) -> dict[str, str | None]:

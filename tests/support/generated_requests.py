@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class FuzzedServer:
 
     house: House
 
-    def send(self, case: AnyCase, name: str) -> float:
-        """Send a request as a caller, check the answer, and return the time in seconds that the server took.
+    def send(self, case: AnyCase, name: str) -> tuple[int, float]:
+        """Send a request as a caller, check the answer, and return its status and how many seconds the server took.
 
         The time for which the request asked the server to wait for jobs is not included.
         """
@@ -59,7 +60,7 @@ class FuzzedServer:
         case.validate_response(answer, checks=CHECKS)
         if name == "anonymous" and CANARY not in str(case.formatted_path):
             assert CANARY not in answer.text
-        return answer.elapsed - _requested_wait_s(case)
+        return answer.status_code, answer.elapsed - _requested_wait_s(case)
 
     def _headers(self, name: str, case: AnyCase) -> dict[str, str]:
         """Return the credential of a caller; one that signs out gets a token for it."""
@@ -83,8 +84,8 @@ def _requested_wait_s(case: AnyCase) -> float:
     """Return for how many seconds a request asks the server to wait, in its body or in the header `Prefer`."""
     body = case.body if isinstance(case.body, dict) else {}
     waits = [float(found) for found in re.findall(r"wait=(\d{1,4})", str(dict(case.headers or {})))]
-    if isinstance(body.get("wait_s"), int | float):
-        waits.append(body["wait_s"])
+    if isinstance(wait_s := body.get("wait_s"), int | float):
+        waits.append(wait_s)
     return min(LONGEST_WAIT_S, max(waits, default=0.0))
 
 
@@ -98,6 +99,7 @@ def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
         yield FuzzedServer(house)
 
 
+@functools.cache
 def operations() -> list[AnyOperation]:
     """Return every operation of the document."""
     document = build_document(RouteTable(None, RESOURCES), version("marey"))
