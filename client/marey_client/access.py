@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import timedelta
 
+from marey_client.errors import UnexpectedAnswer
 from marey_client.paging import pages
 from marey_client.transport import Transport, as_json, read_model
 from marey_schemas.access import (
     EndTokens,
+    Me,
     Member,
     MemberChange,
     NewToken,
@@ -17,6 +21,7 @@ from marey_schemas.access import (
     Role,
     Token,
     TokenCreate,
+    TokenRotation,
     User,
     UserChange,
     UserCreate,
@@ -100,6 +105,19 @@ class Tokens:
     def create(self, token: TokenCreate) -> NewToken:
         """Create a token; its secret is in the answer and never shown again."""
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
+
+    def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:
+        """Replace the token of this client by a successor with the same rights and the same end.
+
+        The replaced token, which this client still sends, is valid for the time `grace`. A call with the same
+        `rotation_id`, for example after a crash, gets the same successor; the default is a new random id.
+        """
+        transport = self.transport.with_present_token()
+        found = transport.get(Me, "/me").token
+        if found is None:
+            raise UnexpectedAnswer("the server does not say which token this is, so it cannot rotate it; upgrade it")
+        wanted = TokenRotation(rotation_id=rotation_id or secrets.token_hex(16), grace_s=int(grace.total_seconds()))
+        return transport.post(NewToken, f"/tokens/{found}/rotate", wanted, repeatable=True)
 
     def revoke(self, token_id: str, *, with_created: bool = False) -> None:
         """Revoke a token, at once; with `with_created`, also the tokens that were created with it."""

@@ -7,6 +7,7 @@ and `admin.token` in the data folder of a server on this machine.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import tempfile
 import tomllib
@@ -24,7 +25,40 @@ DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
 DEFAULT_DATA = "marey-data"
 SETTINGS_FILE = "marey.toml"
 ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
+log = logging.getLogger(__name__)
+
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+class TokenFile:
+    """File that contains a token, which is read again when the file has changed.
+
+    So a program continues to work after its token was rotated. If the file cannot be read at that moment, the last
+    token stays in use.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._seen = self._state()
+        self._token = as_token(read_secret(path))
+
+    @property
+    def token(self) -> str:
+        """The token that the file contains now."""
+        if (state := self._state()) != self._seen:
+            self._seen = state
+            try:
+                self._token = as_token(read_secret(self.path))
+            except (BadCredentialFile, BadToken) as error:
+                log.warning("%s; the token that was read before stays in use", error)
+        return self._token
+
+    def _state(self) -> tuple[int, int, int] | None:
+        try:
+            found = self.path.stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_ino, found.st_size
 
 
 @dataclass(frozen=True)
@@ -35,6 +69,15 @@ class Credential:
     token: str | None = field(repr=False)
     origin: str = ""
     """Place where the token was found, for messages."""
+    file: Path | None = None
+    """File that contains nothing but the token."""
+    logins: Path | None = None
+    """File of stored logins that contains the token."""
+
+    @property
+    def bearer(self) -> str | TokenFile | None:
+        """The token, or the file in which it may be replaced while a program runs."""
+        return self.token if self.file is None else TokenFile(self.file)
 
 
 def resolve(
@@ -46,13 +89,18 @@ def resolve(
     chosen = (url or environment.get("MAREY_URL") or stored.default or DEFAULT_URL).rstrip("/")
     require_address(chosen)
     if token_file is not None:
-        return Credential(chosen, read_secret(token_file), str(token_file))
+        return _from_file(chosen, token_file)
     if token := environment.get("MAREY_TOKEN"):
         return Credential(chosen, token, "the variable MAREY_TOKEN")
     if token := stored.tokens.get(chosen):
-        return Credential(chosen, token, f"marey login, which keeps it in {logins_path(environment)}")
+        path = logins_path(environment)
+        return Credential(chosen, token, f"marey login, which keeps it in {path}", logins=path)
     file = _local_token_file(chosen, environment)
-    return Credential(chosen, None) if file is None else Credential(chosen, read_secret(file), str(file))
+    return Credential(chosen, None) if file is None else _from_file(chosen, file)
+
+
+def _from_file(url: str, file: Path) -> Credential:
+    return Credential(url, read_secret(file), str(file), file=file)
 
 
 def require_address(url: str) -> None:
@@ -138,16 +186,45 @@ def forget_login(path: Path, url: str) -> bool:
     return True
 
 
+def replace_token(credential: Credential, token: str) -> None:
+    """Replace a token in the file that contains it, in one step. Raises `BadCredentialFile` if no file contains it."""
+    if credential.file is not None:
+        write_private(credential.file, f"{token}\n")
+    elif credential.logins is not None:
+        stored = read_logins(credential.logins)
+        _write_logins(credential.logins, Logins(stored.default, {**stored.tokens, credential.url: token}))
+    else:
+        raise BadCredentialFile(f"the token comes from {credential.origin}, where no other token can be stored")
+
+
 def _write_logins(path: Path, logins: Logins) -> None:
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    write_private(path, json.dumps({"default": logins.default, "tokens": dict(logins.tokens)}, indent=1))
+
+
+def write_private(path: Path, text: str) -> None:
+    """Write a file that only its owner can read, in one step; a file that exists keeps its owner."""
+    path = path.resolve()  # a link stays a link
     handle, name = tempfile.mkstemp(dir=path.parent)  # mode 0600
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump({"default": logins.default, "tokens": dict(logins.tokens)}, file, indent=1)
+            _keep_owner(file.fileno(), path)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         Path(name).replace(path)
     except BaseException:
         Path(name).unlink()  # it may hold tokens
         raise
+
+
+def _keep_owner(handle: int, path: Path) -> None:
+    """Give a new file the owner of the file that it will replace, as when root rotates the token of a service."""
+    if os.name != "posix" or not path.exists():
+        return
+    before, now = path.stat(), os.fstat(handle)
+    if (before.st_uid, before.st_gid) != (now.st_uid, now.st_gid):
+        os.fchown(handle, before.st_uid, before.st_gid)
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:

@@ -11,7 +11,7 @@ import httpx
 
 from marey_client.access import Tokens, Users
 from marey_client.blobs import Blobs
-from marey_client.credentials import resolve
+from marey_client.credentials import TokenFile, resolve
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.project import ProjectHandle
@@ -27,7 +27,8 @@ class Marey:
     ----------
     url : address of the server, such as `https://marey.example.org`; default: server and token from the environment or
         from `marey login`, as on the command line
-    token : a personal token; with a `url` and no token, only public projects can be read
+    token : a personal token, or a `TokenFile`, which is read again when it changes; with a `url` and no token, only
+        public projects can be read
     retries : limits of the retries of requests that are safe to repeat
     timeout_s : longest time in seconds to wait for the next bytes of an answer
     http : replaces the network in tests
@@ -36,7 +37,7 @@ class Marey:
     def __init__(
         self,
         url: str | None = None,
-        token: str | None = None,
+        token: str | TokenFile | None = None,
         *,
         retries: Retries | None = None,
         timeout_s: float = 60.0,
@@ -44,7 +45,7 @@ class Marey:
     ) -> None:
         if url is None:
             known = resolve()
-            url, token = known.url, token or known.token
+            url, token = known.url, token or known.bearer
         self.transport = Transport(url, token, retries=retries, timeout_s=timeout_s, http=http)
 
     def __repr__(self) -> str:

@@ -16,7 +16,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from marey_client.credentials import as_token, require_address
+from marey_client.credentials import TokenFile, as_token, require_address
 from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_schemas.address import API
@@ -40,12 +40,17 @@ log = logging.getLogger(__name__)
 class BearerToken(httpx.Auth):
     """Authentication that adds the token to requests; the token appears nowhere else, for example in logs."""
 
-    def __init__(self, token: str) -> None:
-        self._token = as_token(token)
+    def __init__(self, token: str | TokenFile) -> None:
+        self._source = token if isinstance(token, TokenFile) else as_token(token)
+
+    @property
+    def token(self) -> str:
+        """The token of this moment."""
+        return self._source.token if isinstance(self._source, TokenFile) else self._source
 
     def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
         """Set the header."""
-        request.headers["Authorization"] = f"Bearer {self._token}"
+        request.headers["Authorization"] = f"Bearer {self.token}"
         yield request
 
     def __repr__(self) -> str:
@@ -65,7 +70,7 @@ class Transport:
     def __init__(
         self,
         url: str,
-        token: str | None = None,
+        token: str | TokenFile | None = None,
         *,
         retries: Retries | None = None,
         timeout_s: float = 60.0,
@@ -96,6 +101,14 @@ class Transport:
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other
+
+    def with_present_token(self) -> Transport:
+        """Return the same connections with the token of this moment, which stays the same if its file changes."""
+        return self if self._auth is None else self.with_token(self._auth.token)
+
+    def has_token_of(self, other: Transport) -> bool:
+        """Return whether both send the same token at this moment."""
+        return (self._auth and self._auth.token) == (other._auth and other._auth.token)
 
     def with_retries(self, retries: Retries) -> Transport:
         """Return the same connections and token with another policy of retries."""

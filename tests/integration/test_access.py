@@ -197,6 +197,26 @@ def test_a_worker_token_reaches_no_further_than_its_labels(house: House) -> None
     assert (pointless.status_code, pointless.json()["errors"][0]["pointer"]) == (422, "/labels")
 
 
+def test_a_worker_rotates_its_token_which_no_other_token_can(house: House) -> None:
+    worker, chief = (house.people.client(house.tokens[role]) for role in ("worker", "administrator"))
+    own = worker.get("/me").json()["token"]
+    rotation = {"rotation_id": "0123456789abcdef" * 2}
+    for client in (chief, house.people.client(house.tokens["attempt"])):
+        assert client.post(f"/tokens/{own}/rotate", json=rotation).status_code == 403
+    answers = [worker.post(f"/tokens/{own}/rotate", json=rotation) for _ in range(2)]
+    assert {(one.status_code, one.headers["Cache-Control"]) for one in answers} == {(200, "no-store")}
+    first, again = (one.json() for one in answers)
+    assert first == again
+    assert (first["scopes"], first["successor_of"]) == (["work"], own)
+    successor = house.people.client(first["secret"])
+    assert successor.get("/me").json()["token"] == first["id"]
+    assert successor.post("/leases", json=BODIES["ClaimRequest"]).status_code == 200
+    refused = worker.post(f"/tokens/{own}/rotate", json={"rotation_id": "f" * 32})
+    assert (refused.status_code, refused.json()["code"]) == (409, "token-rotated")
+    for wrong in ({}, {"rotation_id": "short"}, {"rotation_id": "0 " * 20}, {**rotation, "grace_s": 59}):
+        assert worker.post(f"/tokens/{own}/rotate", json=wrong).status_code == 422
+
+
 def test_who_may_write_but_not_read_does_not_see_what_they_change(house: House) -> None:
     owner = house.people.client(house.tokens["owner"])
     assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": "*"}).status_code == 200

@@ -105,9 +105,9 @@ def test_another_item_of_the_kind_can_be_compared(owner: httpx.Client, skeleton:
     assert (found.before.name, found.after.name, found.after.revision) == ("walk", "moved", 1)
     assert found.parts == {"info": "removed", "motion": "changed"}
     assert found.motion is not None
-    assert found.motion.root is not None
-    assert found.motion.root.moved is not None
-    assert found.motion.root.moved.shift_cm == pytest.approx((50.0, 0.0, 0.0), abs=1e-3)
+    assert found.motion.path is not None
+    assert found.motion.path.moved is not None
+    assert found.motion.path.moved.shift_cm == pytest.approx((50.0, 0.0, 0.0), abs=1e-3)
 
 
 def refused(client: httpx.Client, path: str, **query: Any) -> tuple[int, str]:

@@ -19,13 +19,24 @@ def python_path() -> str:
 
 
 class AttachedWorker:
-    """A worker process that ends when its standard input is closed; its log is a file in `folder`."""
+    """A worker process that ends when its standard input is closed; its log is a file in `folder`.
+
+    With a `token_file`, it reads its token there instead, and is not attached.
+    """
 
     LOG = "worker.log"
 
-    def __init__(self, server: FakeServer, folder: Path, *options: str, env: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        server: FakeServer,
+        folder: Path,
+        *options: str,
+        env: dict[str, str] | None = None,
+        token_file: Path | None = None,
+    ) -> None:
         self.log = folder / self.LOG
-        command = [sys.executable, "-m", "marey_worker", "--attached", "--server", server.url]
+        credential = ["--attached"] if token_file is None else ["--token-file", str(token_file)]
+        command = [sys.executable, "-m", "marey_worker", *credential, "--server", server.url]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--cache", str(folder / "cache"), *options],

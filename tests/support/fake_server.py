@@ -51,7 +51,8 @@ class FakeServer:
 
     A job in `lost` has lost its lease; requests about one in `silent` get the answer that the server is away, and are
     counted in `refused`. Results of a job in `slow` are not answered while it is there; those of one in `unwelcome` are
-    refused, and one in `over_quota` cannot complete. `order` lists claims and ends of jobs.
+    refused, and one in `over_quota` cannot complete. `order` lists claims and ends of jobs. `claimants` are the tokens
+    with which each claim was sent; if `valid_tokens` are given, claims with others are refused.
     """
 
     def __init__(self) -> None:
@@ -78,6 +79,8 @@ class FakeServer:
         self.may_complete.set()
         self.tokens_seen: set[str] = set()
         self.claims: dict[str, list[dict[str, Any]]] = {}
+        self.claimants: dict[str, set[str]] = defaultdict(set)
+        self.valid_tokens: set[str] | None = None
         self.answers_to_lose = 0
         self._lock = threading.Lock()
         self._http = _Connections(("127.0.0.1", 0), _handler(self))
@@ -169,6 +172,10 @@ def _handler(server: FakeServer) -> type[BaseHTTPRequestHandler]:
             body = self.body()
             server.tokens_seen.add(self.headers["Authorization"])
             if self.path == "/api/v1/leases":
+                token = self.headers["Authorization"].removeprefix("Bearer ")
+                if server.valid_tokens is not None and token not in server.valid_tokens:
+                    return self.problem(401, "bad-token")
+                server.claimants[json.loads(body)["claim_id"]].add(token)
                 leases = server.claim(json.loads(body))
                 if leases and server.answers_to_lose:
                     server.answers_to_lose -= 1

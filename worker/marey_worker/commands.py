@@ -56,7 +56,7 @@ def work(
         slots=slots, kinds=_known_kinds(kinds), labels=labels,
         cache=cache or default_cache(os.environ), **given,
     )  # fmt: skip
-    supervisor = Supervisor(Transport(credential.url, credential.token, retries=BRIEF), options)
+    supervisor = Supervisor(Transport(credential.url, credential.bearer, retries=BRIEF), options)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: threading.Thread(target=supervisor.stop).start())
     if attached:

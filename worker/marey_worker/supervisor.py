@@ -112,26 +112,29 @@ class Supervisor:
 
     def _claim_and_run(self) -> None:
         failures = 0
-        claim_id = uuid.uuid4().hex
+        opened = self._open_claim()
         finishing: Future[None] | None = None
         with _Bench(self._options) as bench, ThreadPoolExecutor(1, thread_name_prefix="marey-finish") as finisher:
             while not self._stopping.is_set():
                 try:
                     child = bench.child()
-                    leases = self._claim(claim_id)
+                    leases = self._claim(opened)
                 except (Unauthenticated, Forbidden, Invalid) as error:
+                    if not opened.transport.has_token_of(self._claims):  # the file of the token has changed
+                        opened = self._open_claim()
+                        continue
                     self._refusal = error
                     self.stop()
                     break
                 except (MareyError, ChildBroken) as error:
                     failures += 1
                     if isinstance(error, LeaseLost):  # the answer was lost for too long
-                        claim_id = uuid.uuid4().hex
+                        opened = self._open_claim()
                     log.warning("no work: %s", error)
                     self._stopping.wait(PAUSES.delay_s(failures))
                     continue
                 failures = 0
-                claim_id = uuid.uuid4().hex
+                opened = self._open_claim()
                 for lease in leases:
                     earlier, finishing = finishing, self._attempt(lease, child, finisher)
                     if earlier is not None:
@@ -139,10 +142,13 @@ class Supervisor:
             if finishing is not None:
                 finishing.result()
 
-    def _claim(self, claim_id: str) -> tuple[Lease, ...]:
+    def _open_claim(self) -> _OpenClaim:
+        return _OpenClaim(self._claims.with_present_token(), uuid.uuid4().hex)
+
+    def _claim(self, opened: _OpenClaim) -> tuple[Lease, ...]:
         """Claim a job.
 
-        If the answer to an earlier claim was lost, its `claim_id` is sent again, and the server returns the same job.
+        If the answer to an earlier claim was lost, the same id is sent again, and the server returns the same job.
         """
         wanted = ClaimRequest(
             worker=self._options.name,
@@ -150,9 +156,9 @@ class Supervisor:
             labels=dict(self._options.labels),
             max=1,
             wait_s=CLAIM_WAIT_S,
-            claim_id=claim_id,
+            claim_id=opened.id,
         )
-        return claim(self._claims, wanted)
+        return claim(opened.transport, wanted)
 
     def _attempt(self, lease: Lease, child: ChildProcess, finisher: Executor) -> Future[None]:
         """Run a job; its last results are stored, and its success is reported, while the child runs the next one."""
@@ -179,6 +185,17 @@ class Supervisor:
             self._interrupted |= attempt.finish(end) is Stop.INTERRUPTED
         finally:
             self._running.discard(place)
+
+
+@dataclass(frozen=True)
+class _OpenClaim:
+    """Claim that is repeated with the same token and the same id until it is answered.
+
+    The token stays the same even if it is rotated meanwhile, because an answer can only be repeated for one token.
+    """
+
+    transport: Transport
+    id: str
 
 
 class _Bench:

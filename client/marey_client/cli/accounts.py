@@ -1,38 +1,27 @@
-"""Commands `login`, `token` and `user`."""
+"""Commands `login`, `logout` and `user`."""
 
 from __future__ import annotations
 
 import os
 import sys
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, UserName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
-from marey_client.cli.quotas import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
-from marey_schemas.wording import counted
+from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
 
-if TYPE_CHECKING:
-    from marey_client.marey import Marey
-    from marey_schemas.access import NewToken, Token, TokenCreate
-
-token = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage your tokens.")
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 
 SECONDS_PER_DAY = 86_400
-SOON_DAYS = 14
-"""Number of days before its end from which a list shows the time left to a token."""
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     app.command()(login)
     app.command()(logout)
-    app.add_typer(token, name="token")
     app.add_typer(user, name="user")
 
 
@@ -72,147 +61,6 @@ def logout(context: typer.Context) -> None:
         url = marey.transport.url
     known = forget_login(logins_path(os.environ), url)
     print_message(f"forgot the token for {url}" if known else f"no token is stored for {url}")
-
-
-# -- tokens --
-
-
-@token.command("create")
-def create_token(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Purpose of the token, for your own reference.")],
-    scope: Annotated[
-        list[str] | None,
-        typer.Option(help="Scope: read, write, jobs, work or admin; !project=NAME limits it to one project."),
-    ] = None,
-    days: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            help="Days for which the token is valid; 0: it does not expire; default: 90, but not "
-            "longer than your own token.",
-        ),
-    ] = None,
-    label: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="With the scope work: label, as name=value, that a worker with this token may announce; may be "
-            "repeated. Default: the labels of your own token, or any."
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "--out", "-o", help="Write the secret to this file (mode 0600) instead of the screen."
-        ),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Create a token. Its secret is shown only once."""
-    from marey_client.cli.typed_values import assignment
-    from marey_schemas.access import TokenCreate
-
-    given: dict[str, Any] = {"scopes": tuple(scope)} if scope else {}
-    if days is not None:
-        given["expires_in_s"] = days * SECONDS_PER_DAY or None
-    if label:
-        given["labels"] = dict(map(assignment, label))
-    wanted = TokenCreate(name=name, **given)
-    with connect(context) as marey:
-        made = marey.tokens.create(wanted) if output is None else _token_in_file(marey, wanted, output)
-    if output is not None:
-        print_message(f"token {made.id} is in {output}")
-    elif as_json:
-        print_json(made)
-    else:
-        print_message(f"token {made.id}, scopes {', '.join(made.scopes)}; it is not shown again:")
-        typer.echo(made.secret)
-
-
-def _token_in_file(marey: Marey, wanted: TokenCreate, path: Path) -> NewToken:
-    """Create a token and write its secret to a new file; create no token if the file cannot be created."""
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        try:
-            made = marey.tokens.create(wanted)
-            file.write(made.secret + "\n")
-        except BaseException:
-            path.unlink()
-            raise
-    return made
-
-
-@token.command("ls")
-def list_tokens(
-    context: typer.Context,
-    user: Annotated[str | None, typer.Option(help="List the tokens of this user (for administrators).")] = None,
-    everybody: Annotated[
-        bool, typer.Option("--everybody", help="List the tokens of all users (for administrators).")
-    ] = False,
-    prefix: Annotated[
-        str | None,
-        typer.Option(help="List only the token whose secret begins with marey_PREFIX_, for example one that leaked."),
-    ] = None,
-    expiring: Annotated[
-        int | None, typer.Option(min=0, help="List only tokens that expire within this number of days.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Show your tokens, without their secrets. Scopes show to which projects a token is limited, labels to which
-    workers.
-    """
-    within_s = None if expiring is None else expiring * SECONDS_PER_DAY
-    with connect(context) as marey:
-        tokens = list(marey.tokens.list(user=user, everybody=everybody, prefix=prefix, ends_within_s=within_s))
-    if as_json:
-        return print_json(tokens)
-    rows = [
-        (one.id, one.user, one.name, one.prefix, " ".join(one.scopes), _labels_of(one), _end_of(one), one.last_used_at)
-        for one in tokens
-    ]
-    return print_table(("id", "user", "name", "prefix", "scopes", "labels", "expires", "last used"), rows)
-
-
-def _labels_of(token: Token) -> str:
-    """Return the labels to which a token is bound: nothing if it is not bound, `none` if it allows no label."""
-    if token.labels is None:
-        return ""
-    return " ".join(f"{name}={value}" for name, value in sorted(token.labels.items())) or "none"
-
-
-def _end_of(token: Token) -> str:
-    """Return the end of a token, with the time left if that is less than `SOON_DAYS`."""
-    if token.expires_at is None:
-        return "never"
-    left = token.expires_at - datetime.now(UTC)
-    shown = f"{token.expires_at:%Y-%m-%d}"
-    if left.total_seconds() <= 0:
-        return f"{shown} (ended)"
-    return f"{shown} (in {counted(left.days, 'day')})" if left.days < SOON_DAYS else shown
-
-
-@token.command("rm", help="Revoke a token, at once; the same as `marey token revoke`.")
-@token.command("revoke")
-def revoke_token(
-    context: typer.Context,
-    token_id: Annotated[str | None, typer.Argument(help="The token's id; marey token ls shows them.")] = None,
-    with_created: Annotated[
-        bool, typer.Option("--with-created", help="Also revoke the tokens that were created with it.")
-    ] = False,
-    all_of: Annotated[
-        str | None,
-        typer.Option("--all-of", metavar="USER", help="Revoke all tokens of a user instead, except the one in use."),
-    ] = None,
-) -> None:
-    """Revoke a token, at once. Administrators may revoke the tokens of others."""
-    if (token_id is None) == (all_of is None):
-        raise WrongUsage("give the id of a token, or a user with --all-of")
-    with connect(context) as marey:
-        if all_of is not None:
-            marey.users.end_tokens(all_of)
-            return print_message(f"all tokens of {all_of} are revoked, except the one in use")
-        assert token_id is not None
-        marey.tokens.revoke(token_id, with_created=with_created)
-    return print_message(f"{token_id} is revoked")
 
 
 # -- users --

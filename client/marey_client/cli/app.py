@@ -23,6 +23,7 @@ from marey_client.cli import (
     projects,
     searches,
     skeletons,
+    tokens,
 )
 from marey_client.cli.datasets import versions
 from marey_client.cli.difference import diff
@@ -68,6 +69,7 @@ def marey(
 for register in (
     processes,
     accounts,
+    tokens,
     projects,
     files,
     organise,

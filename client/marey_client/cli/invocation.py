@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from marey_client.credentials import Credential
     from marey_client.marey import Marey
 
 ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey project ls lists them.")]
@@ -29,20 +30,29 @@ class Invocation:
     verbose: bool
 
 
+NO_OPTIONS = Invocation(None, None, False)
+
+
+def credential_of(context: typer.Context) -> Credential:
+    """Return the server and the token that the options, the environment or `marey login` name."""
+    from marey_client.credentials import resolve
+
+    given = context.find_object(Invocation) or NO_OPTIONS
+    return resolve(given.server, given.token_file)
+
+
 @contextmanager
 def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Marey]:
     """Return a connection to the server named by the options, the environment or `marey login`."""
-    from marey_client.credentials import resolve
     from marey_client.errors import Unauthenticated
     from marey_client.marey import Marey
 
-    given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
-    if given.verbose:
+    if (context.find_object(Invocation) or NO_OPTIONS).verbose:
         import logging
 
         logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    found = resolve(given.server, given.token_file)
-    with Marey(found.url, None if anonymous else found.token) as marey:
+    found = credential_of(context)
+    with Marey(found.url, None if anonymous else found.bearer) as marey:
         try:
             yield marey
         except Unauthenticated as error:

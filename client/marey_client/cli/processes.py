@@ -78,14 +78,11 @@ def worker(
 ) -> None:
     """Run jobs of a server until stopped. The token must have the scope `work`."""
     from marey_client import embedded
-    from marey_client.cli.invocation import Invocation
+    from marey_client.cli.invocation import credential_of
     from marey_client.cli.typed_values import assignment
-    from marey_client.credentials import resolve
 
-    given: Invocation = context.find_object(Invocation) or Invocation(None, None, False)
-    found = resolve(given.server, given.token_file)
     embedded.work(
-        found,
+        credential_of(context),
         slots=slots,
         kinds=tuple(kind or ()),
         labels=dict(map(assignment, label or ())),

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from marey_client.cli.failures import ANONYMOUS_HINT
 from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
-from marey_client.cli.quotas import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
+
+if TYPE_CHECKING:
+    from marey_schemas.access import QuotaChange, QuotasInUse
 
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
 member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
+
+ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the largest number of items.")]
+ByteLimit = Annotated[
+    int | None, typer.Option("--stored-bytes", min=0, help="Set the largest number of bytes of all revisions together.")
+]
+DefaultLimits = Annotated[
+    bool, typer.Option("--defaults", help="Use the limits in the server's settings, except for those given here.")
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -104,6 +114,22 @@ def project_quota(
     if as_json:
         return print_json(found)
     return print_quotas(found)
+
+
+def quota_change(items: int | None, stored_bytes: int | None, defaults: bool) -> QuotaChange | None:
+    """Return the change that the options request, or None if they request none."""
+    from marey_schemas.access import QuotaChange
+
+    given = {"items": items, "stored_bytes": stored_bytes}
+    wanted = {name: limit for name, limit in given.items() if defaults or limit is not None}
+    return QuotaChange.model_validate(wanted) if wanted else None
+
+
+def print_quotas(quotas: QuotasInUse) -> None:
+    """Print a table of the quotas with their use and limits."""
+    rows = [(name.replace("_", " "), quota["used"], quota["allowed"]) for name, quota in quotas.model_dump().items()]
+    columns = ("quota", "used", "allowed")
+    print_table(columns, [(name, f"{used:,}", f"{allowed:,}") for name, used, allowed in rows], right=columns[1:])
 
 
 @project.command("delete")

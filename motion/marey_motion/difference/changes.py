@@ -1,4 +1,4 @@
-"""Changes over matched frames: of the joints' rotations, of the root's path, and of translations."""
+"""Changes over matched frames: of the joints' rotations, of the body's path, and of translations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from marey_motion.arrays import CM_PER_M, Flags, Floats, Ints
 from marey_motion.looping import rotated
-from marey_schemas.documents.differences import JointChange, PathMove, Range, RootChange
+from marey_schemas.documents.differences import JointChange, PathChange, PathMove, Range
 
 NOISE_DEG = 0.01
 """Largest change of a rotation that is attributed to rounding."""
@@ -18,6 +18,10 @@ NOISE_CM = 0.01
 """Largest change of a position that is attributed to rounding."""
 JOINED_S = 0.1
 """Distance, in seconds, below which two ranges of frames are joined into one."""
+POINT_M = 0.01
+"""Extent up to which a path has no direction that a turn could be measured by."""
+UNEXPLAINED = 0.1
+"""Greatest share of a path's change that a movement of the whole path may leave."""
 MOST_SPANS = 100
 """Maximum number of ranges listed for a joint; if there are more, ranges farther apart are joined, too."""
 
@@ -86,27 +90,36 @@ def joint_changes(
     )
 
 
-def root_change(before: Floats, after: Floats, course: Course, threshold_cm: float) -> RootChange | None:
-    """Describe the change of the root's path.
+def path_change(
+    joint: str, before: Floats, after: Floats, course: Course, threshold_cm: float, move: Move | None
+) -> PathChange | None:
+    """Describe the change of a path.
 
     Parameters
     ----------
-    before, after : (n, 3) float64    positions of the root in matched frames, metres
+    joint : str    joint whose path is compared
+    before, after : (n, 3) float64    its positions in matched frames, metres
     course : Course    the matched frames
     threshold_cm : float    distance above which the times are listed
+    move : Move or None    movement of the whole path
 
     Returns
     -------
-    RootChange or None    None if all positions are equal
+    PathChange or None    None if all positions are equal
     """
     distances = CM_PER_M * np.linalg.norm(after - before, axis=1)
     if not len(distances) or distances.max() <= NOISE_CM:
         return None
-    return RootChange(**_exceeding(distances, course, threshold_cm), moved=_path_move(before, after, distances))
+    moved = None
+    if move is not None:
+        remaining = CM_PER_M * np.linalg.norm(move.applied(before) - after, axis=1)
+        shift = tuple((CM_PER_M * move.shift_m).tolist())
+        moved = PathMove(turn_deg=float(np.degrees(move.turn_rad)), shift_cm=shift, remaining_cm=float(remaining.max()))
+    return PathChange(joint=joint, moved=moved, **_exceeding(distances, course, threshold_cm))
 
 
 def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
-    """Compute the fields of `Exceeding` for the changes of a joint or of the root."""
+    """Compute the fields of `Exceeding` for the changes of a joint or of a path."""
     at = int(np.argmax(changes))
     return {
         "mean": float(changes.mean()),
@@ -116,22 +129,54 @@ def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, o
     }
 
 
-def _path_move(before: Floats, after: Floats, distances_cm: Floats) -> PathMove | None:
-    """Fit a turn about the vertical axis and a shift by least squares; None if they explain little of the change."""
+class Move(NamedTuple):
+    """Movement on the ground and along the vertical.
+
+    Parameters
+    ----------
+    turn_rad : float    turn about the vertical axis through the origin, left positive
+    shift_m : (3,) float64    shift after the turn
+    """
+
+    turn_rad: float
+    shift_m: Floats
+
+    def applied(self, positions: Floats) -> Floats:
+        """Move positions.
+
+        Parameters
+        ----------
+        positions : (n, 3) float64    metres
+
+        Returns
+        -------
+        (n, 3) float64    metres
+        """
+        turned = np.array(positions, dtype=np.float64)
+        turned[:, [0, 2]] = rotated(turned[:, [0, 2]], self.turn_rad)
+        return turned + self.shift_m
+
+
+def whole_move(before: Floats, after: Floats) -> Move | None:
+    """Find the movement of a whole path, by least squares.
+
+    Parameters
+    ----------
+    before, after : (n, 3) float64    positions in matched frames, metres
+
+    Returns
+    -------
+    Move or None    None if a movement of the whole path leaves more than `UNEXPLAINED` of the change
+    """
+    change = np.linalg.norm(after - before, axis=1)
+    if not len(change) or CM_PER_M * change.max() <= NOISE_CM:
+        return None
     centre, target = before.mean(axis=0), after.mean(axis=0)
     a, b = before - centre, after - target
     sine = float(np.sum(a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]))
     cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]))
-    extent = CM_PER_M**2 * float(np.mean(np.sum(a * a, axis=1)))
-    turn = float(np.arctan2(sine, cosine)) if extent > 1.0 else 0.0  # a path of a point has no direction
-    turned = before.copy()
-    turned[:, [0, 2]] = rotated(before[:, [0, 2]], turn)
-    shift = target - turned.mean(axis=0)
-    remaining = CM_PER_M * np.linalg.norm(turned + shift - after, axis=1)
-    if remaining.mean() > 0.5 * distances_cm.mean():
-        return None
-    return PathMove(
-        turn_deg=float(np.degrees(turn)),
-        shift_cm=tuple((CM_PER_M * shift).tolist()),
-        remaining_cm=float(remaining.max()),
-    )
+    extent_m = float(np.sqrt(np.mean(a[:, [0, 2]] ** 2)))
+    turn = Move(float(np.arctan2(sine, cosine)) if extent_m > POINT_M else 0.0, np.zeros(3))
+    move = turn._replace(shift_m=target - turn.applied(before).mean(axis=0))
+    remaining = np.linalg.norm(move.applied(before) - after, axis=1)
+    return move if remaining.mean() <= UNEXPLAINED * change.mean() else None

@@ -5,14 +5,32 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.arrays import CM_PER_M, Ints
+from marey_motion import quaternions
+from marey_motion.arrays import CM_PER_M, Floats, Ints
 from marey_motion.clip import Clip
-from marey_motion.difference.changes import NOISE_CM, NOISE_DEG, Course, joint_changes, root_change
+from marey_motion.difference.changes import (
+    NOISE_CM,
+    NOISE_DEG,
+    Course,
+    Move,
+    joint_changes,
+    path_change,
+    whole_move,
+)
 from marey_motion.difference.poses import Poses, rotation_changes_deg
 from marey_motion.difference.skeletons import JointPairs, compare_skeletons, pair_joints
 from marey_motion.difference.timing import SAME_PACE, Timing, compare_timing, frame_runs
-from marey_schemas.documents.differences import DifferenceOptions, DifferencePlot, JointChange, MotionDifference
+from marey_motion.kinematics import global_positions
+from marey_motion.looping import about_vertical
+from marey_schemas.documents.differences import (
+    DifferenceOptions,
+    DifferencePlot,
+    JointChange,
+    MotionDifference,
+)
 
+STILL_M = 0.001
+"""Greatest movement along an axis of a joint that stands still."""
 MOST_ROWS = 600
 """Maximum number of rows in the plot of changed rotations."""
 MOST_POINTS = 1000
@@ -48,38 +66,75 @@ def compare_clips(
     [('removed', (0, 12)), ('matched', (12, 240))]
     """
     options = options or DifferenceOptions()
-    joints = pair_joints(before.skeleton, after.skeleton)
-    old, new = _poses(before, joints.before), _poses(after, joints.after)
-    timing = compare_timing(old, new, after.frame_rate_hz / before.frame_rate_hz)
+    pairing = pair_joints(before.skeleton, after.skeleton)
+    carrier = _carrier(before, after, pairing)
+    old = _poses(before, pairing.before, pairing.before[carrier])
+    new = _poses(after, pairing.after, pairing.after[carrier])
+    timing, move = _compare_moved(old, new, after.frame_rate_hz / before.frame_rate_hz)
     pairs = timing.matching.pairs
     course = Course(pairs[:, 1], after.frame_rate_hz)
-    names = [after.skeleton.joint_names[joint] for joint in joints.after]
+    names = [after.skeleton.joint_names[joint] for joint in pairing.after]
     rotations = rotation_changes_deg(timing.before, new, pairs)
-    paths = (timing.before.roots[pairs[:, 0]].astype(np.float64), new.roots[pairs[:, 1]].astype(np.float64))
+    translated = _translation_changes(before, after, pairing, timing, course, options.threshold_cm)
     found = MotionDifference(
         frames=(before.frame_count, after.frame_count),
         frame_rate_hz=(before.frame_rate_hz, after.frame_rate_hz),
         duration_s=(before.duration_s, after.duration_s),
         skeleton=compare_skeletons(before.skeleton, after.skeleton),
         runs=frame_runs(timing, before.frame_count, after.frame_count),
-        frames_per_frame=timing.pace,
+        frames_per_frame=timing.pace.frames,
         duration_ratio=_duration_ratio(timing, before, after),
         rotations=joint_changes(names, rotations, course, threshold=options.threshold_deg, noise=NOISE_DEG),
-        root=root_change(*paths, course, options.threshold_cm),
-        translations=_translation_changes(before, after, joints, timing, course, options.threshold_cm),
+        path=path_change(names[carrier], *_paths(timing, new, move), course, options.threshold_cm, move),
+        translations=tuple(one for one in translated if carrier == 0 or one.joint != names[carrier]),
         translated_joints=(_translated(before), _translated(after)),
     )
     return found, _plot(names, rotations, pairs, old, new, after.frame_rate_hz) if plot else None
 
 
-def _poses(clip: Clip, joints: tuple[int, ...]) -> Poses:
-    """Return the poses of some joints, in the given order."""
+def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
+    """Return the index, among the paired joints, of the joint whose path is that of the body."""
+    if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
+        return 0
+    for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):
+        for clip, joint in zip((before, after), joints, strict=True):
+            if joint in clip.translated_joints and float(np.ptp(_translations(clip, joint), axis=0).max()) > STILL_M:
+                return place
+    return 0
+
+
+def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
+    """Return the poses of some joints, in the given order, with the positions of one joint in the world."""
     whole = joints == tuple(range(clip.skeleton.joint_count))
-    return Poses(clip.root_translations, clip.rotations if whole else clip.rotations[:, list(joints)])
+    positions = clip.root_translations if carrier == 0 else np.ascontiguousarray(global_positions(clip)[:, carrier])
+    return Poses(positions, clip.rotations if whole else clip.rotations[:, list(joints)])
+
+
+def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timing, Move | None]:
+    """Match the frames; if the whole clip was moved, move the clip before likewise and match the frames again."""
+    timing = compare_timing(before, after, rate_ratio)
+    move = whole_move(*_paths(timing, after, None))
+    if move is None:
+        return timing, None
+    rotations = before.rotations.copy()
+    turn = about_vertical(np.asarray(move.turn_rad))
+    rotations[:, 0] = quaternions.multiply(turn, rotations[:, 0].astype(np.float64))
+    moved = Poses(move.applied(before.roots.astype(np.float64)).astype(np.float32), rotations)
+    return compare_timing(moved, after, rate_ratio), move
+
+
+def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
+    """Return the positions (n, 3) of the body in matched frames, those before as they were before the movement."""
+    pairs = timing.matching.pairs
+    before = timing.before.roots[pairs[:, 0]].astype(np.float64)
+    if move is not None:
+        back = Move(-move.turn_rad, np.zeros(3))
+        before = back.applied(before - move.shift_m)
+    return before, after.roots[pairs[:, 1]].astype(np.float64)
 
 
 def _duration_ratio(timing: Timing, before: Clip, after: Clip) -> float:
-    ratio = timing.pace * before.frame_rate_hz / after.frame_rate_hz
+    ratio = timing.pace.frames * before.frame_rate_hz / after.frame_rate_hz
     return 1.0 if abs(ratio - 1.0) <= SAME_PACE else ratio
 
 
@@ -98,18 +153,20 @@ def _translation_changes(
     ]
     if not moved or not len(timing.matching.pairs):
         return ()
-    places = np.minimum(np.round(timing.matching.pairs[:, 0] / timing.pace), before.frame_count - 1).astype(np.int64)
-    steps = [_translations(after, new, course.frames) - _translations(before, old, places) for old, new in moved]
+    places = np.minimum(np.round(timing.pace.places(timing.matching.pairs[:, 0])), before.frame_count - 1).astype(
+        np.int64
+    )
+    steps = [_translations(after, new)[course.frames] - _translations(before, old)[places] for old, new in moved]
     distances = CM_PER_M * np.linalg.norm(np.stack(steps, axis=1), axis=2)
     names = [after.skeleton.joint_names[new] for _, new in moved]
     return joint_changes(names, distances, course, threshold=threshold_cm, noise=NOISE_CM)
 
 
-def _translations(clip: Clip, joint: int, frames: Ints) -> NDArray[np.floating]:
-    """Return the positions (n, 3) of a joint in its parent's frame."""
+def _translations(clip: Clip, joint: int) -> NDArray[np.floating]:
+    """Return the positions (F, 3) of a joint in its parent's frame."""
     if clip.translations is None or joint not in clip.translated_joints:
-        return np.broadcast_to(clip.skeleton.offsets[joint], (len(frames), 3))
-    return np.asarray(clip.translations[frames, clip.translated_joints.index(joint)])
+        return np.broadcast_to(clip.skeleton.offsets[joint], (clip.frame_count, 3))
+    return clip.translations[:, clip.translated_joints.index(joint)]
 
 
 def _plot(

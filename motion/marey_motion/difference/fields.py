@@ -36,7 +36,8 @@ def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[Chang
     """Compare two documents.
 
     Objects are compared by field, lists of equal length by position. If lists have different lengths, entries of only
-    one of them count as removed or added. Arrays are compared as a whole.
+    one of them count as removed or added. Arrays are compared as a whole. Null, an empty list and an empty object equal
+    an absent value.
 
     Parameters
     ----------
@@ -62,12 +63,21 @@ def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointe
     for name in dict.fromkeys((*before, *after)):
         place = f"{pointer}/{name.replace('~', '~0').replace('/', '~1')}"
         old, new = before.get(name), after.get(name)
-        if old is None and new is not None:
+        if _is_nothing(old) and _is_nothing(new):
+            continue
+        if _is_list(old or new) and _is_list(new or old):
+            yield from changed_values(old or (), new or (), place)
+        elif _is_nothing(old):
             yield ChangedValue(place, "added", after=_shown(new))
-        elif new is None and old is not None:
+        elif _is_nothing(new):
             yield ChangedValue(place, "removed", before=_shown(old))
         else:
             yield from changed_values(old, new, place)
+
+
+def _is_nothing(value: Any) -> bool:
+    """Return whether a value says as much as an absent one."""
+    return value is None or (isinstance(value, Mapping | list | tuple) and not value)
 
 
 def _changed_entries(before: Sequence[Any], after: Sequence[Any], pointer: str) -> Iterator[ChangedValue]:

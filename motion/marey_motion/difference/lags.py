@@ -19,6 +19,13 @@ SIMILAR = 4.0
 """Factor of the least squared distance up to which the second-best place of a window is a candidate, too."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
+GREATEST_PACE = 4.0
+"""Greatest pace that is searched; 1 divided by it is the least."""
+PACES = 97
+DECIMATED = 2048
+"""Frames of the longer clip that are used to search paces."""
+PACE_WINDOW = 96
+PACE_WINDOWS = 3
 CHANNELS = 8
 """Number of random projections of a pose in which windows are searched."""
 
@@ -90,6 +97,50 @@ def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size:
     products = np.fft.irfft(spectrum * np.conj(np.fft.rfft(window, size, axis=0)), size, axis=0)[:places]
     squares = energy[length:] - energy[:-length]
     return np.asarray(squares - 2.0 * products.sum(axis=1) + np.sum(window * window), dtype=np.float64)
+
+
+def likely_pace(before: Poses, after: Poses) -> float:
+    """Estimate at which pace a clip was sampled from another one, of which it may be a part.
+
+    Windows of the clip after are stretched to many paces, and each is compared with every place of the clip before.
+
+    Parameters
+    ----------
+    before, after : Poses    frames of the same joints
+
+    Returns
+    -------
+    float    frames after for each frame before, to about 3 %
+    """
+    stride = max(1, max(before.frame_count, after.frame_count) // DECIMATED)
+    source, target = (
+        _features(before)[::stride, :-3],
+        _features(after)[::stride, :-3],
+    )  # the root's steps depend on the pace
+    length = max(SHORTEST_WINDOW, min(PACE_WINDOW, len(target) // 2))
+    if len(target) < length or len(source) < length:
+        return 1.0
+    paces = np.geomspace(1.0 / GREATEST_PACE, GREATEST_PACE, PACES)
+    size = 1 << int(np.ceil(np.log2(len(source) + length * GREATEST_PACE)))
+    spectrum = np.fft.rfft(source, size, axis=0)
+    energy = np.concatenate(([0.0], np.cumsum(np.einsum("fc,fc->f", source, source))))
+    starts = np.linspace(0, len(target) - length, PACE_WINDOWS).astype(np.int64)
+    costs = np.full(len(paces), np.inf)
+    for place, pace in enumerate(paces.tolist()):
+        count = round(length / pace)
+        if SHORTEST_WINDOW <= count <= len(source):
+            windows = (_stretched(target[start : start + length], count) for start in starts)
+            least = [_window_distances(window, spectrum, energy, size).min() for window in windows]
+            costs[place] = float(np.sum(least)) / count
+    return float(paces[np.argmin(costs)]) if np.isfinite(costs).any() else 1.0
+
+
+def _stretched(window: Floats, count: int) -> Floats:
+    """Sample a window at `count` places by straight lines."""
+    places = np.linspace(0.0, len(window) - 1.0, count)
+    left = np.minimum(places.astype(np.int64), len(window) - 2)
+    share = (places - left)[:, None]
+    return np.asarray((1.0 - share) * window[left] + share * window[left + 1], dtype=np.float64)
 
 
 def _features(poses: Poses) -> Floats:

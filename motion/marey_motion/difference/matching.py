@@ -23,8 +23,8 @@ NEW_RUN = 1.0
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further candidates are searched."""
 MOST_ROUNDS = 64
-"""Maximum number of changes of the lag."""
-SHORTEST_REPLACEMENT = 3
+"""Most changes of the lag that are considered."""
+SHORTEST_REPLACEMENT = 10
 """Minimum number of consecutive, entirely different frames that are reported as removed and inserted."""
 
 

@@ -7,21 +7,56 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marey_motion.arrays import Floats, Ints
+from marey_motion.arrays import AnyInts, Floats, Ints
+from marey_motion.difference.lags import likely_pace
 from marey_motion.difference.matching import UNMATCHED, WELL_MATCHED, Matching, match_frames
 from marey_motion.difference.poses import Poses, time_offsets
-from marey_motion.resampling import count_samples
 from marey_schemas.documents.differences import FrameRun
 
 SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
 """Share of the shorter clip's frames; if more are matched well, no other pace is tried."""
 MUCH_BETTER = 0.5
-"""Share of the cost at the first pace below which the cost at another pace must be for that pace to be chosen."""
-MOST_REFINEMENTS = 4
-ROUNDED_PACE = 1e-6
+"""Share of the cost at the best pace so far below which the cost at another pace must be for it to be chosen."""
+SIMILAR_ENOUGH = 0.1
+"""Share of the greatest possible cost up to which no pace is searched, unless there are `MANY_RUNS`."""
+MANY_RUNS = 8
+MOST_REFINEMENTS = 6
+FEWEST_PAIRS = 8
+SLOPES = 20
+"""Slopes are measured over the number of matched frames divided by this number."""
+FARTHEST_OFFSET = 2.0
+"""Maximum offset, in frames, that is estimated from velocities."""
+ROUNDED_FRAMES = 0.02
+"""Deviation over the whole clip, in frames, that is attributed to rounding."""
 GREATEST_PACE = 16.0
-"""Greatest factor between the numbers of frames of the same motion."""
+"""Maximum factor between the numbers of frames of the same motion."""
+
+
+class Pace(NamedTuple):
+    """Sampling of a clip.
+
+    Parameters
+    ----------
+    frames : float    frames of the sampled clip for each frame of the stored clip
+    phase : float    place of the first sampled frame, in frames of the stored clip
+    """
+
+    frames: float
+    phase: float = 0.0
+
+    def places(self, frames: AnyInts | Floats) -> Floats:
+        """Return the places of sampled frames in the stored clip.
+
+        Parameters
+        ----------
+        frames : (n,)    numbers of sampled frames
+
+        Returns
+        -------
+        (n,) float64    frames of the stored clip
+        """
+        return np.asarray(self.phase + frames / self.frames, dtype=np.float64)
 
 
 class Timing(NamedTuple):
@@ -29,12 +64,12 @@ class Timing(NamedTuple):
 
     Parameters
     ----------
-    pace : float    frames of the clip after for each matched frame of the clip before
+    pace : Pace    sampling of the clip before
     before : Poses    the clip before, sampled at that pace
     matching : Matching    pairs of frames of the sampled clip and of the clip after
     """
 
-    pace: float
+    pace: Pace
     before: Poses
     matching: Matching
 
@@ -52,15 +87,13 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
     Timing    correspondence at the ratio of the frame rates, unless another pace explains much more
     """
     first, *others = _paces(before.frame_count, after.frame_count, rate_ratio)
-    best = _at_pace(before, after, first, search=True)
+    best = _at_pace(before, after, Pace(first), search=True)
     for pace in others:
         if _explains(best, after):
-            break
-        tried = _at_pace(before, after, pace, search=pace == 1.0)
-        if pace != 1.0:
-            tried = _refined(before, after, tried)
-        if _share(tried, after) < MUCH_BETTER * _share(best, after):
-            best = _at_pace(before, after, tried.pace, search=True)
+            return best
+        best = _better(best, before, after, pace)
+    if _share(best, after) > SIMILAR_ENOUGH or _run_count(best) >= MANY_RUNS:
+        best = _better(best, before, after, likely_pace(before, after), search=True)
     return best
 
 
@@ -73,46 +106,78 @@ def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float
     return [pace for pace in possible if pace == 1.0 or abs(pace - 1.0) > SAME_PACE]
 
 
-def _at_pace(before: Poses, after: Poses, pace: float, *, search: bool) -> Timing:
+def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: bool = False) -> Timing:
+    """Return the timing at a pace, refined, if it is much better than the best one; otherwise the best one."""
+    if pace == 1.0:
+        tried = _at_pace(before, after, Pace(1.0), search=True)
+        return tried if _share(tried, after) < MUCH_BETTER * _share(best, after) else best
+    tried = _refined(before, after, _at_pace(before, after, Pace(pace), search=search), search=search)
+    if _share(tried, after) >= MUCH_BETTER * _share(best, after):
+        return best
+    return _at_pace(before, after, tried.pace, search=True)
+
+
+def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing:
     """Match the frames of two clips at a pace."""
     sampled = before
-    if pace != 1.0:
-        sampled = before.sampled(
-            np.minimum(np.arange(count_samples(before.frame_count, 1.0, pace)) / pace, before.frame_count - 1.0)
-        )
+    if pace != Pace(1.0):
+        count = int((before.frame_count - 1 - pace.phase) * pace.frames + ROUNDED_FRAMES) + 1
+        sampled = before.sampled(np.minimum(pace.places(np.arange(count)), before.frame_count - 1.0))
     return Timing(pace, sampled, match_frames(sampled, after, search=search))
 
 
-def _refined(before: Poses, after: Poses, timing: Timing) -> Timing:
-    """Correct a pace by the mean drift of the matched frames, and match the frames again."""
+def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Timing:
+    """Correct pace and phase by the times of the matched frames, and match the frames again, while it gets better."""
     for _ in range(MOST_REFINEMENTS):
         pairs = timing.matching.pairs
-        if len(pairs) < 3:
+        if len(pairs) < FEWEST_PAIRS:
             return timing
-        times, weights = time_offsets(timing.before, after, pairs)
-        slope = _weighted_slope(pairs[:, 0].astype(np.float64), times, weights)
-        pace = _rounded(timing.pace / (1.0 + slope))
-        tried = _at_pace(before, after, pace, search=False)
-        if not tried.matching.costs.sum() < timing.matching.costs.sum():
+        offsets, weights = time_offsets(timing.before, after, pairs)
+        near = np.clip(offsets, -FARTHEST_OFFSET, FARTHEST_OFFSET)
+        start, step = _robust_line(pairs[:, 1].astype(np.float64), timing.pace.places(pairs[:, 0] + near), weights)
+        if not 1.0 / GREATEST_PACE <= step <= GREATEST_PACE:
+            return timing
+        tried = _at_pace(before, after, _rounded(start, step, timing.before.frame_count), search=search)
+        if not _share(tried, after) < _share(timing, after):
             return timing
         timing = tried
     return timing
 
 
-def _rounded(pace: float) -> float:
-    """Return a simple fraction instead of a pace that differs from it by rounding only."""
+def _rounded(start: float, step: float, count: int) -> Pace:
+    """Return the pace of a line; slope and start become simple numbers if they differ from these by rounding only."""
+    pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))
-    return simple if abs(simple - pace) <= ROUNDED_PACE * pace else pace
+    if abs(simple - pace) * count <= ROUNDED_FRAMES * pace:
+        pace = simple
+    if abs(start - round(start)) <= ROUNDED_FRAMES:
+        start = round(start)
+    phase = start % (1.0 / pace)
+    return Pace(pace, 0.0 if 1.0 / pace - phase <= SAME_PACE else phase)
 
 
-def _weighted_slope(places: Floats, values: Floats, weights: Floats) -> float:
-    """Return the slope of a straight line through values, by weighted least squares."""
+def _robust_line(places: Floats, values: Floats, weights: Floats) -> tuple[float, float]:
+    """Return start and slope of a straight line through most values, which jump where frames were removed."""
+    apart = max(1, len(places) // SLOPES)
+    slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
+    start = float(np.median(values - slope * places))
+    for _ in range(2):
+        near = np.abs(values - start - slope * places) <= 1.0
+        if np.count_nonzero(near & (weights > 0.0)) >= FEWEST_PAIRS:
+            start, slope = _line(places[near], values[near], weights[near])
+    return start, slope
+
+
+def _line(places: Floats, values: Floats, weights: Floats) -> tuple[float, float]:
+    """Return start and slope of a straight line by weighted least squares."""
     total = float(weights.sum())
     if total <= 0.0:
-        return 0.0
-    centred = places - float(weights @ places) / total
+        return 0.0, 0.0
+    at, level = float(weights @ places) / total, float(weights @ values) / total
+    centred = places - at
     spread = float(weights @ (centred * centred))
-    return float(weights @ (centred * values)) / spread if spread > 0.0 else 0.0
+    slope = float(weights @ (centred * (values - level))) / spread if spread > 0.0 else 0.0
+    return level - slope * at, slope
 
 
 def _explains(timing: Timing, after: Poses) -> bool:
@@ -121,9 +186,14 @@ def _explains(timing: Timing, after: Poses) -> bool:
     return int(well) >= WELL_EXPLAINED * min(timing.before.frame_count, after.frame_count)
 
 
+def _run_count(timing: Timing) -> int:
+    return int(np.count_nonzero(np.any(np.diff(timing.matching.pairs, axis=0) != 1, axis=1))) + 1
+
+
 def _share(timing: Timing, after: Poses) -> float:
-    """Return the cost of a matching as a share of the cost of removing and inserting all frames."""
-    return timing.matching.total / (UNMATCHED * (timing.before.frame_count + after.frame_count))
+    """Return the cost of a matching, from 0 to 1, apart from the frames that remain because one clip is longer."""
+    counts = timing.before.frame_count, after.frame_count
+    return (timing.matching.total - UNMATCHED * abs(counts[0] - counts[1])) / (2.0 * UNMATCHED * min(counts))
 
 
 def frame_runs(timing: Timing, count_before: int, count_after: int) -> tuple[FrameRun, ...]:
@@ -174,7 +244,8 @@ def _edges(timing: Timing, count_before: int) -> list[tuple[tuple[int, int], tup
 
 def _stored(frames: Ints, timing: Timing, count: int) -> Ints:
     """Convert borders of the sampled clip to borders of the stored clip."""
-    if timing.pace == 1.0:
+    if timing.pace == Pace(1.0):
         return frames
-    borders = np.minimum(np.round(frames / timing.pace), count).astype(np.int64)
-    return np.where(frames >= timing.before.frame_count, count, borders)
+    borders = np.clip(np.round(timing.pace.places(frames)), 0, count)
+    borders = np.where(frames == 0, 0, np.where(frames >= timing.before.frame_count, count, borders))
+    return borders.astype(np.int64)

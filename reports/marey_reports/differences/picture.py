@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from marey_reports.drawing.paper import (
     COLOURS,
-    HAIRLINE,
     HEADING,
     INK,
+    MORE_IS_WORSE,
     QUIET,
     REFERENCE,
     SMALL,
@@ -26,7 +27,6 @@ from marey_reports.drawing.paper import (
     shortened,
     to_png,
     to_svg,
-    warm_colours,
     write,
 )
 from marey_schemas.documents.annotations import Annotation
@@ -40,7 +40,7 @@ FileType = Literal["png", "svg"]
 
 MOST_JOINTS = 40
 """Most joints in the picture: those with the largest changes."""
-LEAST_DEG = 0.01
+LEAST_DEG = 0.1
 """Least change of a joint that is drawn."""
 BEFORE, AFTER = REFERENCE, COLOURS[0]
 REMOVED, INSERTED = COLOURS[1], COLOURS[2]
@@ -48,8 +48,18 @@ MATCHED = "#c9ced8"
 MOST_LABELS = 60
 """Most segments of a row whose labels are written."""
 
-_WIDTH, _LEFT, _TIMES, _PATHS = 12.6, 1.7, 6.1, 2.9
-_ROW = 0.21
+UNKNOWN = "#c4e3dc"
+"""Ground of frames that correspond to none."""
+
+MOST_SIGNS = 16
+"""Longest label of a keyframe."""
+
+_WIDTH, _LEFT, _TIMES, _PATHS = 12.8, 1.7, 6.2, 2.5
+_ROW, _HIGHEST_ROW, _LEAST_ROWS, _ABOVE, _BELOW = 0.21, 0.36, 2.0, 2.35, 0.6
+_UPPER, _LOWER = (0.74, 0.74, 1.0, 1.0), (0.0, 0.0, 0.26, 0.26)
+"""Heights of the corners of a bar."""
+_THINNEST, _NAME_ROOM = 0.004, 0.16
+"""Shares of the width: of the thinnest bar, and of a number of frames in words."""
 
 
 def draw_difference(difference: Difference, file_type: FileType) -> bytes:
@@ -87,81 +97,107 @@ def _title(difference: Difference) -> str:
 def _draw_motions(difference: Difference, motion: MotionDifference, plot: DifferencePlot) -> Figure:
     largest = plot.rotation_deg.max(axis=0, initial=-1.0)
     order = np.argsort(-largest, kind="stable")
-    shown = np.sort([joint for joint in order[:MOST_JOINTS].tolist() if largest[joint] > LEAST_DEG])
-    height = max(2.6, _ROW * len(shown))
-    figure = new_figure(_WIDTH, height + 2.9)
-    figure.text(0.02, 1.0 - 0.25 / (height + 2.9), plain(_title(difference)), fontsize=HEADING + 1.5, color=INK,
+    shown = np.sort(order[:MOST_JOINTS][largest[order[:MOST_JOINTS]] > LEAST_DEG])
+    rows = max(_LEAST_ROWS, _ROW * len(shown))
+    figure = new_figure(_WIDTH, rows + _ABOVE + _BELOW)
+    top = rows + _BELOW
+    figure.text(0.25 / _WIDTH, 1.0 - 0.3 / (top + _ABOVE), plain(_title(difference)), fontsize=HEADING + 1.5, color=INK,
                 va="center", fontweight="bold", parse_math=False)  # fmt: skip
-    _draw_runs(add_panel(figure, Place(_LEFT, height + 1.35, _TIMES, 0.75), title="frames", grid=False), motion)
-    heat = add_panel(
-        figure, Place(_LEFT, 0.55, _TIMES, height), title="change of rotations", x="time after (s)", grid=False
-    )
-    _draw_changes(figure, heat, plot, shown.astype(np.int64), height)
-    paths = add_panel(
-        figure, Place(_LEFT + _TIMES + 1.75, 0.55, _PATHS, _PATHS), title="path of the root, from above", x="x (m)",
-        y="z (m)",
-    )  # fmt: skip
-    _draw_paths(paths, plot)
+    bars = add_panel(figure, Place(_LEFT, top + 0.8, _TIMES, 0.7), grid=False)
+    bars.set_title("frames that correspond", fontsize=HEADING, color=INK, loc="left", fontweight="bold", pad=21)
+    _draw_runs(bars, motion)
+    height = min(rows, _HIGHEST_ROW * max(len(shown), 1))
+    place = Place(_LEFT, top - height, _TIMES, height)
+    heat = add_panel(figure, place, title="change of rotations", x="time after (s)", grid=False)
+    _draw_changes(figure, heat, plot, shown, top)
+    place = Place(_LEFT + _TIMES + 1.9, top + 1.45 - _PATHS, _PATHS, _PATHS)
+    name = f"path of {motion.path.joint}" if motion.path is not None else "path"
+    _draw_paths(add_panel(figure, place, title=f"{shortened(name, 26)}, from above", x="x (m)", y="z (m)"), plot)
+    bars.set_xlim(0.0, max(motion.duration_s))
+    heat.set_xlim(0.0, max(motion.duration_s))
     return figure
 
 
 def _draw_runs(panel: Axes, motion: MotionDifference) -> None:
     """Draw both revisions as bars; grey areas connect the frames that correspond."""
-    rates = motion.frame_rate_hz
+    rates, longest_s = motion.frame_rate_hz, max(motion.duration_s)
     for run in motion.runs:
         old, new = (np.array(frames) / rate for frames, rate in zip((run.before, run.after), rates, strict=True))
         if run.change == "matched":
-            panel.fill([*old, *old[::-1]], [0.74, 0.74, 1.0, 1.0], color=BEFORE, lw=0)
-            panel.fill([*new, *new[::-1]], [0.0, 0.0, 0.26, 0.26], color=AFTER, lw=0)
-            panel.fill([*old, *new[::-1]], [0.74, 0.74, 0.26, 0.26], color=MATCHED, lw=0, alpha=0.6)
-        elif run.change == "removed":
-            panel.fill([*old, *old[::-1]], [0.74, 0.74, 1.0, 1.0], color=REMOVED, lw=0)
-            _name_run(panel, f"{run.before[1] - run.before[0]} removed", float(old.mean()), 1.02, "bottom", REMOVED)
-        else:
-            panel.fill([*new, *new[::-1]], [0.0, 0.0, 0.26, 0.26], color=INSERTED, lw=0)
-            _name_run(panel, f"{run.after[1] - run.after[0]} inserted", float(new.mean()), -0.02, "top", INSERTED)
-    panel.set(xlim=(0.0, max(motion.duration_s)), ylim=(0.0, 1.0))
-    panel.set_yticks([0.87, 0.13], [f"before ({motion.frames[0]:,})", f"after ({motion.frames[1]:,})"])
+            panel.fill([*old, *old[::-1]], _UPPER, color=BEFORE, lw=0)
+            panel.fill([*new, *new[::-1]], _LOWER, color=AFTER, lw=0)
+            panel.fill([*old, *new[::-1]], [*_UPPER[:2], *_LOWER[2:]], color=MATCHED, lw=0)
+            continue
+        removed = run.change == "removed"
+        (start, stop), bar, colour = (old, _UPPER, REMOVED) if removed else (new, _LOWER, INSERTED)
+        stop = max(stop, start + _THINNEST * longest_s)
+        panel.fill([start, stop, stop, start], bar, color=colour, lw=0, zorder=2)
+    panel.set(ylim=(0.0, 1.0))
+    panel.set_yticks([0.87, 0.13], [f"before, {motion.frames[0]:,}", f"after, {motion.frames[1]:,}"])
     panel.tick_params(axis="y", length=0, labelcolor=INK)
     panel.tick_params(axis="x", bottom=False, labelbottom=False)
     for spine in panel.spines.values():
         spine.set_visible(False)
+    _name_runs(panel, motion)
 
 
-def _name_run(panel: Axes, text: str, at: float, y: float, side: str, colour: str) -> None:
-    write(panel, (at, y), text, color=colour, ha="center", va=side)
+def _name_runs(panel: Axes, motion: MotionDifference) -> None:
+    """Write the numbers of removed and inserted frames above and below the bars, as far as there is room."""
+    room = _NAME_ROOM * max(motion.duration_s)
+    free = {"removed": 0.0, "inserted": 0.0}
+    for run in motion.runs:
+        if run.change == "matched":
+            continue
+        removed = run.change == "removed"
+        start, stop = (one / motion.frame_rate_hz[not removed] for one in (run.before if removed else run.after))
+        left = min(max((start + stop - room) / 2.0, 0.0), max(motion.duration_s) - room)
+        if left < free[run.change]:
+            continue
+        free[run.change] = left + room
+        count = (run.before[1] - run.before[0]) or (run.after[1] - run.after[0])
+        place, side = (1.06, "bottom") if removed else (-0.06, "top")
+        look = {"color": REMOVED if removed else INSERTED, "ha": "center", "va": side}
+        write(panel, (left + room / 2.0, place), f"{count:,} {run.change}", **look)
 
 
-def _draw_changes(figure: Figure, panel: Axes, plot: DifferencePlot, shown: np.ndarray, height: float) -> None:
+def _draw_changes(figure: Figure, panel: Axes, plot: DifferencePlot, shown: NDArray[np.intp], top: float) -> None:
     """Draw the changes of the joints over time; where no frame corresponds, the page is grey."""
     times = np.array(plot.frames) / plot.frame_rate_hz
-    panel.set_facecolor(HAIRLINE)
     if not len(shown):
-        panel.set(xlim=(times[0], times[-1]), yticks=[])
-        write(panel, (0.5, 0.5), "no rotation changed", transform=panel.transAxes, ha="center", color=QUIET)
+        panel.set_yticks([])
+        write(
+            panel,
+            (0.5, 0.5),
+            f"no rotation changed by more than {LEAST_DEG:g}°",
+            transform=panel.transAxes,
+            ha="center",
+            color=QUIET,
+        )
         return
     values = np.ma.masked_less(plot.rotation_deg[:, shown].T, 0.0)
-    top = nice_ceiling(float(values.max()))
-    mesh = panel.pcolormesh(times, np.arange(len(shown) + 1), values, cmap=warm_colours(), vmin=0.0, vmax=top,
+    panel.fill_between(times[[0, -1]], 0, len(shown), color=UNKNOWN, lw=0)
+    most = nice_ceiling(float(values.max()))
+    mesh = panel.pcolormesh(times, np.arange(len(shown) + 1), values, cmap=MORE_IS_WORSE, vmin=0.0, vmax=most,
                             rasterized=True)  # fmt: skip
-    panel.invert_yaxis()
+    panel.set_ylim(len(shown), 0)
     names = [plain(name) for name in labels_of([plot.joints[joint] for joint in shown], 22)]
     panel.set_yticks(np.arange(len(shown)) + 0.5, names, parse_math=False)
     panel.tick_params(axis="y", length=0, labelcolor=INK)
-    place = Place(_LEFT + _TIMES + 0.12, 0.55, 0.13, min(height, 2.6))
-    add_colour_bar(figure, mesh, place, "change (°)")
+    height = min(top - _BELOW, 2.2)
+    add_colour_bar(figure, mesh, Place(_LEFT + _TIMES + 0.12, top - height, 0.13, height), "change (°)")
 
 
 def _draw_paths(panel: Axes, plot: DifferencePlot) -> None:
-    styles = ((plot.path_before_m, BEFORE, "before", 2.6), (plot.path_after_m, AFTER, "after", 1.2))
+    styles = ((plot.path_before_m, BEFORE, "before", 3.0), (plot.path_after_m, AFTER, "after", 1.3))
     for path, colour, name, width in styles:
-        panel.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=name)
-        panel.plot(*path[0], marker="o", ms=4.5, color=colour, ls="none")
+        panel.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=f"{name} (dot: start)")
+        panel.plot(*path[0], marker="o", ms=width + 4.0, color=colour, ls="none")
     both = np.concatenate((plot.path_before_m, plot.path_after_m))
     centre, side = (both.min(axis=0) + both.max(axis=0)) / 2.0, max(0.2, 1.1 * float(np.ptp(both, axis=0).max()))
+    # Seen from above with z upwards, x points to the left.
     panel.set(xlim=(centre[0] + side / 2, centre[0] - side / 2), ylim=(centre[1] - side / 2, centre[1] + side / 2))
     panel.set_aspect("equal")
-    add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.18), ncols=2)
+    add_keys(panel, loc="upper left", bbox_to_anchor=(-0.02, -0.17))
 
 
 def _draw_annotations(difference: Difference, before: Annotation, after: Annotation) -> Figure:
@@ -183,6 +219,9 @@ def _draw_annotations(difference: Difference, before: Annotation, after: Annotat
                 write(panel, (middle, bottom + 0.46), shortened(one.label, room), ha="center", fontsize=SMALL)
         for mark in layer.keyframes:
             panel.plot([mark.frame + 0.5], [bottom + 0.84], marker="v", ms=5, color=INK)
+            if len(layer.keyframes) <= MOST_LABELS:
+                place = (mark.frame + 0.5 + 0.005 * end, bottom + 0.86)
+                write(panel, place, shortened(mark.label, MOST_SIGNS), color=QUIET)
     panel.set(xlim=(0, end), ylim=(0.0, 2.0))
     panel.set_yticks([1.46, 0.46], ["before", "after"])
     panel.tick_params(axis="y", length=0, labelcolor=INK)

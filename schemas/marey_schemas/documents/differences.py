@@ -94,11 +94,16 @@ class PathMove(Answer):
     remaining_cm: float = Field(description="Largest distance between the paths after this movement.")
 
 
-class RootChange(Exceeding):
-    """Change of the root's path: distances in centimetres."""
+class PathChange(Exceeding):
+    """Change of the path of the body: distances in centimetres."""
 
+    joint: str = Field(
+        description="Joint whose path is compared: the root, or the first joint that moves if the root stands still."
+    )
     moved: PathMove | None = Field(
-        None, description="Movement that explains most of the change; absent if there is none."
+        None,
+        description="Movement of the whole path that explains nine tenths of the change, if there is one. Changes of "
+        "the root's rotation do not include its turn.",
     )
 
 
@@ -138,9 +143,9 @@ class MotionDifference(Answer):
         1.0, description="Duration after of matched motion, divided by its duration before; 1 unless it was re-timed."
     )
     rotations: tuple[JointChange, ...] = Field((), description="Changed local rotations, largest first, degrees.")
-    root: RootChange | None = Field(None, description="Absent if the path of the root is equal.")
+    path: PathChange | None = Field(None, description="Absent if the path of the body is equal.")
     translations: tuple[JointChange, ...] = Field(
-        (), description="Changed translations of joints other than the root, largest first, centimetres."
+        (), description="Changed translations of joints whose path is not compared, largest first, centimetres."
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
         ((), ()), description="Joints other than the root whose translations are stored."
@@ -207,7 +212,7 @@ class FieldChange(Answer):
 
 
 class DifferencePlot(Answer):
-    """Values to draw: the change of rotations over time, and the paths of the root."""
+    """Values to draw: the change of rotations over time, and the paths of the body."""
 
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
     frame_rate_hz: float = Field(description="Frame rate of the revision after.")
@@ -215,8 +220,8 @@ class DifferencePlot(Answer):
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change within the row's frames; -1: no frame is matched."
     )
-    path_before_m: MatchedFloats = Field(description="[points, 2]: x and z of the root before, metres.")
-    path_after_m: MatchedFloats = Field(description="[points, 2]: x and z of the root after, metres.")
+    path_before_m: MatchedFloats = Field(description="[points, 2]: x and z of the path before, metres.")
+    path_after_m: MatchedFloats = Field(description="[points, 2]: x and z of the path after, metres.")
 
 
 class Difference(Answer):

@@ -20,7 +20,7 @@ import typer
 from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client.cli import accounts, files, projects, with_global_options_first
+from marey_client.cli import files, projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
@@ -31,7 +31,8 @@ from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import _done
 from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _tell_shortfalls
-from marey_client.errors import Forbidden, Invalid, NotFound, Unauthenticated
+from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
+from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
 from marey_schemas.imports import ImportEntry
@@ -444,38 +445,125 @@ def test_a_token_whose_file_cannot_be_written_is_never_made(
     script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "there").write_text("precious")
-    monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
+    monkeypatch.setattr(tokens, "connect", lambda context: script.marey())
     with pytest.raises(FileExistsError):
-        accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "there")
+        tokens.create_token(NO_OPTIONS, "ci", output=tmp_path / "there")
     assert script.requests == []
     assert (tmp_path / "there").read_text() == "precious"
     script.answers = [problem(403, "insufficient-scope")]
     with pytest.raises(Forbidden):
-        accounts.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
+        tokens.create_token(NO_OPTIONS, "ci", output=tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_token_is_bound_to_labels_and_listed_with_them(
     script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(accounts, "connect", lambda context: script.marey())
+    monkeypatch.setattr(tokens, "connect", lambda context: script.marey())
     token = {
         "id": "token_1", "name": "w", "prefix": "abc", "scopes": ["work"], "expires_at": None, "user": "ada",
         "created_at": "2026-01-01T00:00:00Z", "labels": {"site": "lyon", "gpu": "a100"},
     }  # fmt: skip
     script.answers = [httpx.Response(201, json={**token, "secret": "marey_abc_def"})]
-    accounts.create_token(NO_OPTIONS, "w", scope=["work"], label=["gpu=a100", "site=lyon"])
+    tokens.create_token(NO_OPTIONS, "w", scope=["work"], label=["gpu=a100", "site=lyon"])
     assert json.loads(script.requests[0].content)["labels"] == {"gpu": "a100", "site": "lyon"}
     with pytest.raises(WrongUsage, match="write name=value"):
-        accounts.create_token(NO_OPTIONS, "w", scope=["work"], label=["lyon"])
+        tokens.create_token(NO_OPTIONS, "w", scope=["work"], label=["lyon"])
     listed = [token, {**token, "labels": {}}, {**token, "labels": None}]
     script.answers = [httpx.Response(200, json={"items": listed, "next_cursor": None})]
     capsys.readouterr()
-    accounts.list_tokens(NO_OPTIONS)
+    tokens.list_tokens(NO_OPTIONS)
     header, *rows = (line for line in capsys.readouterr().out.splitlines() if "id" in line or "token_1" in line)
     assert "labels" in header
     assert ["gpu=a100 site=lyon" in row for row in rows] == [True, False, False]
     assert ["none" in row for row in rows] == [False, True, False]
+
+
+SUCCESSOR = {
+    "id": "token_2", "name": "w", "prefix": "bbb", "scopes": ["work"], "expires_at": None, "user": "ada",
+    "created_at": "2026-01-01T00:00:00Z", "successor_of": "token_1", "secret": "marey_bbb_new",
+}  # fmt: skip
+ME = {"user": None, "scopes": ["work"], "token": "token_1"}
+SERVER = "http://server.test"
+
+
+@pytest.fixture
+def rotating(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Callable[[Credential], list[Any]]:
+    """Run `marey token rotate` with a credential; return the ids of the rotations that were sent so far."""
+
+    def rotate(credential: Credential) -> list[Any]:
+        monkeypatch.setattr(tokens, "connect", lambda context: script.marey())
+        monkeypatch.setattr(tokens, "credential_of", lambda context: credential)
+        script.answers += [httpx.Response(200, json=ME), httpx.Response(200, json=SUCCESSOR)]
+        tokens.rotate_token(NO_OPTIONS)
+        sent = [one for one in script.requests if one.method == "POST"]
+        assert {one.url.path for one in sent} == {"/api/v1/tokens/token_1/rotate"}
+        assert {one.headers["Authorization"] for one in script.requests} == {"Bearer marey_aaa_old"}
+        return [json.loads(one.content)["rotation_id"] for one in sent]
+
+    return rotate
+
+
+def test_a_rotated_token_is_in_its_file_and_never_shown(
+    rotating: Callable[[Credential], list[Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "worker.token"
+    write_private(file, "marey_aaa_old\n")
+    rotating(Credential(SERVER, "marey_aaa_old", str(file), file=file))
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("worker.token", "marey_bbb_new\n")]
+    shown = capsys.readouterr()
+    assert "token_2 is in" in shown.out + shown.err
+    assert "bbb" not in shown.out + shown.err
+
+
+def test_a_rotated_login_replaces_only_the_token_of_its_server(
+    rotating: Callable[[Credential], list[Any]], tmp_path: Path
+) -> None:
+    path = tmp_path / "credentials.json"
+    store_login(path, SERVER, "marey_aaa_old")
+    store_login(path, "http://other.test", "other")
+    rotating(Credential(SERVER, "marey_aaa_old", "marey login", logins=path))
+    assert read_logins(path) == Logins("http://other.test", {SERVER: "marey_bbb_new", "http://other.test": "other"})
+
+
+def test_a_rotation_that_was_killed_before_the_token_was_stored_is_repeated_with_the_same_id(
+    rotating: Callable[[Credential], list[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "worker.token"
+    write_private(file, "marey_aaa_old\n")
+    credential = Credential(SERVER, "marey_aaa_old", str(file), file=file)
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("marey_client.credentials.replace_token", die)
+        with pytest.raises(KeyboardInterrupt):
+            rotating(credential)
+    assert file.read_text() == "marey_aaa_old\n"
+    first, again = rotating(credential)
+    assert first == again
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("worker.token", "marey_bbb_new\n")]
+
+
+def test_the_id_of_another_rotation_is_not_used_again(
+    rotating: Callable[[Credential], list[Any]], tmp_path: Path
+) -> None:
+    file = tmp_path / "worker.token"
+    write_private(file, "marey_aaa_old\n")
+    write_private(tmp_path / "worker.token.rotation", f"bbb {'b' * 32}\n")
+    [sent] = rotating(Credential(SERVER, "marey_aaa_old", str(file), file=file))
+    assert sent != "b" * 32
+
+
+def test_a_token_in_a_variable_is_not_rotated(
+    rotating: Callable[[Credential], list[Any]], script: ScriptedServer
+) -> None:
+    with pytest.raises(BadCredentialFile, match="--token-file"):
+        rotating(Credential(SERVER, "marey_aaa_old", "the variable MAREY_TOKEN"))
+    assert script.requests == []
 
 
 @pytest.mark.parametrize(

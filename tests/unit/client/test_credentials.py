@@ -36,6 +36,50 @@ def test_a_token_file_comes_before_the_variable_and_that_before_the_stored_login
     assert credentials.resolve(SERVER, file, environment).token == "from-file"
 
 
+def test_a_token_file_is_read_again_when_it_changes_and_a_broken_one_changes_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_secret(tmp_path / "token", "marey_a_old\n")
+    sent: list[str] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        sent.append(request.headers["Authorization"].removeprefix("Bearer "))
+        return httpx.Response(200, json={"user": None, "scopes": []})
+
+    with Marey(SERVER, credentials.TokenFile(path), http=httpx.MockTransport(answer), retries=ONCE) as marey:
+        pinned = marey.transport.with_present_token()
+        marey.me()
+        credentials.write_private(path, "marey_b_new\n")
+        assert not pinned.has_token_of(marey.transport)
+        pinned.send("GET", "/me")
+        for spoil in (lambda: path.write_text("two words"), path.unlink):
+            marey.me()
+            spoil()
+            marey.me()
+        write_secret(path, "marey_c_newest")
+        marey.me()
+    assert sent == ["marey_a_old", "marey_a_old", *["marey_b_new"] * 4, "marey_c_newest"]
+    assert caplog.text.count("the token that was read before stays in use") == 2
+    assert "two words" not in caplog.text
+
+
+def test_a_private_file_is_replaced_in_one_step_and_a_link_stays_a_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, link = write_secret(tmp_path / "kept" / "token", "before"), tmp_path / "link"
+    link.symlink_to(path)
+    credentials.write_private(link, "after")
+    assert (link.is_symlink(), path.read_text(), path.stat().st_mode & 0o777) == (True, "after", 0o600)
+
+    def fail(_handle: int) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OSError, match="disk full"):
+        credentials.write_private(link, "half")
+    assert [(one.name, one.read_text()) for one in path.parent.iterdir()] == [("token", "after")]
+
+
 def test_a_session_without_an_address_goes_where_the_command_line_goes(
     environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,8 +1,10 @@
 """Requests of the client: retries, and errors of answers."""
 
+import json
 import logging
 import pickle
 import ssl
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -297,3 +299,22 @@ def test_a_server_that_starts_again_is_waited_for() -> None:
     restart_s = 15.0
     patient = Retries(random_unit=lambda: 1.0)  # even where every wait is as short as can be
     assert sum(patient.delay_s(tried, None) for tried in range(1, patient.tries)) > restart_s
+
+
+def test_a_rotation_whose_answer_was_lost_is_repeated_with_the_same_id(script: ScriptedServer) -> None:
+    made = {
+        "id": "token_2", "name": "w", "prefix": "bbb", "scopes": ["work"], "expires_at": None,
+        "created_at": "2026-01-01T00:00:00Z", "successor_of": "token_1", "secret": "marey_bbb_new",
+    }  # fmt: skip
+    script.answers = [ok({"user": None, "scopes": ["work"], "token": "token_1"}), LOST, ok(made)]
+    assert script.marey().tokens.rotate(grace=timedelta(minutes=5)).secret == "marey_bbb_new"
+    first, again = (json.loads(one.content) for one in script.requests[1:])
+    assert first == again
+    assert (len(first["rotation_id"]), first["grace_s"]) == (32, 300)
+
+
+def test_a_server_that_does_not_name_the_token_is_not_asked_to_rotate_it(script: ScriptedServer) -> None:
+    script.answers = [ok({"user": None, "scopes": ["work"]})]
+    with pytest.raises(errors.UnexpectedAnswer, match="upgrade"):
+        script.marey().tokens.rotate()
+    assert len(script.requests) == 1

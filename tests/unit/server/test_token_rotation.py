@@ -10,6 +10,7 @@ from sqlalchemy import select
 from tests.support.database_fixtures import AdjustableClock
 
 from marey_schemas.access import NewToken, TokenCreate, TokenRotation
+from marey_server import faults
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.errors import (
     ApiProblem,
@@ -97,6 +98,28 @@ def test_a_repeated_rotation_gets_the_same_token_and_another_one_is_refused(
     assert len(database.read(chief, tokens.list_tokens).items) == 2
     clock.advance(HOUR_S / 2 + 1)
     assert works(database, old, new) == [False, True]
+
+
+@pytest.mark.parametrize("place", ["rotate.before_commit", "rotate.after_commit"])
+def test_a_server_that_dies_before_it_answers_gives_the_same_successor_later(
+    database: Database, chief: Principal, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    def die(name: str) -> None:
+        if name == place:
+            raise RuntimeError("dead")
+
+    old = create(database, chief)
+    with monkeypatch.context() as patch:
+        patch.setattr(faults, "point", die)
+        with pytest.raises(RuntimeError):
+            rotate(database, old)
+    committed = place.endswith("after_commit")
+    stored = [one.id for one in database.read(chief, tokens.list_tokens).items if one.successor_of == old.id]
+    assert len(stored) == committed
+    new = rotate(database, old)
+    assert rotate(database, old) == new
+    assert stored in ([], [new.id])
+    assert works(database, old, new) == [True, True]
 
 
 def test_no_secret_of_a_successor_is_stored_or_follows_from_what_is_stored(

@@ -22,8 +22,8 @@ def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[StartWorker]:
     """Starts workers of `server`, which end with the test."""
     workers: list[AttachedWorker] = []
 
-    def start(*options: str, env: dict[str, str] | None = None) -> AttachedWorker:
-        workers.append(AttachedWorker(server, tmp_path, *options, env=env))
+    def start(*options: str, env: dict[str, str] | None = None, token_file: Path | None = None) -> AttachedWorker:
+        workers.append(AttachedWorker(server, tmp_path, *options, env=env, token_file=token_file))
         return workers[-1]
 
     yield start

@@ -10,6 +10,8 @@ import pytest
 from tests.support.attached_worker import StartWorker
 from tests.support.fake_server import FakeServer
 
+from marey_client.credentials import write_private
+
 
 def alive(pid: int) -> bool:
     try:
@@ -53,6 +55,43 @@ def test_a_job_is_run_once_although_the_answer_to_its_claim_was_lost(
     assert server.ended(job)["result"]["sum"] == 2
     assert server.answers_to_lose == 0
     assert [name for name, _ in server.order].count("claimed") == 1
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_worker_goes_on_with_the_token_that_replaced_its_own(
+    server: FakeServer, start_worker: StartWorker, tmp_path: Path, lost: int
+) -> None:
+    file = tmp_path / "worker.token"
+    write_private(file, "marey_a_old\n")
+    server.valid_tokens = {"marey_a_old"}
+    server.answers_to_lose = lost
+    start_worker("--slots", "1", token_file=file)
+    first = server.submit("add", {"a": 1, "b": 1})
+    server.until(lambda: server.leased)
+    server.valid_tokens.add("marey_b_new")  # as during the grace of a rotation
+    write_private(file, "marey_b_new\n")
+    assert server.ended(first)["result"]["sum"] == 2
+    server.until(lambda: {"marey_b_new"} in server.claimants.values())
+    server.valid_tokens.remove("marey_a_old")
+    assert server.ended(server.submit("add", {"a": 2, "b": 2}))["result"]["sum"] == 4
+    assert all(len(tokens) == 1 for tokens in server.claimants.values())  # no claim is repeated with another token
+    assert [name for name, _ in server.order].count("claimed") == 2
+
+
+def test_a_claim_whose_token_ended_before_it_was_answered_is_given_up_for_one_with_the_new_token(
+    server: FakeServer, start_worker: StartWorker, tmp_path: Path
+) -> None:
+    file = tmp_path / "worker.token"
+    write_private(file, "marey_a_old\n")
+    server.answers_to_lose = 1
+    server.submit("add", {"a": 0, "b": 0})
+    worker = start_worker("--slots", "1", token_file=file)
+    server.until(lambda: server.answers_to_lose == 0)
+    write_private(file, "marey_b_new\n")
+    server.valid_tokens = {"marey_b_new"}
+    assert server.ended(server.submit("add", {"a": 1, "b": 1}))["result"]["sum"] == 2
+    server.valid_tokens = set()
+    assert worker.process.wait(60) == 1  # a token that nobody replaced is refused as before
 
 
 def test_a_worker_that_stops_reports_what_is_done(server: FakeServer, start_worker: StartWorker) -> None:

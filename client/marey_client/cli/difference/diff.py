@@ -55,8 +55,8 @@ def diff(
             second, second_revision = _revision_at(marey, after)
             if first.item.kind is not second.item.kind:
                 raise WrongUsage(
-                    f"{before} is a {first.item.kind} and {after} is a {second.item.kind}; only items of one kind "
-                    "can be compared"
+                    f"only items of one kind can be compared; the kind of {before} is {first.item.kind}, and that of "
+                    f"{after} is {second.item.kind}"
                 )
             found = first.difference(
                 first_revision or first.item.revision,

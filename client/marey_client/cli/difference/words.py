@@ -23,8 +23,12 @@ from marey_schemas.wording import counted
 
 MOST_LINES = 20
 """Most joints, segments or fields that are listed; the others are counted."""
-MOST_SPANS = 4
-"""Most times that are listed for a joint."""
+MOST_SPANS = 3
+"""Most ranges of time that are listed for a joint."""
+LEAST_TURN_DEG = 0.05
+LEAST_SHIFT_CM = 0.05
+THROUGHOUT = 0.95
+"""Share of the matched frames from which on a change is called a change of the whole clip."""
 
 
 def described(difference: Difference) -> Iterator[str]:
@@ -52,7 +56,7 @@ def _changes(difference: Difference) -> Iterator[str]:
         yield from _annotation(difference.annotation)
     if difference.model is not None:
         yield from _model(difference.model)
-    yield from _limited([_field(one) for one in difference.fields], "changed field", difference.more_fields)
+    yield from _fields(difference)
 
 
 def _limited(lines: Sequence[str], noun: str, more: int = 0) -> Iterator[str]:
@@ -72,11 +76,10 @@ def _motion(motion: MotionDifference, difference: Difference) -> Iterator[str]:
     if not any(run.change == "matched" for run in motion.runs):
         yield "no frame of one revision corresponds to a frame of the other"
         return
-    rate_hz = motion.frame_rate_hz[1]
-    yield from _joints(motion.rotations, "°", difference.options.threshold_deg, rate_hz, "joint")
-    yield from _root(motion)
+    yield from _joints(motion.rotations, "°", difference.options.threshold_deg, motion, "joint")
+    yield from _path(motion, difference.options.threshold_cm)
     yield from _joints(
-        motion.translations, " cm", difference.options.threshold_cm, rate_hz, "translated joint", " moved"
+        motion.translations, " cm", difference.options.threshold_cm, motion, "translated joint", " moved"
     )
     if motion.translated_joints[0] != motion.translated_joints[1]:
         stored = [" ".join(names) or "none" for names in motion.translated_joints]
@@ -93,7 +96,7 @@ def _timing(motion: MotionDifference) -> Iterator[str]:
             f"re-timed: the same motion takes {motion.duration_ratio:.4g} times as long "
             f"(speed {1.0 / motion.duration_ratio:.4g}, {direction})"
         )
-    yield from _limited([_run(run, motion) for run in motion.runs if run.change != "matched"], "range of frames")
+    yield from _limited(list(_unmatched(motion)), "range")
     if motion.frames[0] != motion.frames[1] or motion.duration_s[0] != motion.duration_s[1]:
         yield (
             f"length: {motion.frames[0]:,} → {counted(motion.frames[1], 'frame')} "
@@ -105,58 +108,86 @@ def _run(run: FrameRun, motion: MotionDifference) -> str:
     removed = run.change == "removed"
     start, stop = run.before if removed else run.after
     side = 0 if removed else 1
-    frames, verb = stop - start, run.change
+    frames, verb, seconds = counted(stop - start, "frame"), run.change, (stop - start) / motion.frame_rate_hz[side]
     if stop - start == motion.frames[side]:
-        return f"all {counted(frames, 'frame')} {verb}"
+        return f"all {frames} {verb}"
     name = "trimmed" if removed else "extended"
     if start == 0:
-        return f"{name}: first {counted(frames, 'frame')} {verb} ({frames / motion.frame_rate_hz[side]:.2f} s)"
+        return f"{name}: first {frames} {verb} ({seconds:.2f} s)"
     if stop == motion.frames[side]:
-        return f"{name}: last {counted(frames, 'frame')} {verb} ({frames / motion.frame_rate_hz[side]:.2f} s)"
+        return f"{name}: last {frames} {verb} ({seconds:.2f} s)"
     where = _time(start, stop, motion.frame_rate_hz[side])
-    return f"{counted(frames, 'frame')} {verb} {where}{' of the revision before' if removed else ''}"
+    return f"{frames} {verb} {where}{' of the revision before' if removed else ''}"
+
+
+def _unmatched(motion: MotionDifference) -> Iterator[str]:
+    """Yield lines about removed and inserted frames; frames removed and inserted at one place were replaced."""
+    runs = iter([*motion.runs, None])
+    run = next(runs)
+    while run is not None:
+        following = next(runs)
+        if run.change == "removed" and following is not None and following.change == "inserted":
+            where = _time(*following.after, motion.frame_rate_hz[1])
+            old, new = run.before[1] - run.before[0], following.after[1] - following.after[0]
+            yield f"replaced: {counted(old, 'frame')} by {new:,} that correspond to none, {where}"
+            following = next(runs)
+        elif run.change != "matched":
+            yield _run(run, motion)
+        run = following
 
 
 def _joints(
-    joints: Sequence[JointChange], unit: str, threshold: float, rate_hz: float, noun: str, verb: str = ""
+    joints: Sequence[JointChange], unit: str, threshold: float, motion: MotionDifference, noun: str, verb: str = ""
 ) -> Iterator[str]:
     large = [one for one in joints if one.largest > threshold]
-    yield from _limited([f"{one.joint}:{verb} {_size(one, unit, rate_hz)}" for one in large], noun)
+    yield from _limited([f"{one.joint}:{verb} {_size(one, unit, threshold, motion)}" for one in large], noun)
     small = len(joints) - len(large)
     if small:
         other = "other " if large else ""
-        yield f"{counted(small, f'{other}{noun}')}{verb}: up to {joints[len(large)].largest:.2g}{unit}"
+        yield f"{counted(small, f'{other}{noun}')}:{verb} up to {_number(joints[len(large)].largest)}{unit}"
 
 
-def _size(change: Exceeding, unit: str, rate_hz: float) -> str:
-    text = f"up to {change.largest:.3g}{unit}"
+def _size(change: Exceeding, unit: str, threshold: float, motion: MotionDifference) -> str:
+    rate_hz = motion.frame_rate_hz[1]
+    matched = sum(run.after[1] - run.after[0] for run in motion.runs if run.change == "matched")
+    text = f"up to {_number(change.largest)}{unit}"
     if not change.spans:
         return text
-    shown = ", ".join(_time(start, stop, rate_hz) for start, stop in change.spans[:MOST_SPANS])
-    more = len(change.spans) - MOST_SPANS
-    others = f" and {counted(more, 'other time')}" if more > 0 else ""
-    return f"{text} {shown}{others}; mean {change.mean:.2g}{unit}"
+    mean = f", mean {_number(change.mean)}{unit}"
+    if sum(stop - start for start, stop in change.spans) >= THROUGHOUT * matched:
+        return f"{text} throughout{mean}"
+    if len(change.spans) > MOST_SPANS:
+        whole = _time(change.spans[0][0], change.spans[-1][1], rate_hz)
+        times = f"above {threshold:g}{unit} {len(change.spans)} times {whole}"
+        return f"{text} at {change.largest_at / rate_hz:.2f} s, {times}{mean}"
+    return f"{text} {' and '.join(_time(start, stop, rate_hz) for start, stop in change.spans)}{mean}"
+
+
+def _number(value: float) -> str:
+    """Return a number with three digits, or more if it has more before the decimal point."""
+    return f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
 
 
 def _time(start: int, stop: int, rate_hz: float) -> str:
     return f"between {start / rate_hz:.2f} s and {stop / rate_hz:.2f} s"
 
 
-def _root(motion: MotionDifference) -> Iterator[str]:
-    root = motion.root
-    if root is None:
+def _path(motion: MotionDifference, threshold_cm: float) -> Iterator[str]:
+    path = motion.path
+    if path is None:
         return
-    if root.moved is not None:
-        x, y, z = root.moved.shift_cm
-        turn = (
-            f"turned by {root.moved.turn_deg:.3g}° about the vertical, then " if abs(root.moved.turn_deg) > 0.01 else ""
-        )
-        yield (
-            f"path of the root: {turn}shifted by ({x:.1f}, {y:.1f}, {z:.1f}) cm as a whole; "
-            f"apart from that up to {root.moved.remaining_cm:.2g} cm"
-        )
-    else:
-        yield f"path of the root: {_size(root, ' cm', motion.frame_rate_hz[1])}"
+    if path.moved is None:
+        yield f"path of {path.joint}: {_size(path, ' cm', threshold_cm, motion)}"
+        return
+    moves = []
+    if abs(path.moved.turn_deg) > LEAST_TURN_DEG:
+        moves.append(f"turned {'left' if path.moved.turn_deg > 0 else 'right'} by {abs(path.moved.turn_deg):.4g}°")
+    if any(abs(shift) > LEAST_SHIFT_CM for shift in path.moved.shift_cm):
+        x, y, z = (f"{shift:.1f}".replace("-0.0", "0.0") for shift in path.moved.shift_cm)
+        moves.append(f"shifted by x {x}, y {y}, z {z} cm")
+    left = path.moved.remaining_cm
+    rest = f", otherwise changed by up to {_number(left)} cm" if left > LEAST_SHIFT_CM else ""
+    yield f"whole path of {path.joint}: {' and '.join(moves) or 'moved'}{rest}"
 
 
 # -- skeletons ---------------------------------------------------------------------------------------------------------
@@ -275,6 +306,26 @@ def _model(model: ModelDifference) -> Iterator[str]:
     before, after = model.mean_log_likelihood
     if before is not None and after is not None and before != after:
         yield f"mean log-likelihood of the training examples: {before:.4g} → {after:.4g} ({after - before:+.3g})"
+
+
+def _fields(difference: Difference) -> Iterator[str]:
+    """Yield changed fields; the import checks of a clip, and details of its source, in one line each."""
+    checks = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/checks/")]
+    source = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/source/details")]
+    for change, verb in (("removed", "no longer listed"), ("added", "added"), ("changed", "changed")):
+        found = [one for one in checks if one.change == change]
+        if found:
+            yield f"{counted(len(found), 'warning')} {verb}: {_names(list(dict.fromkeys(map(_check, found))))}"
+    rest = [one for one in difference.fields if one not in checks and one not in source]
+    yield from _limited([_field(one) for one in rest], "changed field", difference.more_fields)
+    if source:
+        yield f"{counted(len(source), 'value')} in the details of the clip's source changed; --json lists them"
+
+
+def _check(change: FieldChange) -> str:
+    """Return the code of a check, or its place if only one of its values changed."""
+    value = change.after if change.before is None else change.before
+    return str(value["code"]) if isinstance(value, dict) and "code" in value else change.pointer
 
 
 def _field(change: FieldChange) -> str:

@@ -62,6 +62,7 @@ def _replace(tx: Transaction, old: Row[Any], request: TokenRotation) -> None:
     tx.execute(insert(token), made)
     tx.execute(update(token).where(token.c.created_by == old.id).values(created_by=made["id"]))
     tx.emit("token.rotated", old.id, successor=made["id"])
+    faults.point("rotate.before_commit")
     tx.after_commit(lambda: faults.point("rotate.after_commit"))
 
 
