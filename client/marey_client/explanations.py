@@ -37,25 +37,31 @@ def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime
 
 def _why_waiting(job: Job) -> str:
     if job.cached_from:
-        return f"waiting: {job.cached_from} computes the same, and its result will serve."
+        return f"waiting: {job.cached_from} computes the same result, which this job will reuse."
     makers = {entry["job"] for entries in job.inputs.values() for entry in entries if "job" in entry}
     told = [f"{one}, which makes its inputs" if one in makers else one for one in job.after]
-    return f"waiting: it depends on {' and '.join(told) or 'others'}, of which not all have succeeded."
+    return f"waiting: it depends on {' and '.join(told) or 'other jobs'}; not all of these have succeeded."
 
 
 def _why_queued(job: Job, running: list[Job], now: datetime) -> list[str]:
     wait_s = (job.run_at - now).total_seconds()
     if wait_s > 0:
-        return [f"queued: it is tried again in {wait_s:.0f} s, after attempt {job.attempt} of {job.max_attempts}."]
+        return [
+            f"queued: the next attempt starts in {wait_s:.0f} s at the earliest, after attempt {job.attempt} of "
+            f"{job.max_attempts}."
+        ]
     if running:
         return [f"queued: the project's workers are busy with {len(running)} running jobs."]
-    return [f"queued: no worker has asked for a job of kind {job.kind} that may run here; is `marey worker` running?"]
+    return [
+        f"queued: no worker that can run jobs of the kind {job.kind} in this project has asked for one; is "
+        "`marey worker` running?"
+    ]
 
 
 def _why_running(job: Job, attempts: list[Attempt]) -> list[str]:
     current = next((attempt for attempt in attempts if attempt.fence == job.fence), None)
     who = current.worker if current else "a worker"
-    stopping = " It has been asked to stop." if job.cancel_requested else ""
+    stopping = " The job was cancelled and will stop." if job.cancel_requested else ""
     return [f"running: {who} works on it, attempt {job.attempt} of {job.max_attempts}.{stopping}"]
 
 

@@ -223,7 +223,7 @@ def _may_travel(name: str) -> bool:
 def _refused_name(name: str) -> ImportEntry:
     """Return the entry of a file that is refused because of its name."""
     shown = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in name)
-    detail = "its name is too long, no UTF-8, or holds line breaks or other control characters; rename it"
+    detail = "its name is too long, is not UTF-8, or contains line breaks or other control characters; rename the file"
     return ImportEntry(name=shown, status="failed", error=Refusal(code="file-name", detail=detail))
 
 
@@ -251,7 +251,7 @@ def refusal_text(entry: ImportEntry) -> str:
 def left_out_text(paths: Sequence[Path]) -> str:
     """Return a line about files in folders that are not motion files."""
     others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-    return f"left out what is no motion: {paths[0].name}{others}"
+    return f"left out, because not motion files: {paths[0].name}{others}"
 
 
 def _ignore_notice(_stage: str, _done: int, _total: int) -> None:

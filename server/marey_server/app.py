@@ -187,7 +187,10 @@ async def _drain(services: Services, server: HTTPServer, connections: Connection
     while services.in_flight and time.monotonic() < deadline:
         await asyncio.sleep(0.02)
     if services.in_flight:
-        log.warning("%d requests were cut off", len(services.in_flight))
+        log.warning(
+            "%d requests had not ended after the time for running requests (drain_s) and were aborted",
+            len(services.in_flight),
+        )
     await server.close_all_connections()
     connections.close()
     services.close()
@@ -218,7 +221,7 @@ async def serve(settings: Settings) -> None:
     """Run a server until SIGTERM or SIGINT."""
     configure_logging(settings.log_form, settings.log_level)
     for variable, meant in misspelt_variables(os.environ).items():
-        log.warning("%s is no setting and changes nothing; is %s meant?", variable, meant)
+        log.warning("%s is not a setting and has no effect; did you mean %s?", variable, meant)
     keep_freed_memory()
     raise_descriptor_limit()
     compute_on_one_thread_each()
@@ -298,7 +301,10 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
     if token_file.is_file():
         yield f"administrator: {administrator}; a token of an administrator is in {token_file}"
     else:
-        yield f"administrator: {administrator}; `marey db admin-token` makes a token where there is none any more"
+        yield (
+            f"administrator: {administrator}; if no token of an administrator is left, `marey db admin-token` "
+            "creates one"
+        )
     yield f"next, in another terminal{next_command(settings, address)}"
 
 

@@ -153,7 +153,7 @@ def clock(*, set_now: bool = False, **settings: Any) -> None:
         moved = set_clock(connection) if set_now else None
     _say(str(state))
     if moved is not None:
-        _say(f"the database now uses the time of this machine; {moved:,} times that were later were set back")
+        _say(f"the clock of the database is now the clock of this machine; {moved:,} later times were set back to it")
 
 
 def purge(**settings: Any) -> None:
@@ -202,9 +202,9 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
         try:
             database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)
         except NotFoundProblem:
-            reason = f"no administrator who is not disabled is called {user!r}; say who with --user"
+            reason = f"there is no enabled administrator named {user!r}; name another one with --user"
             raise CommandFailed(reason) from None
-    _say(f"{file} holds a new token; earlier ones still work, see `marey token ls` and `marey token revoke`")
+    _say(f"{file} contains a new token; earlier tokens remain valid: see `marey token ls` and `marey token revoke`")
 
 
 @contextmanager

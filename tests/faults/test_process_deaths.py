@@ -333,7 +333,7 @@ def test_a_worker_that_slept_with_one_job_stored_and_another_running_publishes_n
         assert_published_once(lab, finished)
         before = clips_by_name(lab)
         sleeper.send(signal.SIGCONT)
-        wait_until(lambda: any(text in sleeper.log.read_text() for text in ("given up", "the lease was lost")))
+        wait_until(lambda: any(text in sleeper.log.read_text() for text in ("attempt abandoned", "the lease was lost")))
         assert clips_by_name(lab) == before
         assert_made_from_their_clips(marey, finished)
     server.check_database()
@@ -356,7 +356,7 @@ def test_a_worker_that_slept_through_its_lease_is_refused_and_the_second_result_
         assert job.fence >= 2
         before = clips_by_name(lab)
         sleeper.send(signal.SIGCONT)
-        wait_until(lambda: "given up" in sleeper.log.read_text())
+        wait_until(lambda: "attempt abandoned" in sleeper.log.read_text())
         assert clips_by_name(lab) == before
         assert marey.jobs.get(job.id).fence == job.fence
     server.check_database()

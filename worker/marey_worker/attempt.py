@@ -205,9 +205,9 @@ class RunningAttempt:
                 end = self._when_staged(end)
             end = self._report(end)
         except LeaseLost as error:
-            log.warning("%s: given up: %s", self._lease.job, error)
+            log.warning("%s: attempt abandoned: %s", self._lease.job, error)
         except MareyError as error:
-            log.error("%s: its end could not be reported: %s", self._lease.job, error)
+            log.error("%s: the end of the attempt could not be reported: %s", self._lease.job, error)
         finally:
             self._close()
         return end

@@ -85,7 +85,7 @@ class LeaseKeeper:
             self.lost.set()
             self._stopped.set()
         except MareyError as error:
-            log.warning("%s: no heartbeat: %s", self._job, error)
+            log.warning("%s: a heartbeat failed: %s", self._job, error)
             return False
         return True
 

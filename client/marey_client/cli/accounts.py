@@ -162,7 +162,7 @@ def disable_user(context: typer.Context, name: UserName) -> None:
     """Disable a user; the data of the user is kept."""
     with connect(context) as marey:
         marey.users.disable(name)
-    print_message(f"{name} is disabled; marey user enable {name} undoes it")
+    print_message(f"{name} is disabled; to undo this, run marey user enable {name}")
 
 
 @user.command("enable")
@@ -231,7 +231,7 @@ def _ask_secret(what: str, *, twice: bool = False) -> str:
     if secret := sys.stdin.readline().rstrip("\r\n"):
         return secret
     raise WrongUsage(
-        f"the command needs {what}, but standard input is neither a terminal nor has a line of text; run the "
+        f"the command needs {what}, but standard input is not a terminal and contains no line of text; run the "
         "command in a terminal"
     )
 

@@ -16,8 +16,8 @@ MOST_SHOWN = 80
 """Greatest number of characters shown of a text that is not valid."""
 
 ANONYMOUS_HINT = (
-    "no token was found here: marey login, or --token-file; a server on this machine keeps one in admin.token "
-    "in its data folder, which MAREY_DATA names"
+    "no token was found: run marey login, or give --token-file. A server on this machine stores a token in the file "
+    "admin.token of its data folder; the variable MAREY_DATA can name this folder."
 )
 
 

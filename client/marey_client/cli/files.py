@@ -69,7 +69,9 @@ def upload(
             with progress() as advance:
                 entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
         except KeyboardInterrupt:
-            print_message("interrupted; what was imported stays, and the same command again sends only what is missing")
+            print_message(
+                "interrupted; imported files stay imported, and repeating the command sends only the missing ones"
+            )
             raise
     if as_json:
         print_json(entries)
@@ -163,7 +165,9 @@ def _show_deleted(
     rows = [(f"{one.path}/", "collection", one.deleted_at, one.id) for one in folders]
     rows += [(one.path, one.item.kind, one.item.deleted_at, one.id) for one in items]
     print_table(("name", "kind", "deleted", "id"), rows)
-    return print_message(f"marey restore {address.project}/NAME brings one back; an id where a name stands twice")
+    return print_message(
+        f"marey restore {address.project}/NAME restores an item; if several items have this name, give an id"
+    )
 
 
 def _items_called(marey: Marey, address: Address) -> list[ItemHandle]:

@@ -66,7 +66,9 @@ def follow(
             show(submitted)
             return marey.jobs.wait(submitted.id, on_progress=show)
     except KeyboardInterrupt:
-        print_message(f"{seen.id} goes on; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it")
+        print_message(
+            f"{seen.id} continues on the server; marey job show {seen.id} shows it, marey job cancel {seen.id} stops it"
+        )
         raise
 
 

@@ -125,7 +125,7 @@ def suggest(
     if remove_out is not None:
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
         remove_out.write_text("".join(names), encoding="utf-8")
-        print_message(f"{counted(len(names), 'clip')} that can go: {remove_out}")
+        print_message(f"{counted(len(names), 'clip')} that can be removed: {remove_out}")
     _print_found(found, document, as_json, _print_suggestions)
 
 
@@ -202,7 +202,10 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     if not changed:
         typer.echo(f"No trial changed: all {document['trials']} are the same to the last bit.")
     elif not moved:
-        typer.echo(f"No trial moves otherwise; {len(changed)} of {document['trials']} show the motion of other clips.")
+        typer.echo(
+            f"The character moves the same way in every trial; {len(changed)} of {document['trials']} use other "
+            "clips for it."
+        )
     else:
         typer.echo(f"{len(moved)} of {document['trials']} trials changed.")
     metrics = {one["metric"]: one for one in document["metrics"]}
@@ -236,14 +239,14 @@ def _metres(value: float | None) -> str:
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
     sections = (
-        (f"Can go without any change: {counted(len(unused['clips']), 'clip')}, "
+        (f"Can be removed without any change: {counted(len(unused['clips']), 'clip')}, "
          f"{_seconds(unused['clips'])}", unused["clips"]),
-        (f"Can be cut with hardly a change: {counted(len(unused['ranges']), 'range')} of clips, "
+        (f"Can be cut with hardly any change: {counted(len(unused['ranges']), 'range')} of clips, "
          f"{_seconds(unused['ranges'])}", unused["ranges"]),
-        (f"Can go with little harm{' once those clips are gone' if unused['clips'] else ''}: one after another, "
+        (f"Can be removed with little harm{' after those clips' if unused['clips'] else ''}, one after another: "
          f"{len(redundant['plan'])} planned; "
          f"{redundant['tried']} of {redundant['needed']} used clips tried", redundant["plan"]),
-        (f"Is there twice: {counted(len(document['near_duplicates']['pairs']), 'pair')} within "
+        (f"Are nearly the same: {counted(len(document['near_duplicates']['pairs']), 'pair')} within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
         (f"Would fill holes: {counted(len(document['fillings']), 'clip')}", document["fillings"]),
         ("In this order", document["additions"]),
@@ -278,8 +281,8 @@ def _print_steps(document: Mapping[str, Any]) -> None:
     ]  # fmt: skip
     columns = ("step", "action", "clips", "objective m", "offset m", "data s", "trials changed")
     print_table(columns, rows, right=columns[3:])
-    typer.echo({"no gain": "No further step gains enough.", "steps": "Ended after the most steps that were allowed.",
-                "evaluations": "Ended after the most sets that were to be tried."}[document["ended"]])  # fmt: skip
+    typer.echo({"no gain": "No further step gains enough.", "steps": "Ended at the greatest number of steps.",
+                "evaluations": "Ended at the greatest number of sets to try."}[document["ended"]])  # fmt: skip
 
 
 def _print_sweep(document: Mapping[str, Any]) -> None:

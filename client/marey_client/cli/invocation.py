@@ -57,5 +57,5 @@ def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Mare
             yield marey
         except Unauthenticated as error:
             if found.origin and not anonymous:
-                error.add_note(f"the token comes from {found.origin}; marey login gets another")
+                error.add_note(f"the token comes from {found.origin}; marey login creates a new one")
             raise

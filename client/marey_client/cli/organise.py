@@ -86,7 +86,7 @@ def rm(
 
         def remove(thing: Thing) -> Any:
             thing.delete()
-            print_message(f"{thing.place} is removed; marey restore {_typed(thing)} brings it back")
+            print_message(f"{thing.place} is removed; to undo this, run marey restore {_typed(thing)}")
             return {"id": thing.id, "kind": thing.kind, "place": thing.place}
 
         _do_each(things, remove, "removed", as_json)

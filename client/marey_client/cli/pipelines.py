@@ -191,7 +191,7 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
     except KeyboardInterrupt:
         first = next((job.id for job in run.steps.values() if not job.state.terminal), "JOB")
         print_message(
-            f"the jobs go on without you; marey job ls {project} shows them, marey job cancel {first} stops them"
+            f"the jobs continue on the server; marey job ls {project} shows them, marey job cancel {first} stops them"
         )
         raise typer.Exit(INTERRUPTED) from None
     finally:

@@ -139,7 +139,10 @@ def restore_database(
 @db.command("fsck")
 def check_database(
     repair: Annotated[
-        bool, typer.Option("--repair", help="Correct wrong counters of items and bytes. Other writes wait meanwhile.")
+        bool,
+        typer.Option(
+            "--repair", help="Correct wrong counters of items and bytes; other writes wait until this is done."
+        ),
     ] = False,
     data: DataFolder = None,
     database_url: DatabaseUrl = None,

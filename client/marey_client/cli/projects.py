@@ -137,7 +137,7 @@ def delete_project(context: typer.Context, name: ProjectName) -> None:
     """Delete a project; `marey project restore` restores it."""
     with connect(context) as marey:
         marey.project(name).delete()
-    print_message(f"project {name} is deleted; marey project restore {name} brings it back")
+    print_message(f"project {name} is deleted; to undo this, run marey project restore {name}")
 
 
 @project.command("restore")
@@ -145,7 +145,7 @@ def restore_project(context: typer.Context, name: ProjectName) -> None:
     """Restore a deleted project."""
     with connect(context) as marey:
         marey.project(name).restore()
-    print_message(f"project {name} is back")
+    print_message(f"project {name} is restored")
 
 
 @member.command("ls")

@@ -217,4 +217,4 @@ def _print(answer: SearchAnswer) -> None:
         if step.tree == "drawn":
             print_message("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
     for place in answer.out_of_reach:
-        print_message(f"constraint {place}: out of the model's reach; it was not trained on such motions.")
+        print_message(f"constraint {place}: out of the model's reach: the model was not trained on such motions.")

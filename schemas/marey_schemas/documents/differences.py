@@ -27,10 +27,16 @@ class DifferenceOptions(Options):
     """Options of a difference: which changes of motion have their times listed."""
 
     threshold_deg: float = Field(
-        1.0, ge=0.01, le=180, description="List the times at which a joint's rotation changed by more, in degrees."
+        1.0,
+        ge=0.01,
+        le=180,
+        description="Threshold in degrees: the times at which a joint's rotation changed by more are listed.",
     )
     threshold_cm: float = Field(
-        1.0, ge=0.001, le=1e6, description="List the times at which a position changed by more, in centimetres."
+        1.0,
+        ge=0.001,
+        le=1e6,
+        description="Threshold in centimetres: the times at which a position changed by more are listed.",
     )
 
 
@@ -42,13 +48,13 @@ class DifferenceRequest(DifferenceOptions):
         alias="from",
         ge=1,
         lt=2**31,
-        description="Revision before. Absent: the one before `to`; with `to_item`, the newest.",
+        description="Revision before the change. Absent: the revision before `to`; with `to_item`, the newest.",
     )
-    to: int | None = Field(None, ge=1, lt=2**31, description="Revision after. Absent: the newest.")
+    to: int | None = Field(None, ge=1, lt=2**31, description="Revision after the change. Absent: the newest.")
     to_item: str | None = Field(
         None, max_length=64, description="Another item of the same kind in the project, whose revision is `to`."
     )
-    plot: bool = Field(False, description="Include values to draw.")
+    plot: bool = Field(False, description="Include the values that a drawing of the difference needs.")
 
 
 class ComparedRevision(Answer):
@@ -232,7 +238,7 @@ class Difference(Answer):
     before: ComparedRevision
     after: ComparedRevision
     options: DifferenceOptions
-    parts: dict[str, Change] = Field(description="Parts that differ; a difference without any is empty.")
+    parts: dict[str, Change] = Field(description="Parts that differ; none if the two revisions are equal.")
     motion: MotionDifference | None = None
     skeleton: SkeletonDifference | None = None
     mapping: MappingDifference | None = None

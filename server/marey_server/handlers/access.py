@@ -149,12 +149,18 @@ class LogoutResource(Resource):
 class TokenQuery(PageQuery):
     """Query of a list of tokens."""
 
-    user: UserName | None = Field(None, description="Tokens of this user; default: yours. For administrators.")
-    everybody: bool = Field(False, description="Tokens of all users. For administrators.")
-    prefix: str | None = Field(
-        None, max_length=16, description="The token with this prefix: the text between the two `_` of its secret."
+    user: UserName | None = Field(
+        None, description="List the tokens of this user; default: your own. Only for administrators."
     )
-    ends_within_s: int | None = Field(None, ge=0, le=10 * 365 * 86400, description="Tokens that end within this time.")
+    everybody: bool = Field(False, description="List the tokens of all users. Only for administrators.")
+    prefix: str | None = Field(
+        None,
+        max_length=16,
+        description="List only the token with this prefix, which is the text between the two `_` of its secret.",
+    )
+    ends_within_s: int | None = Field(
+        None, ge=0, le=10 * 365 * 86400, description="List only tokens that expire within this time."
+    )
 
 
 class RevokeQuery(Request):

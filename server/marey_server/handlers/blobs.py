@@ -21,7 +21,7 @@ def require_digest(text: str) -> str:
     """Return the text if it is a digest. Raises `NotFoundProblem`."""
     if not is_digest(text):
         raise NotFoundProblem(
-            "This is not the digest of a blob, which is sha256: and 64 hexadecimal digits.", code="no-blob"
+            "This is not the digest of a blob; a digest is sha256: followed by 64 hexadecimal digits.", code="no-blob"
         )
     return text
 

@@ -121,7 +121,7 @@ class AttemptLog(Resource):
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
             raise BadRequestProblem(
-                "Upload-Offset must be the number of bytes that the stored log has already.", code="bad-upload-offset"
+                "Upload-Offset must be the number of bytes that the stored log already has.", code="bad-upload-offset"
             )
         policy = self.services.queue_policy
         return await self.answer(logs.append_log, job, fence, int(text), body or b"", policy)

@@ -177,7 +177,7 @@ class Connections:
             self._evict(None)
         if self._by_address[host] >= self._most_each or len(self._open) >= self._most:
             accepted.close()
-            self._log("full", "no place for another connection: %d are open, %d of its address",
+            self._log("full", "refused a connection: %d are open already, %d of them from its address",
                       len(self._open), self._by_address[host])  # fmt: skip
             return
         stream = _Connection(accepted, host, self._forget, self._server)
@@ -230,7 +230,7 @@ class Connections:
         """Close connections whose clients have not received enough of the waiting bytes until `now_s`."""
         for one in [one for one in self._open if one.writing() and now_s - one.since_s >= self._write_timeout_s]:
             if one.taken_bytes < LEAST_TAKEN_BYTES:
-                self._log("slow", "closed a connection of %s, which took %d bytes in %.0f s",
+                self._log("slow", "closed a connection of %s, whose client read only %d bytes in %.0f s",
                           one.address, one.taken_bytes, now_s - one.since_s)  # fmt: skip
                 one.close()
             else:

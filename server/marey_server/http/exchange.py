@@ -124,7 +124,7 @@ class Exchange(RequestHandler):
     def method_not_allowed(self) -> MethodNotAllowedProblem:
         """Return the error for a method that the resource does not declare."""
         allowed = ", ".join(sorted({*self.operations, *(["HEAD"] if "GET" in self.operations else [])}))
-        return MethodNotAllowedProblem(f"Here one can {allowed}.", headers={"Allow": allowed})
+        return MethodNotAllowedProblem(f"This address accepts only {allowed}.", headers={"Allow": allowed})
 
     @property
     def stream(self) -> object:
@@ -225,7 +225,7 @@ def render_problem(error: BaseException, request_id: str) -> Rendered:
         problem = _problem(error.status_code, problem_code(error), title, f"{title}.", request_id)
         headers = {}
     else:
-        detail = "Something went wrong here. It is in the server's log under this request id."
+        detail = "The server failed to handle the request; its log describes the error under this request id."
         problem = _problem(500, problem_code(error), "The server failed.", detail, request_id)
         headers = {}
     if problem.status == 401:

@@ -39,7 +39,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "version": ("Branch, tag or commit; with ~n at its end, the version n commits earlier.", _NAME),
     "token": ("Id of the token.", _NAME),
     "upload": ("Id of the upload.", _NAME),
-    "digest": ("Name of the bytes.", {"type": "string", "pattern": DIGEST_PATTERN}),
+    "digest": ("Digest of the blob.", {"type": "string", "pattern": DIGEST_PATTERN}),
     "job": ("Id of the job.", _NAME),
     "job_kind": ("Name of the kind of job.", _NAME),
     "stream": ("Id of the coverage stream.", _NAME),
@@ -56,14 +56,15 @@ _HEADER_SCHEMAS: dict[str, Schema] = {
 }
 _ALWAYS_NEEDED = {"Upload-Offset"}
 _HEADERS = {
-    "If-Match": 'The ETag you read, as in "7.json", or *.',
-    "If-None-Match": "* to create only what is not there.",
-    "Prefer": "wait=20: answer when the job has ended, or after so many seconds.",
-    "Range": "bytes=0-1023: only these bytes.",
-    "If-Range": "The ETag whose bytes the range continues.",
-    "Last-Event-ID": "Number of the last event received, when a stream is taken up again.",
-    "Upload-Offset": "How many bytes the server has; it must be right.",
-    "Idempotency-Key": "A text of your own; the same request with it again gives the same answer, for seven days.",
+    "If-Match": 'ETag of the version that you read, such as "7.json"; * for any version.',
+    "If-None-Match": "*: create the resource only if it does not exist.",
+    "Prefer": "wait=20: answer when the job has ended, but after at most 20 seconds.",
+    "Range": "bytes=0-1023: return only these bytes.",
+    "If-Range": "Return the range only if the resource still has this ETag; otherwise return all bytes.",
+    "Last-Event-ID": "Number of the last event that you received, to continue a stream after it.",
+    "Upload-Offset": "Number of bytes that the server has already received; any other number is refused.",
+    "Idempotency-Key": "Text that you choose. For seven days, the same request with the same text gets the same "
+    "answer.",
 }
 _TOKEN_NEEDED: list[Schema] = [{"bearer": []}]
 _TOKEN_OPTIONAL: list[Schema] = [{}, {"bearer": []}]
@@ -230,12 +231,17 @@ def _responses(operation: Operation, models: _Models) -> Schema:
     if operation.answer is not None:
         success["content"] = _answer_content(operation, models)
     if operation.etag:
-        success["headers"] = {"ETag": {"description": "State and form of the answer.", "schema": {"type": "string"}}}
+        success["headers"] = {
+            "ETag": {
+                "description": "Version of the resource and media type of the answer.",
+                "schema": {"type": "string"},
+            }
+        }
     found: Schema = {str(operation.status): success}
     if operation.etag and operation.method == "GET":
-        found["304"] = {"description": "What you hold is current."}
+        found["304"] = {"description": "The copy that you have is current."}
     if operation.shows_project:
-        found["204"] = {"description": "The change was made; the token lacks the scope read, which shows the result."}
+        found["204"] = {"description": "The change was made, but is not shown, because the token lacks the scope read."}
     for status, model in operation.also:
         found[str(status)] = {"description": HTTPStatus(status).phrase}
         if model is not None:
@@ -270,8 +276,11 @@ def _page_schema(element: Schema) -> Schema:
         "type": "object",
         "properties": {
             "items": {"type": "array", "items": element},
-            "next_cursor": {"type": ["string", "null"], "description": "Send it as `cursor` for the next page."},
-            "count": {"type": ["integer", "null"], "description": "Of the whole list, where count=exact was asked."},
+            "next_cursor": {
+                "type": ["string", "null"],
+                "description": "Value of the parameter `cursor` for the next page.",
+            },
+            "count": {"type": ["integer", "null"], "description": "Length of the whole list; only with count=exact."},
         },
         "required": ["items", "next_cursor", "count"],
     }
@@ -294,7 +303,7 @@ def _refusals(operation: Operation) -> list[int]:
 
 def _problem_response() -> Schema:
     return {
-        "description": "Why it was refused.",
+        "description": "Reason why the request was refused.",
         "headers": {"X-Request-Id": {"description": "Quote it when asking for help.", "schema": {"type": "string"}}},
         "content": {PROBLEM_TYPE: {"schema": {"$ref": _REF.format(model="Problem")}}},
     }

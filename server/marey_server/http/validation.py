@@ -28,13 +28,19 @@ def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[byte
             faults.append(FieldError(pointer=name, code="unknown-parameter", detail=_known_parameters(known)))
         elif len(given) > 1:
             faults.append(
-                FieldError(pointer=name, code="repeated", detail="Give it once; lists are separated by commas.")
+                FieldError(
+                    pointer=name,
+                    code="repeated",
+                    detail="Give this parameter only once; separate several values with commas.",
+                )
             )
         else:
             try:
                 values[name] = given[0].decode()
             except UnicodeDecodeError:
-                faults.append(FieldError(pointer=name, code="not-utf8", detail="Percent-encode it as UTF-8."))
+                faults.append(
+                    FieldError(pointer=name, code="not-utf8", detail="The value must be percent-encoded UTF-8.")
+                )
             if b"\0" in given[0]:
                 faults.append(FieldError(pointer=name, code="bad-text", detail="A text may not contain NUL."))
     if faults:
@@ -48,7 +54,7 @@ def parse_query(model: type[Model] | None, arguments: Mapping[str, Sequence[byte
 
 
 def _known_parameters(known: Mapping[str, Any]) -> str:
-    return f"Known here: {', '.join(sorted(known))}." if known else "Nothing is known here."
+    return f"The known parameters are {', '.join(sorted(known))}." if known else "This address has no parameters."
 
 
 def _bad_query(faults: list[FieldError]) -> BadRequestProblem:

@@ -258,7 +258,7 @@ def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrame
     from marey_motion.documents import clip_from_document
 
     if order.rig is None:
-        fault = _fault("/poses", "no-skeleton", "These need a skeleton.")
+        fault = _fault("/poses", "no-skeleton", "Poses need a skeleton.")
         raise InvalidProblem(
             "Poses need a skeleton, but the stream was created without one; send root positions, or create a "
             "stream with a skeleton.",

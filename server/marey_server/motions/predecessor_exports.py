@@ -43,7 +43,7 @@ class PredecessorOptions:
         """Raise `InvalidProblem` if items of the kind do not have the requested part."""
         if self.part is not None and self.part not in PARTS_OF.get(kind, ()):
             held = " or ".join(PARTS_OF.get(kind, ())) or "none"
-            detail = f"A {kind} has no part {self.part!r} of its own as a file of the predecessor; it has {held}."
+            detail = f"In the predecessor's format, a {kind} has no file for the part {self.part!r}; it has {held}."
             raise InvalidProblem(detail, code="no-part")
 
 

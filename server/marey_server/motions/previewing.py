@@ -150,13 +150,15 @@ def make_preview(packed: bytes) -> bytes:
     source, request = order.source(), order.request
     made = _edited(source, order.most_work)
     if request.piece >= len(made):
-        raise _invalid("/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}, counted from 0.")
+        raise _invalid(
+            "/piece", "no-piece", f"The edit creates only {counted(len(made), 'clip')}; `piece` counts them from 0."
+        )
     wanted = made[request.piece]
     start, stop = request.frames
     stop = min(wanted.clip.frame_count, wanted.clip.frame_count if stop is None else stop)
     if start >= stop:
         held = counted(wanted.clip.frame_count, "frame")
-        raise _invalid("/frames", "no-frames", f"The range contains no frame of the new clip, which has {held}.")
+        raise _invalid("/frames", "no-frames", f"The new clip has {held}; the range contains none of them.")
     shown = wanted.clip.sliced(start, stop)
     if shown.poses.size > order.most_shown:
         raise TooLargeProblem(

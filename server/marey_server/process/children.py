@@ -34,7 +34,7 @@ ABANDONED_S = 1.0
 CLOSING_S = 10.0
 ASK_AGAIN_S = 5
 """Time in seconds after which a refused client is asked to try again."""
-JOB_ADVICE = "split it, or submit a job, which may have more"
+JOB_ADVICE = "split the request, or submit a job, which has higher limits"
 _PROBLEMS = {one.status: one for one in (InvalidProblem, NotFoundProblem, TooLargeProblem)}
 
 log = logging.getLogger(__name__)

@@ -67,7 +67,7 @@ async def _give_up_lead(services: Services, holder: str) -> None:
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
     except ApiProblem as error:
-        log.warning("another process leads only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
+        log.warning("housekeeping can pass to another process only in %d s: %s", LEAD_TTL_US / 1_000_000, error.detail)
 
 
 async def _repeat(services: Services, holder: str, first_s: float, every_s: float, chore: Chore) -> None:
@@ -108,7 +108,7 @@ async def _reap_pages(services: Services) -> None:
         page = await _write(services, reaper.reap_page, services.queue_policy, page.after)
         taken += page.taken
     if taken:
-        log.warning("took %d jobs back from workers that are not heard of any more", taken)
+        log.warning("took %d jobs back from workers that no longer send heartbeats", taken)
 
 
 async def _share_results(services: Services, holder: str) -> None:
@@ -127,7 +127,7 @@ async def _collect_garbage(services: Services, holder: str) -> None:
     if await _write(services, _leads, holder):
         retired = await _in_thread(services, retire, services.database, services.settings.retention)
         collected = await _in_thread(services, collect_garbage, services.database)
-        log.info("deleted what was old: %s; collected garbage: %s", retired, collected)
+        log.info("deleted old rows: %s; deleted unused rows: %s", retired, collected)
 
 
 async def _in_thread(services: Services, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:

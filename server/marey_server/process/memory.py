@@ -39,9 +39,9 @@ class RequestMemory:
             exceeds_share = not reserved and self._by_owner[owner] + more > share * self.total_bytes
             total = self.total_bytes * (1 + RESERVED_SHARE * reserved)
             if others and (exceeds_share or self.held_bytes + more > total):
-                whose = "your requests use" if exceeds_share else "requests use"
+                whose = "your requests" if exceeds_share else "all requests together"
                 raise UnavailableProblem(
-                    f"All the memory that {whose} is in use; try again in a few seconds, with fewer requests at once.",
+                    f"The memory for {whose} is in use; try again in a few seconds, with fewer requests at once.",
                     code="memory",
                     headers={"Retry-After": str(RETRY_AFTER_S)},
                 )

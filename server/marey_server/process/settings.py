@@ -43,13 +43,14 @@ class Settings(BaseSettings):
         description="Reading transactions that run at the same time. Absent: 2 on SQLite, 8 on Postgres.",
     )
     blobs: Literal["database", "directory"] = Field(
-        "database", description="Where bytes are kept: in the database, or in the folder blobs of the data folder."
+        "database", description="Storage of blobs: in the database, or in the folder `blobs` of the data folder."
     )
     answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory for a cache of encoded documents.")
     trust_proxy: bool = Field(
         False,
-        description="Take the addresses of clients from the header proxy_header; only for servers that nobody can "
-        "reach except through a proxy that sets it.",
+        description="Read the addresses of clients from the header proxy_header. Safe only if all clients reach the "
+        "server "
+        "through a proxy that sets this header.",
     )
     proxy_header: Literal["X-Forwarded-For", "X-Real-IP"] = Field(
         "X-Forwarded-For", description="Header in which the proxy names the client's address, if trust_proxy is set."
@@ -58,8 +59,8 @@ class Settings(BaseSettings):
         1,
         ge=1,
         le=16,
-        description="Number of proxies that append an address to the header; earlier entries may be the client's "
-        "invention.",
+        description="Number of proxies that append an address to the header. Earlier entries are ignored, because a "
+        "client can invent them.",
     )
     log_form: Literal["json", "text"] = Field(
         "json", description="Format of the log: one JSON object per line, or text for people."
@@ -82,18 +83,21 @@ class Settings(BaseSettings):
     write_timeout_s: float = Field(
         60.0,
         gt=0,
-        description="Seconds in which a client must take 64 KiB of an answer or its rest; then the server closes.",
+        description="Seconds within which a client must read 64 KiB of an answer, or the rest of it; otherwise the "
+        "server closes the connection.",
     )
     max_connections: int | None = Field(
         None,
         ge=16,
-        description="Greatest number of open connections, three quarters of them from one address. Absent: 10000, or "
-        "as many as the limit on open files leaves room for.",
+        description="Greatest number of open connections; at most three quarters of them from one address. Absent: "
+        "10000, or fewer if the limit on open files requires it.",
     )
     request_memory_bytes: int = Field(
         512 * MIB,
         ge=MIB,
-        description="Memory for bodies and long answers of all requests together, a quarter of it for strangers.",
+        description="Memory in bytes for bodies and long answers of all requests together. Requests without a token "
+        "get "
+        "at most a quarter of it.",
     )
     min_free_bytes: int = Field(
         64 * MIB,
@@ -106,36 +110,38 @@ class Settings(BaseSettings):
     login_tries_per_minute: int = Field(
         10,
         ge=1,
-        description="Greatest number of wrong passwords per minute for a user name from one address (of IPv6, one "
-        "network of 64 bits). An address has ten times as many for all names, and so have all addresses together at "
-        "once for a name that has never signed in there.",
+        description="Greatest number of wrong passwords per minute for one user name from one address (in IPv6, one "
+        "network of 64 bits). Ten times as many are allowed for all names from one address, and for one name from all "
+        "addresses where it has never signed in.",
     )
     import_files_now: int = Field(
-        64, ge=0, description="Greatest number of files in an import that runs at once; larger imports become a job."
+        64,
+        ge=0,
+        description="Greatest number of files in an import that is done immediately; larger imports become a job.",
     )
     import_bytes_now: int = Field(
         64 * MIB,
         ge=0,
-        description="Greatest number of bytes in an import that runs at once; larger imports become a job.",
+        description="Greatest number of bytes in an import that is done immediately; larger imports become a job.",
     )
     child_processes: int | None = Field(
         None,
         ge=2,
         le=64,
-        description="Processes in which the server reads uploaded files and computes on stored data; nobody uses all "
-        "of them at once. Absent: one more than there are processors, but 3 to 5.",
+        description="Processes in which the server reads uploaded files and computes on stored data; no user "
+        "can use all of them at the same time. Absent: one more than the number of processors, but 3 to 5.",
     )
     child_requests: int = Field(
         32,
         ge=2,
-        description="Greatest number of requests that use these processes or wait for one; a user has half of them. "
-        "Others are answered with 503.",
+        description="Greatest number of requests that use a child process or wait for one; at most half of them from "
+        "one user. Further requests are answered with 503.",
     )
-    child_memory_mb: int = Field(1024, ge=64, description="Memory in MiB that such a process may use for its work.")
+    child_memory_mb: int = Field(1024, ge=64, description="Memory in MiB that a child process may use for a request.")
     child_processor_s: float = Field(
-        30.0, ge=1, description="Greatest processor time in seconds for one piece of work."
+        30.0, ge=1, description="Greatest processor time in seconds of a child process for one request."
     )
-    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds for one piece of work.")
+    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds of a child process for one request.")
     lease_ttl_s: float = Field(
         QueuePolicy.lease_ttl_s,
         ge=1,
@@ -154,17 +160,19 @@ class Settings(BaseSettings):
         le=3600,
         description="Seconds that a worker has to stop a job that was cancelled or whose time limit has passed.",
     )
-    user_uploads: int = Field(
-        Quotas.user_uploads, ge=0, description="Greatest number of uploads that a user has begun and not finished."
-    )
+    user_uploads: int = Field(Quotas.user_uploads, ge=0, description="Greatest number of unfinished uploads of a user.")
     user_upload_bytes: int = Field(
-        Quotas.user_upload_bytes, ge=0, description="Greatest number of bytes that such uploads of a user announce."
+        Quotas.user_upload_bytes,
+        ge=0,
+        description="Greatest total size, in bytes, of the unfinished uploads of a user.",
     )
     user_tokens: int = Field(
         Quotas.user_tokens, ge=0, description="Greatest number of valid tokens of a user, apart from sign-ins."
     )
     user_projects: int = Field(
-        Quotas.user_projects, ge=0, description="Number of owned projects from which on a user creates no more."
+        Quotas.user_projects,
+        ge=0,
+        description="Number of owned projects; a user who owns as many cannot create another project.",
     )
     user_jobs: int = Field(
         Quotas.user_jobs,
@@ -176,24 +184,31 @@ class Settings(BaseSettings):
         ge=0,
         description="Greatest number of open connections over which a user follows events.",
     )
-    user_items: int = Field(Quotas.user_items, ge=0, description="Greatest number of items that a user created.")
+    user_items: int = Field(
+        Quotas.user_items, ge=0, description="Greatest number of items of a user, who is the user that created them."
+    )
     user_stored_bytes: int = Field(
-        Quotas.user_stored_bytes, ge=0, description="Greatest number of bytes that the revisions of these items take."
+        Quotas.user_stored_bytes,
+        ge=0,
+        description="Greatest number of bytes that the revisions of a user's items take.",
     )
     project_items: int = Field(Quotas.project_items, ge=0, description="Greatest number of items in a project.")
     project_stored_bytes: int = Field(
-        Quotas.project_stored_bytes, ge=0, description="Greatest number of bytes that the revisions of its items take."
+        Quotas.project_stored_bytes,
+        ge=0,
+        description="Greatest number of bytes that the revisions of a project's items take.",
     )
-    events_days: int = Field(
-        Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever, as for the next two."
-    )
+    events_days: int = Field(Retention.events_days, ge=0, description="Days for which events are kept; 0: for ever.")
     logs_days: int = Field(
-        Retention.logs_days, ge=0, description="Days for which the log of an attempt is kept after its end."
+        Retention.logs_days,
+        ge=0,
+        description="Days for which the log of an attempt is kept after its end; 0: for ever.",
     )
     jobs_days: int = Field(
         Retention.jobs_days,
         ge=0,
-        description="Days for which a job is kept after its end. A job that made a revision is kept for ever.",
+        description="Days for which a job is kept after its end; 0: for ever. A job that made a revision is kept for "
+        "ever.",
     )
     local_workers: int = Field(0, ge=0, le=256, description="Number of worker processes that the server starts.")
 

@@ -247,7 +247,7 @@ def _name_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 def missing_blobs(digests: Iterable[str], errors: Sequence[FieldError] = ()) -> ConflictProblem:
     """Return the error for a document or job that names blobs that are not stored."""
-    detail = "This names blobs that are not here; send them first."
+    detail = "The request refers to blobs that the server does not have; upload them first."
     return ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(set(digests))}, errors=errors)
 
 

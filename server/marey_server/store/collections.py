@@ -110,7 +110,7 @@ def _find(
 
 
 def _no_collection(collection_id: str) -> NotFoundProblem:
-    return NotFoundProblem(f"There is no collection {collection_id!r} here.", code="no-collection")
+    return NotFoundProblem(f"The project has no collection {collection_id!r}.", code="no-collection")
 
 
 def _shown(row: Row[Any]) -> Collection:
@@ -132,7 +132,7 @@ def create_collection(tx: Transaction, project: str, request: CollectionCreate) 
 
 
 def _path_taken(path: str) -> ConflictProblem:
-    return ConflictProblem(f"There is a collection {path!r} already.", code="path-taken")
+    return ConflictProblem(f"There is already a collection {path!r}.", code="path-taken")
 
 
 def move_collection(

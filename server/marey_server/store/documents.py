@@ -129,7 +129,9 @@ def _check(tree: Any, schema: str | None) -> str:
         raise InvalidProblem(f"This part must have the schema {schema}, not {named!r}.", code="bad-schema")
     for pointer, leaf in _members(tree):
         if _is_reference(leaf):
-            detail = "Send the array itself (dtype, shape, data); a reference to content is no document's own."
+            detail = (
+                "Send the array itself (dtype, shape, data); a document cannot refer to the content of another one."
+            )
             raise InvalidProblem(detail, errors=[FieldError(pointer=pointer, code="array-reference", detail=detail)])
     model = SCHEMAS.get(str(named)) or SCHEMAS[OPEN_SCHEMA]
     try:
@@ -192,7 +194,7 @@ def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, s
 def _check_pointers(pointers: list[str]) -> None:
     for pointer in pointers:
         if len(pointer) > _POINTER_LENGTH:
-            detail = f"Arrays and files must lie at a JSON Pointer of at most {_POINTER_LENGTH} characters."
+            detail = f"The JSON Pointer of an array or file must have at most {_POINTER_LENGTH} characters."
             raise InvalidProblem(
                 detail, errors=[FieldError(pointer=pointer[:_POINTER_LENGTH], code="too-deep", detail=detail)]
             )

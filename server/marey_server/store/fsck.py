@@ -107,7 +107,7 @@ def _check_file(tx: Transaction) -> list[StoreDefect]:
     dangling = tx.execute(text("PRAGMA foreign_key_check")).mappings()
     return findings + [
         StoreDefect(
-            "dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to what {row['parent']} does not hold"
+            "dangling-reference", f"{row['table']}/{row['rowid']}", f"refers to a missing row of {row['parent']}"
         )
         for row in dangling
     ]
@@ -119,7 +119,7 @@ def _check_blob(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         hashed.update(piece)
         size += len(piece)
     if size != row.size_bytes:
-        return [StoreDefect("blob-incomplete", row.digest, f"{size} of {row.size_bytes} bytes are there")]
+        return [StoreDefect("blob-incomplete", row.digest, f"only {size} of {row.size_bytes} bytes are stored")]
     if f"sha256:{hashed.hexdigest()}" != row.digest:
         return [StoreDefect("blob-corrupt", row.digest, "the bytes have another digest")]
     return []
@@ -132,18 +132,18 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     arrays, files = documents.references_of(row.schema, row.body)
     file_bytes = select(func.coalesce(func.sum(blob.c.size_bytes), 0)).where(blob.c.digest.in_(set(files.values())))
     if tx.execute(file_bytes).scalar_one() != row.file_bytes:
-        findings.append(StoreDefect("document-reference", row.digest, "the files that it names have another size"))
+        findings.append(StoreDefect("document-reference", row.digest, "the files to which it refers have another size"))
     statement = select(document_blob.c.pointer, document_blob.c.blob_digest, blob.c.size_bytes)
     statement = statement.outerjoin(blob, blob.c.digest == document_blob.c.blob_digest)
     held = {
         found.pointer: found for found in tx.execute(statement.where(document_blob.c.document_digest == row.digest))
     }
     for pointer in sorted(held.keys() ^ (arrays.keys() | files.keys())):
-        what = "has no blob" if pointer not in held else "is no reference"
+        what = "has no blob" if pointer not in held else "is not a reference, but has a blob"
         findings.append(StoreDefect("document-reference", row.digest, f"{pointer} {what}"))
     for pointer, named in files.items():
         if pointer in held and held[pointer].blob_digest != named:
-            findings.append(StoreDefect("document-reference", row.digest, f"{pointer} is held by another blob"))
+            findings.append(StoreDefect("document-reference", row.digest, f"{pointer} has another blob"))
     for pointer, leaf in arrays.items():
         if pointer in held and held[pointer].size_bytes is not None:
             findings += _check_array(tx, row.digest, pointer, leaf, held[pointer])
@@ -189,7 +189,9 @@ def _check_item(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         findings.append(StoreDefect(MISCOUNTED, row.id, detail))
     place = tx.execute(select(collection).where(collection.c.id == row.collection_id)).first()
     if place is None or place.project_id != row.project_id or (row.deleted_us is None) > (place.deleted_us is None):
-        findings.append(StoreDefect("misplaced-item", row.id, "its collection is deleted, gone or of another project"))
+        findings.append(
+            StoreDefect("misplaced-item", row.id, "its collection is deleted, missing, or in another project")
+        )
     return findings
 
 
@@ -222,13 +224,17 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     )
     if tx.execute(select(above)).scalar():
         return []
-    return [StoreDefect("orphan-collection", row.id, f"{row.path!r} lies in {parent!r}, which is not there")]
+    return [StoreDefect("orphan-collection", row.id, f"{row.path!r} is in {parent!r}, which does not exist")]
 
 
 def _check_holding(tx: Transaction, row: Row[Any], owner: Column[str]) -> list[StoreDefect]:
     """Check the counters of a project or a user, whom the column `owner` of items names."""
     counted, recorded = quotas.count_held(tx, owner, row.id), quotas.read_held(tx, row.id)
-    return [] if counted == recorded else [StoreDefect(MISCOUNTED, row.id, f"it holds {counted}, not {recorded}")]
+    return (
+        []
+        if counted == recorded
+        else [StoreDefect(MISCOUNTED, row.id, f"it has {counted}, but {recorded} are recorded")]
+    )
 
 
 def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
@@ -241,7 +247,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     return (
         []
         if size == row.offset
-        else [StoreDefect("upload-incomplete", row.id, f"{size} of {row.offset} bytes are there")]
+        else [StoreDefect("upload-incomplete", row.id, f"only {size} of {row.offset} bytes are stored")]
     )
 
 

@@ -90,7 +90,7 @@ def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredU
         raise _elsewhere(found.offset)
     if offset + len(data) > found.length:
         raise TooLargeProblem(
-            f"The upload was created for {found.length} bytes, but with this piece it would have {offset + len(data)}."
+            f"The upload was created for {found.length} bytes, but would have {offset + len(data)} after this piece."
         )
     if not data:
         return _shown(found)
@@ -145,7 +145,10 @@ def finish(tx: Transaction, upload_id: str, digest: str, copy: Path | None) -> S
 def require_intact(found: StoredUpload) -> None:
     """Raise `InvalidProblem` if the bytes do not have the announced digest."""
     if found.actual_digest is not None:
-        detail = f"The bytes are {found.actual_digest}, not {found.announced}. Delete this upload and make another one."
+        detail = (
+            f"The bytes have the digest {found.actual_digest}, not {found.announced}. Delete this upload and "
+            "create another."
+        )
         raise InvalidProblem(detail, code="digest-mismatch")
 
 
@@ -221,7 +224,7 @@ def _find(tx: Transaction, upload_id: str) -> Row[Any]:
 
 def _elsewhere(offset: int) -> ConflictProblem:
     return ConflictProblem(
-        f"The upload is at byte {offset}; go on from there.", code="wrong-offset", context={"offset": offset}
+        f"The server has received {offset} bytes; continue from there.", code="wrong-offset", context={"offset": offset}
     )
 
 

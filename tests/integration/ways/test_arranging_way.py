@@ -97,7 +97,7 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
 @pytest.mark.parametrize(
     ("arguments", "status", "told"),
     [
-        (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is a clip of that name there already."),
+        (["mv", "lab/raw/a", "lab/raw/b"], 1, "lab/raw/a: There is already a clip with this name in the collection."),
         (["mv", "lab/raw/a", "studio/a"], 2, "lab/raw/a cannot move to another project"),
         (["mv", "lab/raw/nobody", "lab/raw/b"], 2, "there is no item or folder at lab/raw/nobody"),
         (["mv", "lab/raw/a"], 2, "give the items to move and the destination"),
@@ -122,7 +122,7 @@ def test_what_cannot_be_is_told_and_changes_nothing(
 
 
 def test_what_was_removed_is_listed_and_comes_back(run: Command, lab: ProjectHandle) -> None:
-    assert "marey restore lab/raw/a brings it back" in run("rm", "lab/raw/a").stderr
+    assert "to undo this, run marey restore lab/raw/a" in run("rm", "lab/raw/a").stderr
     run("rm", "lab/raw", "--yes")
     assert clips(lab) == []
     assert "raw/a" not in run("ls", "-r", "lab").stdout
@@ -146,7 +146,7 @@ def test_of_several_that_were_removed_at_one_place_the_last_comes_back_and_each_
     run("restore", "lab/raw/a")
     assert next(lab.clips.list(path="raw/a")).id == second
     told = run("restore", f"lab/{first}", status=1).stderr
-    assert "There is another clip 'a' in its place now." in told
+    assert "The collection now contains another clip named 'a'." in told
     assert "first move the item at that place away, with marey mv" in told
     run("mv", "lab/raw/a", "lab/raw/b")
     run("restore", f"lab/{first}")

@@ -131,7 +131,7 @@ def test_another_layout_and_a_changed_model_are_written_anew(lab: ProjectHandle,
         model.export(tmp_path / "none", format="predecessor", part="tree")
     with pytest.raises(RequestFailed, match="not imported from one"):
         model.export(tmp_path / "none", format="original", part="tree")
-    with pytest.raises(RequestFailed, match="model has no part 'alignment'"):
+    with pytest.raises(RequestFailed, match="model has no file for the part 'alignment'"):
         model.export(tmp_path / "none", format="predecessor", part="alignment")
     with pytest.raises(RequestFailed, match="/provenance/predecessor") as refused:
         model.put_part("model", {**document, "provenance": {"predecessor": "x"}})
@@ -205,7 +205,7 @@ def test_models_of_a_large_upload_come_in_by_a_job_with_their_trees(
     tree = model.export(tmp_path / "out", format="predecessor", part="tree")
     assert tree.read_bytes() == files["walk7_cluster_tree.json"]
     assert model.part("tree")["model_digest"] == model.item.parts["model"].document
-    with pytest.raises(RequestFailed, match="name its digest"):
+    with pytest.raises(RequestFailed, match="give the digest"):
         model.put_part("tree", {**model.part("tree"), "model_digest": {"digest_of": "model"}})
 
 

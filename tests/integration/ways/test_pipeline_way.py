@@ -167,6 +167,6 @@ def test_who_stops_waiting_leaves_the_jobs_running_and_is_told_so(
     waiting.send_signal(signal.SIGINT)
     _, told = waiting.communicate(timeout=60)
     assert waiting.returncode == 130, told
-    assert "go on without you" in told
+    assert "continue on the server" in told
     for job in list(lab.jobs()):
         assert marey.jobs.wait(job.id, timeout_s=300).state == "succeeded"

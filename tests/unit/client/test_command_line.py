@@ -376,7 +376,7 @@ def test_who_interrupts_the_wait_for_a_job_is_told_that_it_goes_on(
     with pytest.raises(KeyboardInterrupt):
         follow(script.marey(), running)
     told = capsys.readouterr().err
-    assert "job_1 goes on" in told
+    assert "job_1 continues on the server" in told
     assert "marey job cancel job_1" in told
 
 
@@ -438,7 +438,7 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(
     script.answers = [httpx.Response(200, json=PROJECT), interrupt]
     with pytest.raises(KeyboardInterrupt):
         files.upload(NO_OPTIONS, [tmp_path], "lab", {})
-    assert "the same command again sends only what is missing" in capsys.readouterr().err
+    assert "repeating the command sends only the missing ones" in capsys.readouterr().err
 
 
 def test_a_token_whose_file_cannot_be_written_is_never_made(

@@ -56,10 +56,10 @@ def test_waiting_gives_up_when_told_to(script: ScriptedServer) -> None:
     [
         ({"state": "waiting"}, [], "depends on"),
         ({"state": "waiting", "size": 4, "children": {"queued": 3, "succeeded": 1}}, [], "3 queued, 1 succeeded"),
-        ({"run_at": NOW + timedelta(seconds=30), "attempt": 1}, [], "again in 30 s, after attempt 1 of 3"),
+        ({"run_at": NOW + timedelta(seconds=30), "attempt": 1}, [], "in 30 s at the earliest, after attempt 1 of 3"),
         ({}, [job(state="running")], "busy with 1"),
-        ({}, [], "no worker has asked"),
-        ({"state": "running", "attempt": 2, "cancel_requested": True}, [], "asked to stop"),
+        ({}, [], "has asked for one"),
+        ({"state": "running", "attempt": 2, "cancel_requested": True}, [], "was cancelled and will stop"),
         ({"state": "failed", "failure": {"reason": "poison", "code": "x", "detail": "twice"}}, [], "poison, x"),
         ({"state": "succeeded", "cached_from": "job_0"}, [], "job_0"),
     ],

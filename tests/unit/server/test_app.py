@@ -100,4 +100,4 @@ def test_a_server_whose_database_is_away_stops_all_the_same(
 
     with running(database, tmp_path):
         monkeypatch.setattr(leader, "give_up_lead", without_database)
-    assert "another process leads only in 30 s: The database does not answer." in caplog.text
+    assert "housekeeping can pass to another process only in 30 s: The database does not answer." in caplog.text

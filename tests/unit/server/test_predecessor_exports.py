@@ -126,7 +126,7 @@ def test_a_tree_whose_nodes_are_none_is_refused(stored: tuple[Mapping[str, Any],
     [(Kind.MODEL, "alignment"), (Kind.PROCESSED, "tree"), (Kind.CLIP, "model"), (Kind.ANNOTATION, "alignment")],
 )
 def test_a_part_that_items_of_a_kind_do_not_have_is_refused(kind: Kind, part: Part) -> None:
-    with pytest.raises(InvalidProblem, match=f"{kind} has no part '{part}'") as refused:
+    with pytest.raises(InvalidProblem, match=f"{kind} has no file for the part '{part}'") as refused:
         PredecessorOptions(part=part).require_part_of(kind)
     assert refused.value.error_code == "no-part"
     PredecessorOptions().require_part_of(kind)

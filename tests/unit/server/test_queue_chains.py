@@ -577,7 +577,7 @@ def test_results_know_exactly_which_revisions_they_were_made_from(desk: Desk) ->
     both: Any = {"things": [{"item": thing, "revision": 1}, {"item": thing, "revision": 2}]}
     desk.submit("square", inputs=both)
     lease = desk.claim()
-    with pytest.raises(InvalidProblem, match="has its revision 1, revision 2"):
+    with pytest.raises(InvalidProblem, match="reads revision 1, revision 2"):
         desk.stage(lease, "vague", sources={"things": [{"item": thing}]})
     with pytest.raises(InvalidProblem, match="revision 3"):
         desk.stage(lease, "wrong", sources={"things": [{"item": thing, "revision": 3}]})

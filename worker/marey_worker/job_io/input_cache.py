@@ -79,7 +79,7 @@ class InputCache:
                 file.write(data)
             temporary.replace(path)
         except OSError as error:
-            log.warning("cannot keep an input in %s: %s", self.folder, error)
+            log.warning("cannot store an input in the cache %s: %s", self.folder, error)
             temporary.unlink(missing_ok=True)
             return
         with self._lock:

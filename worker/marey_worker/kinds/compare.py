@@ -28,7 +28,10 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
     try:
         comparison = compare_results(before, after)
     except MotionError as error:
-        again = f"`marey evaluate … --normaliser PROJECT/{first.path}` and its options make one that can be"
+        again = (
+            f"`marey evaluate … --normaliser PROJECT/{first.path}` with the options of that evaluation makes one "
+            "that can be compared"
+        )
         raise JobRefused(error.code, f"{error}; {again}") from error
     document = {**comparison_to_tree(comparison), "names": {"before": first.path, "after": second.path}}
     result = {**_counts(comparison), "document": store_document(context, document)}

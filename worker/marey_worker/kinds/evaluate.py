@@ -56,7 +56,7 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
 def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Compute the measures from the records of all trials, and stage the evaluation with its report, if requested."""
     options = EvaluationOptions.of(params)
-    context.progress(0, GATHERING_STEPS, "reading what the trials recorded")
+    context.progress(0, GATHERING_STEPS, "reading the records of the trials")
     database = read_clips(context, params, options.database).database
     trials = _trials(params, options)
     known = _read_records(context, results)

@@ -141,7 +141,7 @@ def write_model_report(
 
 
 def _checked(context: Context, trained: TrainedPrimitive, aligned: AlignedSet) -> SearchCheck | None:
-    context.progress(0, None, "searching for what examples reached")
+    context.progress(0, None, "searching for targets that the examples reached")
     skeleton = aligned.skeleton
     joints = {standard: skeleton.index_of(name) for standard, name in map_joints(skeleton).joints.items()}
     return check_search(aligned, joints, trained.options, seed=context.seed)

@@ -81,7 +81,7 @@ def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDat
 
 
 def _told(step: OptimisationStep, names: dict[str, str]) -> str:
-    did = {"start": "the set as it is", "remove": "without", "add": "with"}[step.action]
+    did = {"start": "the unchanged set", "remove": "without", "add": "with"}[step.action]
     clips = ", ".join(names.get(source, source) for source in step.sources)
     told = f"objective {step.objective:.4f} m, offset {step.metrics['offset_mean']:.4f} m, {step.data_s:.1f} s of data"
     return f"step {step.number}: {did} {clips}".rstrip() + f": {told}, {step.changed_trials} trials changed"

@@ -347,7 +347,7 @@ def _translated(error: Exception) -> Exception:
     if isinstance(error, exc.TimeoutError):
         return _no_answer("All connections to the database are in use; nothing was written.")
     if isinstance(error, OverflowError | UnicodeEncodeError | exc.DataError):
-        return InvalidProblem("A number or text of the request is beyond what can be stored.", code="bad-value")
+        return InvalidProblem("The request contains a number or text that the database cannot store.", code="bad-value")
     if not isinstance(error, exc.DBAPIError):
         return error
     message = str(error.orig)

@@ -83,7 +83,9 @@ def vacuum(file: Path) -> None:
         try:
             connection.exec_driver_sql("VACUUM")
         except exc.OperationalError as error:
-            reason = f"{file} cannot be copied ({_reason(error)}); leave as much space free as the database needs"
+            reason = (
+                f"{file} cannot be copied ({_reason(error)}); the copy needs as much free space as the database takes"
+            )
             raise DatabaseUnusable(reason) from None
 
 

@@ -139,7 +139,7 @@ def change_item(
     if request.collection is not None:
         values["collection_id"] = collections.ensure(tx, project_row, request.collection)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
-    with taken(ConflictProblem(f"There is a {kind} of that name there already.", code="name-taken")):
+    with taken(ConflictProblem(f"There is already a {kind} with this name in the collection.", code="name-taken")):
         change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     if request.tags is not None:
         tx.execute(delete(item_tag).where(item_tag.c.item_id == item_id))
@@ -171,7 +171,7 @@ def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, exp
     collection_id = collections.ensure(tx, project_row, gone.path)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_not(None))
     values = {"deleted_us": None, "updated_us": tx.now_us, "collection_id": collection_id}
-    with taken(ConflictProblem(f"There is another {kind} {gone.name!r} in its place now.", code="name-taken")):
+    with taken(ConflictProblem(f"The collection now contains another {kind} named {gone.name!r}.", code="name-taken")):
         row = change_row(tx, item, which, values, expected_rev=expected_rev, absent=no_item(kind, item_id))
     quotas.hold(tx, project_row.id, {row.creator_id: Held(1, row.stored_bytes)})
     shown = _shown(tx, project_row, kind, item_id)

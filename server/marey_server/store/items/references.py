@@ -94,7 +94,7 @@ class ReferenceCheck:
             if "model" in bodies:
                 self._require_joints(bodies["model"], "/model")
             if "tree" in bodies and not isinstance(bodies["tree"]["model_digest"], str):
-                detail = "The part that the tree is of is not in this write; name its digest."
+                detail = "The request does not contain the model of the tree; give the digest of the part `model`."
                 raise _invalid("/tree/model_digest", "no-part", detail)
         elif kind is Kind.ANNOTATION:
             self._require_frames(bodies["annotation"])
@@ -107,10 +107,10 @@ class ReferenceCheck:
         if sorted(known) != sorted(motion["joints"]):
             odd = sorted(set(known) ^ set(motion["joints"]))[:5]
             what = pointer.removeprefix("/")
-            detail = f"The joints of the {what} and of its skeleton differ: {', '.join(odd) or 'a name stands twice'}."
+            detail = f"The joints of the {what} and of its skeleton differ: {', '.join(odd) or 'a name occurs twice'}."
             raise _invalid(f"{pointer}/joints", "wrong-joints", detail)
         if known[0] in motion.get("translated_joints", ()):
-            detail = f"The root {known[0]!r} has its translation in the poses already."
+            detail = f"The poses already contain the translation of the root {known[0]!r}."
             raise _invalid(f"{pointer}/translated_joints", "root-translated", detail)
 
     def _require_frames(self, annotation: Tree) -> None:
@@ -118,7 +118,7 @@ class ReferenceCheck:
         ends = [segment["end"] for segment in annotation.get("segments", ())]
         ends += [keyframe["frame"] + 1 for keyframe in annotation.get("keyframes", ())]
         if max(ends, default=0) > frames:
-            detail = f"The clip has {counted(frames, 'frame')}; the annotation {max(ends)}."
+            detail = f"The clip has only {counted(frames, 'frame')}, but the annotation ends after {max(ends)}."
             raise _invalid("/annotation", "beyond-end", detail)
 
     def _require_models(self, graph: Tree) -> None:

@@ -31,7 +31,7 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     poses: EncodedArray = motion["poses"]
     chosen = range(*(frames or slice(None)).indices(poses.shape[0]))
     if not chosen:
-        detail = f"The motion has {counted(poses.shape[0], 'frame')}; the range holds none of them."
+        detail = f"The motion has {counted(poses.shape[0], 'frame')}; the range contains none of them."
         raise _invalid("frames", "no-frames", detail)
     names = list(motion["joints"])
     wanted = names if joints is None else list(joints)

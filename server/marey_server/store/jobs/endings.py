@@ -47,7 +47,7 @@ def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str,
 
 def dependency_failure(cause: str, state: str) -> dict[str, Any]:
     """Return the failure of a job whose dependency did not succeed."""
-    detail = f"This job needs {cause} to succeed, and that is {state}."
+    detail = f"This job needs {cause} to succeed, but {cause} is {state}."
     return failure_document(FailureReason.DEPENDENCY_FAILED, "dependency-failed", detail)
 
 

@@ -88,7 +88,7 @@ def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome
     if row.lease_expires_us >= row.deadline_us + policy.end_grace_us:
         return _over_time(row)
     if row.attempt >= row.max_attempts:
-        detail = f"{row.attempt} attempts were made; the last worker was not heard of again."
+        detail = f"{row.attempt} attempts were made; the last worker stopped sending heartbeats."
         return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, attempt_outcome="lost")
     return AttemptOutcome("queued", "lost", 0)
 
@@ -107,7 +107,7 @@ def _interrupted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
 
 def _unstarted(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
     if row.unstarted >= policy.max_unstarted:
-        detail = f"{row.unstarted + 1} workers claimed the job and were not heard of again."
+        detail = f"{row.unstarted + 1} workers claimed the job and sent no heartbeat."
         return _failed(FailureReason.ATTEMPTS_EXHAUSTED, "worker-lost", detail, attempt_outcome="lost")
     return AttemptOutcome("queued", "lost", 0, counts_as="unstarted")
 

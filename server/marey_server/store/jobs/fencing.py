@@ -107,7 +107,7 @@ def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any])
 
 def lease_lost(job_id: str, fence: int) -> LeaseLostProblem:
     """Return the error that makes a worker stop its attempt."""
-    return LeaseLostProblem(f"Attempt {fence} does not hold {job_id} any more. Stop working on it.")
+    return LeaseLostProblem(f"Attempt {fence} has lost its lease of {job_id}. Stop working on it.")
 
 
 def stored_answer(tx: Transaction, job_id: str, fence: int, write_id: str) -> dict[str, Any] | None:

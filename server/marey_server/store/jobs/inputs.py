@@ -86,7 +86,7 @@ def pin_inputs(
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
         errors.append(
-            _error(f"{at}/inputs", "too-many", f"{total} inputs are named; at most {MOST_INPUTS} are possible.")
+            _error(f"{at}/inputs", "too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
         )
     if errors:
         raise InvalidProblem(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])
@@ -122,7 +122,7 @@ def _pin_input(
 ) -> list[Pin]:
     single = not isinstance(choices, tuple)
     if spec.required and not _as_many(choices):
-        errors.append(_error(pointer, "empty-input", f"This input takes at least one {spec.kind.value}; name some."))
+        errors.append(_error(pointer, "empty-input", f"This input needs at least one {spec.kind.value}."))
     pins: dict[tuple[str, int], Pin] = {}
     made: dict[str, Pin] = {}
     for index, choice in enumerate(_as_many(choices)):
@@ -133,7 +133,7 @@ def _pin_input(
         if isinstance(choice, CollectionInput):
             found = _items_below(tx, project, spec, choice.collection)
             if not found:
-                detail = f"The collection {choice.collection!r} holds no {spec.kind.value}."
+                detail = f"The collection {choice.collection!r} contains no {spec.kind.value}."
                 errors.append(_error(f"{place}/collection", "empty-collection", detail))
             chosen = [(one, one.head) for one in found]
         else:

@@ -78,7 +78,10 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
             f"version accepted: {error}.",
         ) from error
     except ValidationError as error:
-        detail = f"{kind.name} does not take these parameters any more: {without_prefix(error.errors()[0]['msg'])}"
+        detail = (
+            f"In this version of the server, these parameters of {kind.name} are not valid: "
+            f"{without_prefix(error.errors()[0]['msg'])}"
+        )
         raise LateInputError("invalid-params", detail) from error
     pins = _pin_outputs(tx, row, kind)
     if (clash := find_clash(kind, params, pins, row.into_path)) is not None:
@@ -167,7 +170,7 @@ def _resolved(
         made[source] = _outputs(tx, project_id, source)
     found = [one for one in made[source].pins if one["kind"] == spec.kind]
     if not found and spec.required:
-        detail = f"{source} made no {spec.kind} that is there, which this job needs as its input {name!r}."
+        detail = f"The input {name!r} needs a {spec.kind} from {source}, which made none that still exists."
         raise LateInputError("no-input", detail)
     return found
 

@@ -41,7 +41,7 @@ def append_log(
     if offset != length:
         if _is_said(tx, job_id, fence, offset, data):
             return LogAnswer(offset=length)
-        detail = f"The log is {length} bytes long; it does not go on at {offset}."
+        detail = f"The log has {length} bytes; the next piece must begin there, not at {offset}."
         raise LogOffset(detail, context={"offset": length})
     if not data:
         return LogAnswer(offset=length)

@@ -67,7 +67,7 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     `LeaseLostProblem` if no lease of the earlier claim is held any more.
     """
     if request.protocol != PROTOCOL_VERSION:
-        detail = f"The worker speaks version {request.protocol} of the protocol, the server {PROTOCOL_VERSION}."
+        detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
         raise InvalidProblem(detail, errors=[FieldError(pointer="/protocol", code="protocol", detail=detail)])
     scopes = _require_worker(tx.principal)
     _require_labels(tx.principal, request)

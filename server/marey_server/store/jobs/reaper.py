@@ -99,7 +99,7 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
     except OperationalError:  # concerns the database, not this job: the whole page is tried again
         raise
     except Exception:
-        log.exception("%s cannot be taken back from a worker that is not heard of any more", row.id)
+        log.exception("%s cannot be taken back from a worker that no longer sends heartbeats", row.id)
         return False
     return True
 

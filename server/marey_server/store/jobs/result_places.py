@@ -43,7 +43,7 @@ def _too_long(kind: KindDeclaration, pins: PinnedInputs, into: str) -> tuple[str
         try:
             collections.check_length(_path(into, folder))
         except InvalidProblem as error:
-            return error.error_code, f"The results would go to {_path(into, folder)}. {error.detail}"
+            return error.error_code, f"The results cannot go to {_path(into, folder)}. {error.detail}"
     return None
 
 
@@ -51,7 +51,7 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
     counts = Counter((_folder(pin), pin["name"]) for pin in named)
     for (folder, name), count in counts.most_common(1):
         if count > 1:
-            detail = f"{count} results would be called {_path(folder, name)}; name each input at one revision."
+            detail = f"{count} results would have the path {_path(folder, name)}; give each input at one revision only."
             return "same-name", detail
     return None
 
@@ -74,8 +74,8 @@ def _over_another_input(
         place = _path(into, _folder(pin), pin["name"] + getattr(params, "suffix", ""))
         if read.get((pin["kind"], place), pin["item"]) != pin["item"]:
             detail = (
-                f"The result of {_path(pin['collection'], pin['name'])} would take the place of {place}, which is an "
-                "input, too; send results into another folder, or give another suffix."
+                f"The result of {_path(pin['collection'], pin['name'])} would replace {place}, which is also an "
+                "input of the job; send results into another folder, or give another suffix."
             )
             return "own-input", detail
     return None

@@ -100,7 +100,9 @@ class _Family:
         self._rows |= rows
         self._needs |= needs
         if len(self._rows) > MOST_AT_ONCE:
-            detail = f"More than {MOST_AT_ONCE} jobs hang together here; try those again that the others need."
+            detail = (
+                f"More than {MOST_AT_ONCE} jobs depend on each other here; first retry the jobs that the others need."
+            )
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:

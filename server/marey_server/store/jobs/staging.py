@@ -122,9 +122,9 @@ def _pinned_source(role: str, source: ItemInput, pins: PinnedInputs) -> list[Any
     if source.revision in given:
         return [source.item, source.revision]
     asked = "" if source.revision is None else f" at revision {source.revision}"
-    known = f"; the job has its {', '.join(f'revision {one}' for one in given)}" if given else ""
+    known = f"; the job reads {', '.join(f'revision {one}' for one in given)}" if given else ""
     raise InvalidProblem(
-        f"A result names as its source {source.item}{asked}, which is not among the inputs {role!r} of the job{known}.",
+        f"A result names the source {source.item}{asked}, which is not in the input {role!r} of the job{known}.",
         code="no-input",
     )
 
@@ -251,6 +251,6 @@ def keep_named_blobs(tx: Transaction, job_id: str, digests: set[str]) -> None:
         return
     lacking = digests - blobs.readable(tx, digests)
     if lacking:
-        detail = "The job names blobs that are not here; send them first."
+        detail = "The job refers to blobs that the server does not have; upload them first."
         raise ConflictProblem(detail, code="missing-blobs", context={"missing": sorted(lacking)})
     blobs.keep_for_job(tx, job_id, digests)

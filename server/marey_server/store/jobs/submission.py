@@ -122,7 +122,7 @@ def _check(
         params = kind.params.model_validate(request.params)
     except ValidationError as error:
         found = field_errors(error, request.params, lambda steps: f"{at}/params{json_pointer(steps)}")
-        detail = f"These are no parameters of {kind.name}: {found[0].pointer}: {found[0].detail}"
+        detail = f"These parameters are not valid for {kind.name}: {found[0].pointer}: {found[0].detail}"
         raise InvalidProblem(detail, errors=found) from error
     pins = pin_inputs(tx, project, kind, request, known, at)
     if (clash := find_clash(kind, params, pins, request.into)) is not None:
