@@ -1,17 +1,21 @@
 """Every route times every kind of caller, from the route table itself: who may do what, and that nothing leaks."""
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from sqlalchemy import select
 from tests.support.furnished_house import BODIES, CANARY, ROUTES, SECRET_BYTES, SECRET_DIGEST, House, build_house
-from tests.support.rest_server import Server
+from tests.support.rest_server import Server, running
 from tests.support.who_may import LET_THROUGH, PEOPLE, Person, verdict
 
 from marey_server.http.declarations import Access, writes
 from marey_server.http.routes import Route
 from marey_server.store import projects
+from marey_server.store.database.connections import Database
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import project
 from marey_server.store.transaction import Transaction
@@ -22,6 +26,7 @@ REFUSALS = {
     "no-blob", "no-attempt", "not-yours", "lease-lost",
 }  # fmt: skip
 """Problem codes that say: you may not, or you may not know."""
+GUESSES = 3
 
 
 @pytest.fixture
@@ -215,6 +220,26 @@ def test_a_worker_rotates_its_token_which_no_other_token_can(house: House) -> No
     assert (refused.status_code, refused.json()["code"]) == (409, "token-rotated")
     for wrong in ({}, {"rotation_id": "short"}, {"rotation_id": "0 " * 20}, {**rotation, "grace_s": 59}):
         assert worker.post(f"/tokens/{own}/rotate", json=wrong).status_code == 422
+
+
+def test_guesses_of_project_names_are_limited_and_then_no_answer_tells_one(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, name_guesses_per_hour=GUESSES) as server:
+        owner, guesser = server.client(server.make_project("secret")), server.client(server.make_user("eve"))
+        chief = server.client(server.make_user("root", administrator=True, scopes=("read", "write", "admin")))
+        for _ in range(2 * GUESSES):  # a name that is known is no guess
+            for client in (owner, chief):
+                assert client.post("/projects", json={"name": "secret"}).status_code == 409
+        assert guesser.post("/projects", json={"name": "mine"}).status_code == 201
+        assert guesser.post("/projects", json={"name": "mine"}).status_code == 409
+        with ThreadPoolExecutor(3 * GUESSES) as threads:
+            guess = partial(guesser.post, "/projects", json={"name": "secret"})
+            answers = [one.result() for one in [threads.submit(guess) for _ in range(3 * GUESSES)]]
+        assert sorted(one.status_code for one in answers) == [409] * GUESSES + [429] * 2 * GUESSES
+        taken, free = (guesser.post("/projects", json={"name": name}) for name in ("secret", "free"))
+        assert taken.json()["code"] == free.json()["code"] == "too-many-names"
+        assert 0 < int(free.headers["Retry-After"]) <= 3600 // GUESSES
+        assert taken.json()["detail"].partition(" in ")[0] == free.json()["detail"].partition(" in ")[0]
+        assert owner.post("/projects", json={"name": "free"}).status_code == 201
 
 
 def test_who_may_write_but_not_read_does_not_see_what_they_change(house: House) -> None:

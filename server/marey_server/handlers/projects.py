@@ -33,9 +33,21 @@ class Projects(Resource):
         """List your projects and public ones."""
         return await self.answer(projects.list_projects, sort=query.sort, cursor=query.cursor, limit=query.limit)
 
-    @writes(access=Access.USER, body=ProjectCreate, answer=Project, status=201, etag=True, idempotency="key")
+    @writes(
+        access=Access.USER,
+        body=ProjectCreate,
+        answer=Project,
+        status=201,
+        etag=True,
+        idempotency="key",
+        also=((429, None),),
+    )
     async def post(self, body: ProjectCreate) -> Rendered:
         """Create a project; you become its owner."""
+        # The refusal of a taken name tells that the project exists, so it is counted before it is sent.
+        per_hour = self.services.settings.name_guesses_per_hour
+        if await self.look_up(projects.meets_hidden, body.name, per_hour):
+            await self.change(projects.count_guess, per_hour)
         return await self.answer_with(
             lambda made: Reply(made, rev=made.rev, location=f"/projects/{made.name}"), projects.create_project, body
         )

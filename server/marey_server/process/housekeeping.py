@@ -17,8 +17,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
 from marey_server.process.services import Services
-from marey_server.store import leader
-from marey_server.store.credentials import sign_ins
+from marey_server.store import leader, rate_limits
 from marey_server.store.garbage import collect_garbage
 from marey_server.store.jobs import reaper
 from marey_server.store.jobs.reaper import StartGrace
@@ -135,12 +134,12 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete the rows of sign-in limits that have ended.
+    """Delete the rows of limits that have ended.
 
     Each try adds three rows, and passwords are hashed one by one, so few rows are added per minute.
     """
     if await _write(services, _leads, holder):
-        while await _write(services, sign_ins.forget_ended) == sign_ins.FORGOTTEN_AT_ONCE:
+        while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:
             pass
 
 

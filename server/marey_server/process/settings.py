@@ -114,6 +114,12 @@ class Settings(BaseSettings):
         "network of 64 bits). Ten times as many are allowed for all names from one address, and for one name from all "
         "addresses where it has never signed in.",
     )
+    name_guesses_per_hour: int = Field(
+        20,
+        ge=1,
+        description="Greatest number of times per hour that a user may try to create a project whose name is taken by "
+        "a project that the user may not see.",
+    )
     import_files_now: int = Field(
         64,
         ge=0,

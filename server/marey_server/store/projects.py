@@ -26,15 +26,24 @@ from marey_schemas.items import Page
 from marey_server.access import roles, scopes
 from marey_server.access.principal import Principal
 from marey_server.access.roles import require_administrator
-from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem, UnauthenticatedProblem
-from marey_server.store import listing, quotas
+from marey_server.errors import (
+    ConflictProblem,
+    ForbiddenProblem,
+    NotFoundProblem,
+    TooManyRequestsProblem,
+    UnauthenticatedProblem,
+)
+from marey_server.store import listing, quotas, rate_limits
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.database.violations import taken
 from marey_server.store.ids import new_id
+from marey_server.store.rate_limits import RateLimit, key_of
 from marey_server.store.revs import ExpectedRev, change_row
 from marey_server.store.tables import member, project
 from marey_server.store.transaction import Transaction
+
+_HOUR_US = 3600 * 1_000_000
 
 WRITERS = tuple(role.value for role in Role if roles.includes(role, Role.CONTRIBUTOR))
 """Roles of members who may add items and submit jobs."""
@@ -200,6 +209,37 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
 
 
 # -- changing ---------------------------------------------------------------------------------------------------------
+
+
+def meets_hidden(tx: Transaction, name: str, guesses_per_hour: int) -> bool:
+    """Return whether a project of this name exists that the caller may not see.
+
+    Raises `TooManyRequestsProblem`, whatever the name, if the caller has tried too many names of such projects.
+    """
+    if wait_s := rate_limits.wait_s(tx, _guess_limit(tx, guesses_per_hour)):
+        raise _too_many_guesses(wait_s)
+    row = tx.first(_ALIVE_BY_NAME, {"name": name, "me": tx.principal.user_id or ""})
+    return row is not None and _as_seen(tx.principal, row) is None
+
+
+def count_guess(tx: Transaction, guesses_per_hour: int) -> None:
+    """Count that the caller has tried the name of a hidden project. Raises `TooManyRequestsProblem`."""
+    if wait_s := rate_limits.count(tx, _guess_limit(tx, guesses_per_hour)):
+        raise _too_many_guesses(wait_s)
+
+
+def _guess_limit(tx: Transaction, per_hour: int) -> RateLimit:
+    return RateLimit(key_of("project-names", tx.principal.user_id or ""), per_hour, _HOUR_US // per_hour)
+
+
+def _too_many_guesses(wait_s: int) -> TooManyRequestsProblem:
+    return TooManyRequestsProblem(
+        "You have tried too many project names that are taken by projects that you may not see; you can create a "
+        f"project in {wait_s} s.",
+        code="too-many-names",
+        context={"wait_s": wait_s},
+        headers={"Retry-After": str(wait_s)},
+    )
 
 
 def create_project(tx: Transaction, request: ProjectCreate) -> Project:

@@ -76,10 +76,10 @@ token = Table(
     Index("uq_token_successor_of", "successor_of", unique=True),
 )
 
-sign_in_limit = Table(
+sign_in_limit = Table(  # sign-ins, and other things that are limited in the same way
     "sign_in_limit",
     metadata,
-    Column("key", String(64), primary_key=True),  # hash of a limit's name, and of the account or address it is for
+    Column("key", String(64), primary_key=True),  # hash of a limit's name, and of what it is for
     Column("until_us", Micros, nullable=False, index=True),  # from then on the row says nothing
 )
 

@@ -14,6 +14,7 @@ from marey_server.errors import TooManyRequestsProblem, UnavailableProblem
 from marey_server.http.exchange import forwarded_address
 from marey_server.process import password_lanes
 from marey_server.process.password_lanes import PLACES, PLACES_PER_ADDRESS, PasswordLane, RefusedTries, limited_address
+from marey_server.store import rate_limits
 from marey_server.store.credentials import sign_ins
 from marey_server.store.credentials.sign_ins import MORE_FOR_MANY, SignInTry, too_many_sign_ins
 from marey_server.store.database.connections import Database
@@ -117,9 +118,9 @@ def test_limits_that_have_ended_are_deleted(database: Database, clock: Adjustabl
     for number in range(50):
         guess(database, f"user{number}", f"10.0.0.{number}")
     assert rows(database) == 150
-    assert database.write(SYSTEM, sign_ins.forget_ended) == 0
+    assert database.write(SYSTEM, rate_limits.forget_ended) == 0
     clock.advance(7)
-    assert database.write(SYSTEM, sign_ins.forget_ended) == 150
+    assert database.write(SYSTEM, rate_limits.forget_ended) == 150
     assert rows(database) == 0
 
 

@@ -1,0 +1,72 @@
+"""Limits on how often something may happen, shared by all servers.
+
+A limit is a row with one time (the generic cell rate algorithm): each event moves the time into the future by an
+interval, and an event that would move it too far is refused and not counted. So a limit always ends after the time that
+its refusal states. Rows whose time has passed have no effect, and are deleted. Keys are hashes, so that a stolen
+database does not show the names and addresses in them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+
+from sqlalchemy import case, delete, select, update
+
+from marey_schemas.encoding.canonical import canonical_json
+from marey_server.store.tables import sign_in_limit
+from marey_server.store.transaction import Transaction
+
+FORGOTTEN_AT_ONCE = 10_000
+"""Greatest number of rows deleted in one transaction."""
+
+
+@dataclass(frozen=True, slots=True)
+class RateLimit:
+    """Limit of the events with a key: at most `burst` at once, and then one each `interval_us`."""
+
+    key: str
+    burst: int
+    interval_us: int
+
+    def latest_us(self, now_us: int) -> int:
+        """Return the latest time in the row at which another event is allowed now."""
+        return now_us + (self.burst - 1) * self.interval_us
+
+
+def key_of(*parts: str) -> str:
+    """Return the key of a limit from its name and the names that it is for."""
+    return hashlib.sha256(canonical_json(list(parts))).hexdigest()
+
+
+def wait_s(tx: Transaction, limit: RateLimit) -> int:
+    """Return the seconds until another event is allowed, 0 if it is allowed now."""
+    until_us = tx.execute(select(sign_in_limit.c.until_us).where(sign_in_limit.c.key == limit.key)).scalar() or 0
+    return max(0, math.ceil((until_us - limit.latest_us(tx.now_us)) / 1_000_000))
+
+
+def count(tx: Transaction, limit: RateLimit) -> int:
+    """Count an event and return 0; if the limit is reached, count nothing and return the seconds to wait."""
+    until, now_us = sign_in_limit.c.until_us, tx.now_us
+    counted = tx.insert_into(sign_in_limit, {"key": limit.key, "until_us": now_us + limit.interval_us})
+    counted = counted.on_conflict_do_update(
+        index_elements=["key"],
+        set_={"until_us": case((until > now_us, until), else_=now_us) + limit.interval_us},
+        where=until <= limit.latest_us(now_us),
+    )
+    return 0 if tx.execute(counted.returning(until)).first() is not None else wait_s(tx, limit)
+
+
+def take_back(tx: Transaction, limit: RateLimit) -> None:
+    """Remove a counted event."""
+    values = {"until_us": sign_in_limit.c.until_us - limit.interval_us}
+    tx.execute(update(sign_in_limit).where(sign_in_limit.c.key == limit.key).values(**values))
+
+
+def forget_ended(tx: Transaction) -> int:
+    """Delete rows that no longer have an effect, at most `FORGOTTEN_AT_ONCE`; return their number."""
+    ended = select(sign_in_limit.c.key).where(sign_in_limit.c.until_us <= tx.now_us).limit(FORGOTTEN_AT_ONCE)
+    if tx.is_postgres:
+        ended = ended.with_for_update(skip_locked=True)
+    return tx.execute(delete(sign_in_limit).where(sign_in_limit.c.key.in_(ended))).rowcount
