@@ -178,7 +178,7 @@ class Settings(BaseSettings):
     user_projects: int = Field(
         Quotas.user_projects,
         ge=0,
-        description="Number of owned projects; a user who owns as many cannot create another project.",
+        description="Number of owned projects; a user who owns as many cannot create or restore one.",
     )
     user_jobs: int = Field(
         Quotas.user_jobs,

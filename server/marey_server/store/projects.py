@@ -293,9 +293,13 @@ def delete_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev) -> 
 def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = None) -> Project:
     """Restore the project of this name that was deleted last.
 
-    Raises `ConflictProblem` if another project has the name now.
+    Raises `ConflictProblem` if another project has the name now, and `QuotaExceededProblem` if the caller would own too
+    many projects.
     """
     seen = require(tx, name, deleted=True)
+    own = member.c.project_id == seen.id, member.c.user_id == tx.principal.user_id, member.c.role == Role.OWNER.value
+    if tx.execute(select(member.c.project_id).where(*own)).first() is not None:
+        quotas.require_room(tx, "user_projects")
     with taken(_name_taken(name)):
         restored = _change(tx, seen, {"deleted_us": None}, expected_rev, project.c.deleted_us.is_not(None))
     tx.emit("project.restored", seen.id, project_id=seen.id, name=name)

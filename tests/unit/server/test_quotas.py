@@ -81,6 +81,24 @@ def test_what_ends_makes_room_and_nothing_is_lost(lab: Lab) -> None:
                 lab.write(uploads.abandon, ended)
 
 
+def restore_project(tx: Transaction, number: int) -> None:
+    projects.restore_project(tx, f"p{number}")
+
+
+def test_restoring_projects_at_once_never_exceeds_the_quota(lab: Lab) -> None:
+    numbers = range(2 * LIMIT)
+    for number in numbers:
+        lab.write(make_project, number, who=lab.stranger)
+        lab.write(projects.delete_project, f"p{number}", expected_rev=None, who=lab.stranger)
+    lab.database.quotas = Quotas(user_projects=LIMIT)
+    futures = [lab.database.submit_write(lab.stranger, restore_project, number) for number in numbers]
+    errors = [future.exception(60) for future in futures]
+    assert [type(error) for error in errors if error is not None] == [QuotaExceededProblem] * LIMIT
+    refused = next(number for number, error in zip(numbers, errors, strict=True) if error is not None)
+    administrator = replace(lab.owner, administrator=True)
+    lab.write(projects.restore_project, f"p{refused}", who=administrator)  # who does not own it afterwards
+
+
 def test_unfinished_jobs_and_their_tasks_count_until_they_end(desk: Desk) -> None:
     desk.database.quotas = Quotas(user_jobs=LIMIT)
     things = tuple(ItemInput(item=one) for one in desk.things(4))
