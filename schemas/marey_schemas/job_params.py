@@ -39,7 +39,7 @@ class TaggedResults(Request):
 class SuffixedResults(TaggedResults):
     """Base of parameters with a suffix for the names of the results, and tags."""
 
-    suffix: NameSuffix = Field("", description="Suffix of the results' names.")
+    suffix: NameSuffix = Field("", description="Text that is appended to the names of the results.")
 
 
 MOST_EXAMPLES = 2000
@@ -55,7 +55,7 @@ class AlignParams(AlignOptions, SuffixedResults):
     labels: tuple[Label, ...] = Field(
         (), max_length=1000, description="Labels whose segments and keyframes cut the clips; empty: all labels."
     )
-    mirroring: Literal["none", "add"] = Field("none", description="add: each clip and its mirrored copy.")
+    mirroring: Literal["none", "add"] = Field("none", description="add: use each clip and its mirrored copy.")
 
 
 _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
@@ -219,8 +219,8 @@ class ModelParams(ModelOptions, TaggedResults):
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
         True,
-        description="For the report, test searches: remove each example in turn, train again, and search for "
-        "the places that it reached.",
+        description="For the report, test searches: leave out each example in turn, train a model on the "
+        "others, and search for positions that the example reached.",
     )
 
 

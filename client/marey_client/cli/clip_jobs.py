@@ -53,7 +53,7 @@ def retarget(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Move clips to another skeleton, as a job."""
+    """Transfer the motion of clips to another skeleton, as a job."""
     from marey_schemas.job_params import RetargetParams
     from marey_schemas.kinds import Kind
 

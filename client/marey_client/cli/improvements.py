@@ -102,8 +102,7 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="File to which the paths of clips are written, one per line, that can be removed without any effect "
-            "on the trials."
+            help="File for the paths, one per line, of the clips that can be removed without any effect on the trials."
         ),
     ] = None,
     wait: Wait = True,

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from marey_client.credentials import Credential
     from marey_client.marey import Marey
 
-ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey project ls lists them.")]
-UserName = Annotated[str, typer.Argument(help="Name of the user; marey user ls lists them.")]
-JobId = Annotated[str, typer.Argument(help="Id of the job; marey job ls lists them.")]
+ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey project ls lists all names.")]
+UserName = Annotated[str, typer.Argument(help="Name of the user; marey user ls lists all names.")]
+JobId = Annotated[str, typer.Argument(help="Id of the job; marey job ls lists the ids.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 

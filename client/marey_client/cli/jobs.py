@@ -181,7 +181,7 @@ def show_log(
 
 @job.command("cancel")
 def cancel_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
-    """Ask a job to stop; a queued one is cancelled at once."""
+    """Ask a job to stop; a queued job is cancelled at once."""
     with connect(context) as marey:
         found = marey.jobs.cancel(job_id)
     if as_json:

@@ -49,7 +49,7 @@ def serve(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run a server with its database and a local worker until stopped."""
+    """Run a server with its database and a local worker until it is stopped."""
     from marey_client import embedded
 
     embedded.serve(data=data, host=host, port=port, local_workers=workers, database_url=database_url, log_form=log_form)
@@ -76,7 +76,7 @@ def worker(
         LogForm | None, typer.Option(help="Format of the log: text (the default at a terminal) or json.")
     ] = None,
 ) -> None:
-    """Run jobs of a server until stopped. The token must have the scope `work`."""
+    """Run jobs of a server until the worker is stopped. The token must have the scope `work`."""
     from marey_client import embedded
     from marey_client.cli.invocation import credential_of
     from marey_client.cli.typed_values import assignment

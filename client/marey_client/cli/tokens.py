@@ -154,7 +154,7 @@ def rotate_token(
     ] = 60,
     as_json: AsJson = False,
 ) -> None:
-    """Replace the token in use by a new one with the same rights and the same end, in the file that contains it.
+    """Replace the token in use by a new one with the same rights and the same expiry, in its file.
 
     The new token is not shown. If the command is interrupted, run it again: it gets the same new token.
     """
@@ -210,13 +210,17 @@ def _rotation_id(begun: Path, token: str) -> str:
 @token.command("revoke")
 def revoke_token(
     context: typer.Context,
-    token_id: Annotated[str | None, typer.Argument(help="The token's id; marey token ls shows them.")] = None,
+    token_id: Annotated[str | None, typer.Argument(help="Id of the token; marey token ls lists the ids.")] = None,
     with_created: Annotated[
         bool, typer.Option("--with-created", help="Also revoke the tokens that were created with it.")
     ] = False,
     all_of: Annotated[
         str | None,
-        typer.Option("--all-of", metavar="USER", help="Revoke all tokens of a user instead, except the one in use."),
+        typer.Option(
+            "--all-of",
+            metavar="USER",
+            help="Instead of one token, revoke all tokens of a user, except the token in use.",
+        ),
     ] = None,
 ) -> None:
     """Revoke a token, at once. Administrators may revoke the tokens of others."""

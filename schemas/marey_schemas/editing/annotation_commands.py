@@ -47,7 +47,7 @@ class MergeSegment(Request):
 
     command: Literal["merge_segment"]
     at: Frame = Field(description="Any frame of the segment whose label is kept.")
-    neighbour: Literal["next", "previous", "nearest"] = Field("next", description="The segment to merge with.")
+    neighbour: Literal["next", "previous", "nearest"] = Field("next", description="Neighbouring segment to merge with.")
 
 
 class MoveBoundary(Request):

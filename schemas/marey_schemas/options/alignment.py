@@ -23,8 +23,8 @@ class CostOptions(Options):
 
     cost: CostMethod = Field(
         "turned",
-        description="Cost of a pair of poses. turned: after the best rotation about the vertical and shift "
-        "on the ground; plain: without either.",
+        description="Cost of a pair of poses. turned: the distance after the best rotation about the vertical and "
+        "the best shift on the ground; plain: the distance without rotation and shift.",
     )
     window: int = Field(1, ge=1, le=61, description="Number of frames in the window that is compared; odd.")
 

@@ -30,7 +30,9 @@ class ImportOptions(Options):
 
     collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
-        None, description="Item id of the skeleton that the clips must use; absent: found or created."
+        None,
+        description="Item id of the skeleton that the clips must use; absent: an equal skeleton of the project, or a "
+        "new one.",
     )
     unit: LengthUnit | None = Field(
         None, description="Unit of length of the files; cmu is 1/0.45 inch. Absent: inferred."
@@ -39,14 +41,16 @@ class ImportOptions(Options):
         None, gt=1e-6, lt=1e3, description="Metres per unit of length, for units without a name."
     )
     up_axis: UpAxis | None = Field(None, description="Axis that points up in the files. Absent: inferred.")
-    handedness: Handedness = Field("right", description="left: mirror the files, which are left-handed.")
+    handedness: Handedness = Field(
+        "right", description="Handedness of the axes in the files. left: the motion is mirrored."
+    )
     align_floor: bool = Field(
         False, description="Shift each clip vertically, so that its feet are on the ground at height 0."
     )
     frame_rate_hz: float | None = Field(
         None, gt=0, le=100_000, description="Frame rate of the clips, in hertz. Absent: the rate in the files."
     )
-    trim_rest_pose: bool = Field(False, description="Remove rest poses at both ends.")
+    trim_rest_pose: bool = Field(False, description="Remove rest poses at the beginning and at the end of each clip.")
     tags: tuple[Tag, ...] = Field((), max_length=64, description="Tags that every clip gets.")
     subject: str | None = Field(None, max_length=255, description="The performer.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")

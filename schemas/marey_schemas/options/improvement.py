@@ -44,7 +44,8 @@ class SuggestionOptions(ObjectiveChoice):
         50,
         ge=0,
         le=100_000,
-        description="Number of clips to remove in turn, starting with those that the fewest trials use; null: all.",
+        description="Number of clips whose removal is tried, one at a time, beginning with the clips that the fewest "
+        "trials use; null: all.",
     )
     duplicate_cm: float = Field(
         3.0,

@@ -267,7 +267,7 @@ def merge(
     """Merge a version into a branch. Changes of different parts of one entry are combined.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base. The exit status is 1 then.
+    --ours, --theirs or --base. In that case, the exit status is 1.
     """
     from marey_client.errors import Conflict
     from marey_schemas.datasets.merges import MergeAnswer
