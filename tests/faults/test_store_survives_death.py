@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.support import store_writer
 from tests.support.store_fixtures import Lab
-from tests.support.store_writer import FILES
+from tests.support.store_writer import FILES, LARGE_FILES
 
 from marey_schemas.kinds import Kind
 from marey_server.access.principal import Principal
@@ -23,12 +23,15 @@ class Writer:
     def __init__(self, lab: Lab, url: str, folder: str) -> None:
         self._args = [sys.executable, store_writer.__file__, url, lab.owner.user_id, lab.owner.user_name]
         self._folder = folder
+        self.lines: list[str] = []
+        """Lines that the last process printed."""
 
     def run(self, work: str, fault: str = "") -> int:
         """Exit status: 0, or minus the signal that ended it."""
         environment = {**os.environ, "MAREY_FAULT": fault}
         done = subprocess.run([*self._args, work, self._folder], env=environment, capture_output=True, timeout=60)
         assert done.returncode in (0, -signal.SIGKILL), done.stderr.decode()
+        self.lines = done.stdout.decode().split()
         return done.returncode
 
 
@@ -108,6 +111,24 @@ def test_a_collector_that_dies_deletes_nothing_it_did_not_finish(lab: Lab, write
     assert writer.run("collect") == 0
     assert stored(lab) == [False, False, False]
     assert_sound(lab)
+
+
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+@pytest.mark.every_database
+@pytest.mark.parametrize("place", ["before_copy", "after_copy"])
+def test_a_process_that_dies_while_it_copies_its_log_loses_nothing(
+    lab: Lab, writer: Writer, place: str, tmp_path: Path
+) -> None:
+    assert writer.run("send-large", f"log.{place}:kill") == -signal.SIGKILL
+    acknowledged = set(writer.lines)
+    assert acknowledged
+    assert lab.read(blobs.readable, acknowledged) == acknowledged
+    assert_sound(lab)
+    assert writer.run("send-large") == 0
+    assert lab.read(blobs.readable, writer.lines) == {digest_of(data) for data in LARGE_FILES}
+    assert_sound(lab)
+    lab.database.close()
+    assert not list(tmp_path.rglob("*-wal"))
 
 
 def test_without_a_fault_nobody_dies(lab: Lab, writer: Writer) -> None:

@@ -11,6 +11,8 @@ from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
 from marey_server.store.transaction import Transaction
 
+LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
+"""Files that together make the write-ahead log of SQLite long."""
 FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 
 
@@ -23,12 +25,17 @@ def publish(tx: Transaction) -> Any:
 
 
 def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
-    """Send the files, publish, or collect garbage; blobs are in `folder`, or in the database if that is empty."""
+    """Send the files or large files, publish, or collect garbage; blobs are in `folder`, or in the database if that is
+    empty. After each large file, its digest is printed.
+    """
     database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
     who = Principal("user", user_id, user_name, scopes=("read", "write"))
     if work == "send":
         for data in FILES:
             database.write(who, blobs.put_blob, data)
+    elif work == "send-large":
+        for data in LARGE_FILES:
+            print(database.write(who, blobs.put_blob, data), flush=True)
     elif work == "publish":
         database.write(who, publish)
     else:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
+
 from marey_schemas.items import Upload, UploadCreate
 from marey_schemas.sizes import MIB
 from marey_server.access.principal import ANONYMOUS
@@ -13,6 +16,9 @@ from marey_server.store import uploads
 
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
+LONGEST_PAUSE_S = 0.2
+"""Longest time that a piece waits until the database has caught up, so that uploads do not delay other writes."""
+PAUSE_STEP_S = 0.01
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
@@ -65,6 +71,8 @@ class UploadResource(Resource):
     async def _append(self) -> None:
         data = bytes(self.piece)
         self.piece.clear()
+        if data:
+            await self._let_database_catch_up()
         try:
             moved = await self.change(uploads.append, self.upload_id, self.offset, data)
         except ConflictProblem as error:
@@ -73,6 +81,11 @@ class UploadResource(Resource):
         if data:
             await self.compute(self.services.upload_hashes.add, self.upload_id, self.offset, data)
         self.offset = moved.offset
+
+    async def _let_database_catch_up(self) -> None:
+        deadline_s = time.monotonic() + LONGEST_PAUSE_S
+        while self.services.database.is_behind and time.monotonic() < deadline_s:
+            await asyncio.sleep(PAUSE_STEP_S)
 
     @reads(access=Access.SIGNED_IN, answer=Upload, attempts=True)
     async def get(self, upload: str) -> Rendered:

@@ -1,12 +1,8 @@
 """Transactions: retries, translation of errors, and the clock."""
 
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import psycopg
@@ -17,7 +13,6 @@ from sqlalchemy.engine.default import DefaultDialect
 
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import InvalidProblem, StorageFullProblem, UnavailableProblem
-from marey_server.store.database import connections as database_module
 from marey_server.store.database.clock import DatabaseClock
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import server_state, user
@@ -215,70 +210,6 @@ def test_values_beyond_what_can_be_stored_are_the_callers_mistake(
 
     with pytest.raises(InvalidProblem):
         database.write(SYSTEM, write)
-
-
-@on_sqlite
-def test_a_long_log_is_written_back_under_steady_reads(
-    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
-    monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
-    monkeypatch.setattr(database_module, "WAL_PATIENCE_MS", 10_000)  # readers of a busy machine take long
-    stop = threading.Event()
-
-    def keep_reading() -> None:
-        while not stop.is_set():
-            database.read(SYSTEM, user_names)
-
-    readers = [threading.Thread(target=keep_reading) for _ in range(3)]
-    for reader in readers:
-        reader.start()
-    try:
-        for number in range(40):
-            database.write(SYSTEM, add_large_row, f"k{number}")
-        wal = tmp_path / "marey.db-wal"
-        assert wal.stat().st_size < 4 * 2**20
-    finally:
-        stop.set()
-        for reader in readers:
-            reader.join(30)
-
-
-@on_sqlite
-def test_writes_go_on_while_somebody_reads_for_long(
-    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As `marey db backup` does."""
-    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
-    monkeypatch.setattr(database_module, "WAL_CHECK_EVERY_S", 0.0)
-    with closing(sqlite3.connect(tmp_path / "marey.db", isolation_level=None)) as reading:
-        reading.execute("BEGIN")
-        reading.execute("SELECT count(*) FROM server_state").fetchall()
-        for number in range(8):
-            written = database.submit_write(SYSTEM, add_large_row, f"k{number}")
-            written.result(database_module.BUSY_TIMEOUT_MS / 2000)
-    database.write(SYSTEM, user_names)
-    assert (tmp_path / "marey.db-wal").stat().st_size == 0
-
-
-@on_sqlite
-def test_the_length_of_the_log_is_looked_at_once_in_some_seconds(
-    tmp_path: Path, database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = SimpleNamespace(now_s=1000.0)
-    monkeypatch.setattr(database_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=time.sleep))
-    monkeypatch.setattr(database_module, "WAL_LIMIT_BYTES", 2**20)
-
-    def length_after_a_write(size: int) -> int:
-        row = {"key": f"at {clock.now_s}", "value": "x" * size}
-        database.write(SYSTEM, lambda tx: tx.execute(tx.insert_or_ignore(server_state, row)))
-        return (tmp_path / "marey.db-wal").stat().st_size
-
-    assert length_after_a_write(2**21) == 0
-    clock.now_s += database_module.WAL_CHECK_EVERY_S - 1.0
-    assert length_after_a_write(2**21) > 2**20
-    clock.now_s += 1.0
-    assert length_after_a_write(1) == 0
 
 
 @on_postgres

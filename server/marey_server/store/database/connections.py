@@ -19,7 +19,6 @@ import time
 from collections.abc import AsyncGenerator, Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy
@@ -32,6 +31,8 @@ from marey_server.store import tables
 from marey_server.store.blob_backings import BlobBacking, DatabaseBlobs
 from marey_server.store.database.clock import Clock, DatabaseClock, save_high_water
 from marey_server.store.database.lanes import SERVER, Client, Lane
+from marey_server.store.database.opening import sqlite_file
+from marey_server.store.database.write_ahead_log import PAGE_BYTES, SHORT_BYTES, WriteAheadLog
 from marey_server.store.database.write_lane import WriteLane
 from marey_server.store.transaction import Quotas, Transaction
 
@@ -39,12 +40,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 BUSY_TIMEOUT_MS = 30_000
-PAGE_BYTES = 16_384
 CACHE_KIB = 4096
-WAL_LIMIT_BYTES = 64 * 2**20
-WAL_CHECK_EVERY_S = 5.0
-WAL_PATIENCE_MS = 250
-"""Time that a write waits for readers before the log is written back: longer than most reads, shorter than a backup."""
 WRITE_TRIES = 5
 WRITE_BACKOFF = Backoff(first_s=0.02, longest_s=0.16, jitter=1.0)
 READ_TRIES = 3
@@ -90,7 +86,8 @@ class Database:
         self.blobs: BlobBacking = blobs or DatabaseBlobs()
         self.quotas = quotas or Quotas()
         self._lane: AbstractContextManager[Any] = threading.Lock() if self.is_sqlite else nullcontext()
-        self._wal_checked_s = 0.0
+        file = sqlite_file(self.url)
+        self._log = WriteAheadLog(file) if file else None
         self._ordinary = Lane("marey-database", readers)
         self._reserved = Lane("marey-reserved", RESERVED_THREADS, most_each=RESERVED_THREADS - 1)
         self._write_lane = WriteLane(self.write) if self.is_sqlite else None
@@ -107,6 +104,11 @@ class Database:
         """The lanes by name."""
         lanes: dict[str, Lane | WriteLane] = {"database": self._ordinary, "database-reserved": self._reserved}
         return lanes if self._write_lane is None else {**lanes, "database-writing": self._write_lane}
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether writes of many bytes should wait until the database has caught up with earlier ones."""
+        return self._log is not None and self._log.is_long
 
     @property
     def connections_in_use(self) -> int:
@@ -186,24 +188,10 @@ class Database:
                     ) from error
                 raise
         self._high_water_us = high_water_us
-        if self.is_sqlite:
-            self._keep_wal_short(tx.connection)
+        if self._log is not None:
+            driver: sqlite3.Connection = tx.connection.connection.driver_connection  # type: ignore[assignment]
+            self._log.after_commit(driver)
         return answer
-
-    def _keep_wal_short(self, connection: Connection) -> None:
-        """Copy a long write-ahead log to the database file and restart the log; while there are always readers, SQLite
-        does not do so by itself. If a reader takes too long, a later write tries again.
-        """
-        now_s = time.monotonic()
-        if now_s - self._wal_checked_s < WAL_CHECK_EVERY_S:
-            return
-        self._wal_checked_s = now_s
-        wal = Path(f"{self.url.database}-wal")
-        if wal.exists() and wal.stat().st_size > WAL_LIMIT_BYTES:
-            driver: sqlite3.Connection = connection.connection.driver_connection  # type: ignore[assignment]
-            driver.execute(f"PRAGMA busy_timeout = {WAL_PATIENCE_MS}")
-            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # answers that it could not, and raises nothing
-            driver.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
 
     def submit_write(
         self,
@@ -258,6 +246,8 @@ class Database:
             self._write_lane.close()
         self._reserved.close()
         self._ordinary.close()
+        if self._log is not None:
+            self._log.close()
         self._read_engine.dispose()
         self.engine.dispose()
 
@@ -284,7 +274,8 @@ def _sqlite_engine(url: URL, connections: int, echo: bool, *, begin: str, query_
     pragmas = [
         f"page_size = {PAGE_BYTES}",
         "journal_mode = WAL",
-        f"journal_size_limit = {WAL_LIMIT_BYTES}",
+        f"journal_size_limit = {SHORT_BYTES}",
+        "wal_autocheckpoint = 0",  # see `WriteAheadLog`
         "synchronous = FULL",
         "foreign_keys = ON",
         f"cache_size = -{CACHE_KIB}",

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from alembic.util import CommandError
-from sqlalchemy import Connection, NullPool, create_engine, exc, make_url
+from sqlalchemy import URL, Connection, NullPool, create_engine, exc, make_url
 
 from marey_server.errors import StorageFullProblem, UnavailableProblem
 from marey_server.store.database.clock import ClockFarAhead
@@ -43,7 +43,7 @@ def opening(url: str) -> Iterator[None]:
         ) from error
 
 
-def sqlite_file(url: str) -> Path | None:
+def sqlite_file(url: str | URL) -> Path | None:
     """Return the file of an SQLite database, or None for other databases, such as SQLite in memory."""
     parsed = make_url(url)
     if (

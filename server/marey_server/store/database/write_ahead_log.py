@@ -1,0 +1,131 @@
+"""Write-ahead log of an SQLite database.
+
+A commit appends pages to the log. From time to time these pages must be copied into the database file, so that the log
+can start again from its beginning. By default, SQLite copies them at the end of a commit, and all other writes wait for
+this. Here a thread copies them while writes go on; when few pages are left, the writing thread restarts the log.
+
+After a crash, SQLite reads the log when the database is opened. When the last connection to the database closes, SQLite
+copies the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from marey_server import faults
+
+log = logging.getLogger(__name__)
+
+PAGE_BYTES = 16_384
+FRAME_BYTES = PAGE_BYTES + 24
+"""Size in bytes of a page in the log, with its header."""
+SHORT_BYTES = 4 * 2**20
+"""Length of the log up to which nothing is copied. SQLite shortens the file to this length after restarting the log."""
+LITTLE_BYTES = 3 * 2**20
+"""Number of bytes that the writing thread may copy when it restarts the log."""
+LONG_BYTES = 16 * 2**20
+"""Length of the log above which uploads wait, so that the copying thread can keep pace."""
+TOO_LONG_BYTES = 64 * 2**20
+"""Length of the log above which the writing thread waits longer for readers in order to restart the log."""
+PATIENCE_MS = 10
+LONG_PATIENCE_MS = 250
+"""The same for a log that is too long: longer than most reads, shorter than a backup."""
+PAUSES = 20
+"""Number of times as long as the patience that pass before the next try, if readers prevented a restart of the log."""
+
+
+class WriteAheadLog:
+    """Write-ahead log of the database in a file."""
+
+    def __init__(self, file: Path) -> None:
+        self.is_long = False
+        """Whether the log grows faster than it is copied; then writes of many bytes should wait."""
+        self._file = file
+        self._log = Path(f"{file}-wal")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="marey-log")
+        self._connection: sqlite3.Connection | None = None
+        self._copying = False
+        self._copied_bytes = 0
+        self._next_try_s = 0.0
+        self._failing = False
+
+    def after_commit(self, connection: sqlite3.Connection) -> None:
+        """Start to copy a log that is no longer short, or restart it if little is left to copy.
+
+        `connection` has just committed. Only one thread may call this method at a time.
+        """
+        length = self._length_bytes()
+        self.is_long = self._copying and length > LONG_BYTES
+        if length <= SHORT_BYTES:
+            self._copied_bytes = 0
+        elif self._copying:
+            return
+        elif length - self._copied_bytes > LITTLE_BYTES:
+            self._copying = True
+            with suppress(RuntimeError):  # the process ends; the log is copied when the database is closed or opened
+                self._thread.submit(self._copy)
+        elif time.monotonic() >= self._next_try_s:
+            self._restart(connection, LONG_PATIENCE_MS if length > TOO_LONG_BYTES else PATIENCE_MS)
+
+    def close(self) -> None:
+        """Wait for the copying thread, and close its connection."""
+        self._thread.shutdown(wait=True)
+        if self._connection is not None:
+            self._connection.close()
+
+    def _length_bytes(self) -> int:
+        try:
+            return self._log.stat().st_size
+        except FileNotFoundError:
+            return 0
+
+    def _copy(self) -> None:
+        """Copy the log until only what was written in a short time is left, or until readers prevent more."""
+        try:
+            copied_before = self._copied_bytes
+            self._copied_bytes = self._copy_once()
+            while self._copied_bytes - copied_before > LITTLE_BYTES:
+                copied_before, self._copied_bytes = self._copied_bytes, self._copy_once()
+        finally:
+            self._copying = self.is_long = False
+
+    def _copy_once(self) -> int:
+        """Copy what no reader still needs in the log; return how many bytes of the log are copied now."""
+        try:
+            if self._connection is None:
+                self._connection = sqlite3.connect(self._file, isolation_level=None, check_same_thread=False)
+            faults.point("log.before_copy")
+            pages: int = self._connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()[2]
+            faults.point("log.after_copy")
+        except sqlite3.Error as error:
+            self._note_failure(error)
+            return 0
+        self._failing = False
+        return max(pages, 0) * FRAME_BYTES
+
+    def _restart(self, connection: sqlite3.Connection, patience_ms: int) -> None:
+        """Copy the rest, and restart the log unless readers use it for longer than the patience."""
+        (usual_ms,) = connection.execute("PRAGMA busy_timeout").fetchone()
+        connection.execute(f"PRAGMA busy_timeout = {patience_ms}")
+        try:
+            in_use, _, _ = connection.execute("PRAGMA wal_checkpoint(RESTART)").fetchone()
+        except sqlite3.Error as error:  # not a failure of the write, which is committed
+            self._note_failure(error)
+            in_use = True
+        finally:
+            connection.execute(f"PRAGMA busy_timeout = {usual_ms}")
+        if in_use:
+            self._next_try_s = time.monotonic() + PAUSES * patience_ms / 1000
+        else:
+            self._copied_bytes = 0
+
+    def _note_failure(self, error: sqlite3.Error) -> None:
+        """Log an error once; the next commit tries again."""
+        if not self._failing:
+            log.warning("the log of the database %s cannot be copied, and grows: %s", self._file, error)
+        self._failing = True
