@@ -479,3 +479,19 @@ def _cut(proxy: TcpProxy, count: int) -> None:
 
 def _is_stopped(pid: int) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+
+def test_a_rotation_whose_server_dies_before_the_answer_gets_the_same_token_later(server: ServerProcess) -> None:
+    rotation_id = "r" * 32
+    server.start(fault="rotate.after_commit:kill")
+    with server.client(patient=False) as marey, pytest.raises(MareyError):
+        marey.tokens.rotate(rotation_id)
+    assert server.wait_until_dead() == -signal.SIGKILL
+    server.start()
+    with server.client() as marey:
+        new, again = (marey.tokens.rotate(rotation_id) for _ in range(2))
+        assert [one.id for one in marey.tokens.list() if one.successor_of] == [new.id]
+    assert new == again
+    with Marey(server.url, new.secret) as marey:
+        assert marey.me().token == new.id
+    server.check_database()
