@@ -72,8 +72,8 @@ class UserChange(Request):
     disabled: bool | None = None
     end_tokens: EndTokens | None = Field(
         None,
-        description="Tokens of the user to revoke: `sessions` (the tokens of sign-ins) or `all`. The token of this "
-        "request is never revoked. Default with a new password: `sessions`.",
+        description="Tokens of the user to revoke: `none`, `sessions` (the tokens of sign-ins) or `all`. The token of "
+        "this request is never revoked. Default with a new password: `sessions`.",
     )
 
 
