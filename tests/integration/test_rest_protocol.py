@@ -27,6 +27,7 @@ from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.negotiation import MediaType
 from marey_server.process.observe import without_received_text
 from marey_server.store.blobs import Spool
+from marey_server.store.database.connections import Database
 
 JOINTS = ("hips", "knee", "foot")
 HIERARCHY = {
@@ -546,6 +547,22 @@ def test_an_upload_goes_on_where_it_broke_off(owner: httpx.Client, server: Serve
     done = answer.json()
     assert done["offset"] == len(data)
     assert owner.get(f"/blobs/{done['digest']}").content == data
+
+
+def test_an_upload_waits_for_a_database_that_is_behind_but_not_for_ever(
+    owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def is_always_behind(_database: Database) -> bool:
+        asked.append(True)
+        return True
+
+    monkeypatch.setattr(Database, "is_behind", property(is_always_behind))
+    path = owner.post("/uploads", json={"length": 5}).headers["Location"].removeprefix("/api/v1")
+    answer = owner.patch(path, content=b"bytes", headers={"Upload-Offset": "0"})
+    assert (answer.status_code, answer.json()["offset"]) == (200, 5)
+    assert asked
 
 
 @pytest.mark.parametrize(
