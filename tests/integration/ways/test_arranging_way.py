@@ -216,12 +216,12 @@ def test_quotas_are_shown_and_changed(run: Command, marey: Marey, lab: ProjectHa
     lines = run("project", "quota", "lab", "--defaults", "--items", "1000").stdout.splitlines()
     assert [line.split() for line in lines if "items" in line] == [["items", f"{used:,}", "1,000"]]
     assert lab.quotas().stored_bytes.allowed > 50
-    run("user", "create", "grace", "--without-password")
-    assert json.loads(run("user", "quota", "grace", "--items", "7", "--json").stdout)["items"] == {
+    run("user", "create", "quincy", "--without-password")
+    assert json.loads(run("user", "quota", "quincy", "--items", "7", "--json").stdout)["items"] == {
         "used": 0,
         "allowed": 7,
     }
-    assert marey.users.quotas("grace").items.allowed == 7
+    assert marey.users.quotas("quincy").items.allowed == 7
 
 
 def test_a_place_where_nothing_is_is_told_and_an_item_listed_by_its_name(run: Command, lab: ProjectHandle) -> None:
