@@ -194,7 +194,10 @@ def replace_token(credential: Credential, token: str) -> None:
         stored = read_logins(credential.logins)
         _write_logins(credential.logins, Logins(stored.default, {**stored.tokens, credential.url: token}))
     else:
-        raise BadCredentialFile(f"the token comes from {credential.origin}, where no other token can be stored")
+        raise BadCredentialFile(
+            f"the token comes from {credential.origin}, where the command cannot store a new token; put the token "
+            "into a file, and name it with --token-file"
+        )
 
 
 def _write_logins(path: Path, logins: Logins) -> None:

@@ -95,7 +95,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
     data = leaf["data"]
     if "encoding" in leaf:
         if leaf["encoding"] != "blocks" or not isinstance(data, bytes):
-            raise ArrayError("bad-array", 'the only encoding of an array is "blocks", with bytes as its data')
+            raise ArrayError("bad-array", 'the encoding of an array must be "blocks", and its data must be bytes')
         array = EncodedArray(spec.dtype, spec.shape, data).decode(max_bytes=max_bytes)
     elif isinstance(data, bytes):
         array = _from_bytes(data, spec)

@@ -174,8 +174,8 @@ class _Job:
         if count > MOST_EXAMPLES and self._params.reference == MEDOID:
             raise JobRefused(
                 "too-many-clips",
-                f"{count} clips are too many to compare each clip with every other; this is possible for at "
-                f"most {MOST_EXAMPLES}; choose a clip or {NEAREST_MEAN_LENGTH} as reference",
+                f"the reference `medoid` compares each clip with every other, which is possible for at most "
+                f"{MOST_EXAMPLES} clips, not {count}; choose a clip or {NEAREST_MEAN_LENGTH} as reference",
             )
 
     # -- annotations --
