@@ -11,8 +11,9 @@ from tests.support.rest_server import Server, running
 from tests.support.tiers import is_soak
 from tests.support.who_may_know import Program
 
+from marey_schemas.access import Role
 from marey_server.access import roles, scopes
-from marey_server.store import blobs
+from marey_server.store import blobs, projects
 from marey_server.store.database.connections import Database
 
 pytestmark = pytest.mark.timeout(7200)
@@ -20,12 +21,13 @@ pytestmark = pytest.mark.timeout(7200)
 SEED = 20261123
 CALLS = 20_000 if is_soak() else 1_000
 CALLS_TO_FIND_A_HOLE = 2_000
+AS_SEEN = projects._as_seen
 
 
 @pytest.fixture
 def server(database: Database, tmp_path: Path) -> Iterator[Server]:
     """A running server, on SQLite and on Postgres."""
-    with running(database, tmp_path) as one:
+    with running(database, tmp_path, lease_ttl_s=3600.0) as one:
         yield one
 
 
@@ -47,10 +49,20 @@ def _every_role_is_enough(_role: Any, _required: Any) -> bool:
     return True
 
 
+def _everybody_is_an_administrator(_principal: Any) -> bool:
+    return True
+
+
+def _every_project_has_guests(principal: Any, row: Any) -> Any:
+    return AS_SEEN(principal, row) or projects._row(row, Role.READER, guest=True)
+
+
 HOLES: dict[str, tuple[Any, str, Callable[..., Any]]] = {
     "every member may do everything": (roles, "includes", _every_role_is_enough),
     "a token reaches beyond its project": (scopes, "allows", _bounds_of_tokens_are_forgotten),
     "a digest is enough to have the bytes": (blobs, "_held", _everybody_holds_all_bytes),
+    "everybody is an administrator": (roles, "is_administrator", _everybody_is_an_administrator),
+    "private projects have guests": (projects, "_as_seen", _every_project_has_guests),
 }
 
 

@@ -161,13 +161,12 @@ def build_house(people: People) -> House:
 
 
 def start_attempt(people: People, tokens: Mapping[str, str | None], clip: str) -> dict[str, Any]:
-    """Submit a job of the contributor that exports a clip of `lab`, claim it as the worker, and return the lease."""
+    """Submit a job of the contributor that exports a clip of `lab`, and return the lease of such a job."""
     body = {"kind": "export", "inputs": {"clips": [{"item": clip}]}, "cache": "refresh", "priority": 5}
     job = people.client(tokens["contributor"]).post("/projects/lab/jobs", json=body)
     assert job.status_code == 202, job.text
     request = {"worker": "w", "kinds": ["export"], "max": 1}
     lease: dict[str, Any] = people.client(tokens["worker"]).post("/leases", json=request).json()["leases"][0]
-    assert lease["job"] == job.json()["id"]
     return lease
 
 

@@ -1,4 +1,4 @@
-"""Model of who may know what: projects, members, items, blobs and tokens in memory, and what each caller is answered.
+"""Model of who may know what: all that projects contain, in memory, and the answers that each caller gets.
 
 Projects, users, items and bytes carry marks in their texts. After every call the answer must have the status of the
 model, contain what the caller asked for, and contain no mark of a project that the caller may not read.
@@ -13,11 +13,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import httpx
+from sqlalchemy import update
 from tests.support.furnished_house import HIERARCHY, MOTION
 from tests.support.rest_server import ALL_SCOPES, USER_SCOPES, People
 from tests.support.who_may import RANK
 
 from marey_schemas.access import Role
+from marey_server.access.principal import SYSTEM
+from marey_server.store.tables import token
 
 PROJECTS = ("red", "green", "blue")
 USERS = ("ann", "bob", "cleo", "dora")
@@ -39,6 +42,10 @@ class Caller:
 
 
 ROOT = Caller("root", scopes=ALL_SCOPES)
+WORKER = Caller("root", scopes=("work",))
+EXPIRED = Caller("dora", scopes=("read", "jobs"))
+ATTEMPTS = {state: Caller(f"{state} attempt", scopes=()) for state in ("running", "ended")}
+"""Attempts of jobs in the first project."""
 CALLERS = (
     Caller(None),
     *(Caller(user) for user in USERS),
@@ -46,6 +53,9 @@ CALLERS = (
     Caller("ann", scopes=("read",)),
     Caller("cleo", scopes=("write",)),
     ROOT,
+    WORKER,
+    EXPIRED,
+    *ATTEMPTS.values(),
 )
 
 
@@ -58,10 +68,15 @@ class World:
     disabled: set[str] = field(default_factory=set)
     held: set[tuple[str, str | None, int]] = field(default_factory=set)
     stored: set[int] = field(default_factory=set)
+    jobs: dict[str, set[str]] = field(default_factory=lambda: {name: set() for name in PROJECTS})
+    uploads: dict[str, Caller] = field(default_factory=dict)
     items: dict[str, dict[str, int | None]] = field(default_factory=lambda: {name: {} for name in PROJECTS})
 
-    def refused(self, caller: Caller) -> bool:
-        return caller.user in self.disabled
+    def refusal(self, caller: Caller) -> int:
+        """Return the status with which every operation refuses a credential, or 0."""
+        if caller.user in self.disabled or caller == EXPIRED:
+            return 401
+        return 409 if caller == ATTEMPTS["ended"] else 0
 
     def has(self, caller: Caller, scope: str, project: str | None = None) -> bool:
         """Return whether the credential includes a scope, in a project if one is named."""
@@ -71,7 +86,7 @@ class World:
         """Return the caller's role, None for outsiders and tokens that do not reach the project."""
         if caller.user is None or caller.bound not in (None, project):
             return None
-        return Role.OWNER if caller == ROOT else self.roles.get((project, caller.user))
+        return Role.OWNER if caller.user == "root" else self.roles.get((project, caller.user))
 
     def knows(self, caller: Caller, project: str) -> bool:
         """Return whether the caller may know that a project exists."""
@@ -79,8 +94,8 @@ class World:
 
     def status(self, caller: Caller, project: str, least: Role, scope: str, *, guests: bool = True) -> int:
         """Return the status with which an operation of a project refuses a caller, or 0."""
-        if self.refused(caller):
-            return 401
+        if refusal := self.refusal(caller):
+            return refusal
         reads = least is Role.READER and guests
         if caller.user is None and not reads:
             return 401
@@ -108,6 +123,8 @@ class World:
         """Return whether the caller may read a blob, or refer to it; a bound token sends for its project."""
         places = (caller.bound,) if caller.bound else (None, *PROJECTS)
         held = any((caller.user, place, blob) in self.held for place in places)
+        if caller in ATTEMPTS.values():  # whose inputs name no blob
+            return held
         return held or self.referring(caller, blob)
 
 
@@ -130,10 +147,11 @@ class Program:
         for user in USERS:
             self.tokens[Caller(user)] = self.people.make_user(user)
         for caller in CALLERS:
-            if caller not in self.tokens:
+            if caller not in self.tokens and caller not in ATTEMPTS.values():
                 bound = f"!project={caller.bound}" if caller.bound else ""
+                maker = ROOT if caller.user == ROOT.user else Caller(caller.user)
                 wanted = {"name": caller.name, "scopes": [scope + bound for scope in caller.scopes]}
-                made = self.people.client(self.tokens[Caller(caller.user)]).post("/tokens", json=wanted)
+                made = self.people.client(self.tokens[maker]).post("/tokens", json=wanted)
                 self.tokens[caller] = made.json()["secret"]
         for project, user in zip(PROJECTS, USERS, strict=False):
             owner = self.people.client(self.tokens[Caller(user)])
@@ -142,13 +160,38 @@ class Program:
             made = owner.post(f"/projects/{project}/skeletons", json=body)
             self.skeletons[project] = {"item": made.json()["id"], "revision": 1}
             self.world.roles[project, user] = Role.OWNER
+            self._submit_jobs(project)
+        end = update(token).where(token.c.name == EXPIRED.name).values(expires_us=1)
+        self.people.database.write(SYSTEM, lambda tx: tx.execute(end))
+
+    def _submit_jobs(self, project: str) -> None:
+        """Submit two jobs with marks and claim them; one attempt goes on, the other ends."""
+        root, worker = (self.people.client(self.tokens[caller]) for caller in (ROOT, WORKER))
+        name = f"mark-{project}-walk"
+        parts = {"motion": {**MOTION, "skeleton": self.skeletons[project]}}
+        clip = root.post(f"/projects/{project}/clips", json={"name": name, "parts": parts}).json()["id"]
+        self.world.items[project][name] = None
+        for state in ATTEMPTS:
+            body = {"kind": "export", "inputs": {"clips": [{"item": clip}]}, "cache": "refresh", "message": name}
+            self.world.jobs[project].add(root.post(f"/projects/{project}/jobs", json=body).json()["id"])
+            claim = {"worker": f"mark-{project}", "kinds": ["export"], "max": 1}
+            lease = worker.post("/leases", json=claim).json()["leases"][0]
+            attempt = self.people.client(lease["attempt_token"])
+            path = f"/jobs/{lease['job']}/attempts/{lease['fence']}"
+            assert attempt.post(f"{path}/log", content=name.encode(), headers={"Upload-Offset": "0"}).is_success
+            if state == "ended":
+                failure = {"write_id": "12345678", "code": name, "retryable": False}
+                assert attempt.post(f"{path}/fail", json=failure).is_success
+            if project == PROJECTS[0]:
+                self.tokens[ATTEMPTS[state]] = lease["attempt_token"]
 
     def run(self, count: int) -> None:
         """Make calls, until the server and the model differ."""
         kinds = (
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
-            self.change_visibility, self.list_members, self.list_events, self.list_tokens, self.disable,
+            self.change_visibility, self.list_members, self.list_events, self.list_tokens, self.disable, self.list_jobs,
+            self.read_job, self.read_quotas, self.begin_upload, self.read_upload, self.claim,
         )  # fmt: skip
         while self.calls < count and not self.differences:
             self.chance.choice(kinds)(self.chance.choice(CALLERS), self.chance.choice(PROJECTS))
@@ -160,8 +203,10 @@ class Program:
         self._call(caller, "GET", f"/projects/{project}", expected or 200)
 
     def list_projects(self, caller: Caller, _project: str) -> None:
-        answer = self._call(caller, "GET", "/projects", self._anyone(caller, "read"))
-        self._compare(answer, caller, {name for name in PROJECTS if self.world.sees_contents(caller, name)})
+        attempt = caller in ATTEMPTS.values()  # to which the list is always empty
+        answer = self._call(caller, "GET", "/projects", 200 if attempt else self._anyone(caller, "read"))
+        listed = {name for name in PROJECTS if not attempt and self.world.sees_contents(caller, name)}
+        self._compare(answer, caller, listed)
 
     def list_items(self, caller: Caller, project: str) -> None:
         expected = self.world.status(caller, project, Role.READER, "read")
@@ -187,17 +232,14 @@ class Program:
 
     def send_blob(self, caller: Caller, _project: str) -> None:
         blob = self.chance.randrange(len(BLOBS))
-        expected = self._user(caller, "write") or 204
-        if expected == 204 and caller.bound:  # the bytes are for this project
-            role = self.world.role(caller, caller.bound)
-            expected = 403 if role is None or RANK[role] < RANK[Role.CONTRIBUTOR] else 204
+        expected = self._sends(caller) or 204
         if self._call(caller, "PUT", f"/blobs/{DIGESTS[blob]}", expected, content=BLOBS[blob]).is_success:
             self.world.held.add((str(caller.user), caller.bound, blob))
 
     def read_blob(self, caller: Caller, _project: str) -> None:
         blob = self.chance.randrange(len(BLOBS))
         known = 200 if self.world.may_refer(caller, blob) else 404
-        expected = self._anyone(caller, "read")
+        expected = 200 if caller == ATTEMPTS["running"] else self._anyone(caller, "read")
         self._call(caller, "GET", f"/blobs/{DIGESTS[blob]}", known if expected == 200 else expected)
 
     def ask_missing(self, caller: Caller, _project: str) -> None:
@@ -257,6 +299,50 @@ class Program:
         own = {one.name for one in CALLERS if one.user == caller.user and one.name != Caller(one.user).name}
         self._compare(answer, caller, {*own, "test"} - {ROOT.name})
 
+    def list_jobs(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read")
+        answer = self._call(caller, "GET", f"/projects/{project}/jobs?count=exact", expected or 200)
+        self._compare(answer, caller, self.world.jobs[project], "id")
+        if answer.is_success and answer.json()["count"] != len(self.world.jobs[project]):
+            self._differ(answer, caller, f"counted {answer.json()['count']}")
+
+    def read_job(self, caller: Caller, project: str) -> None:
+        """Read a job, or what the server knows of it; logs and events are for members."""
+        job = self.chance.choice(sorted(self.world.jobs[project]))
+        what = self.chance.choice(("", "/attempts", "/outputs", "/log", "/events"))
+        guests = what not in ("/log", "/events")
+        expected = self.world.status(caller, project, Role.READER, "read", guests=guests)
+        self._call(caller, "GET", f"/jobs/{job}{what}", expected or 200)
+
+    def read_quotas(self, caller: Caller, project: str) -> None:
+        expected = self.world.status(caller, project, Role.READER, "read", guests=False)
+        self._call(caller, "GET", f"/projects/{project}/quotas", expected or 200)
+        user = self.chance.choice(USERS)
+        expected = self._user(caller, "read")
+        if not expected and caller.bound:
+            expected = 403
+        known = 200 if caller == ROOT or caller.user == user else 404
+        self._call(caller, "GET", f"/users/{user}/quotas", expected or known)
+
+    def begin_upload(self, caller: Caller, _project: str) -> None:
+        expected = self._sends(caller) or 201
+        answer = self._call(caller, "POST", "/uploads", expected, json={"length": 5})
+        if answer.is_success:
+            self.world.uploads[answer.json()["id"]] = caller
+
+    def read_upload(self, caller: Caller, _project: str) -> None:
+        """Read an upload with the credential that began it, or with one of another user."""
+        upload = self.chance.choice([*self.world.uploads, "upload_of_nobody"])
+        sender = self.world.uploads.get(upload)
+        if sender is not None and sender.user == caller.user and sender != caller:
+            return
+        expected = 0 if caller == ATTEMPTS["running"] else self._user(caller, "read")
+        self._call(caller, "GET", f"/uploads/{upload}", expected or (200 if sender == caller else 404))
+
+    def claim(self, caller: Caller, _project: str) -> None:
+        expected = self._user(caller, "work") or 200
+        self._call(caller, "POST", "/leases", expected, json={"worker": "w", "kinds": ["no-such-kind"]})
+
     def disable(self, _caller: Caller, _project: str) -> None:
         user, disabled = self.chance.choice(USERS), self.chance.random() < 0.3
         path = f"/users/{user}"
@@ -266,8 +352,8 @@ class Program:
     # -- comparing ----------------------------------------------------------------------------------------------------
 
     def _anyone(self, caller: Caller, scope: str) -> int:
-        if self.world.refused(caller):
-            return 401
+        if refusal := self.world.refusal(caller):
+            return refusal
         return 200 if caller.user is None or scope in caller.scopes else 403
 
     def _changed(self, caller: Caller, project: str, status: int) -> int:
@@ -275,9 +361,16 @@ class Program:
         return status if self.world.has(caller, "read", project) else 204
 
     def _user(self, caller: Caller, scope: str) -> int:
-        if caller.user is None or self.world.refused(caller):
+        if caller.user is None:
             return 401
-        return 0 if scope in caller.scopes else 403
+        return self.world.refusal(caller) or (0 if scope in caller.scopes else 403)
+
+    def _sends(self, caller: Caller) -> int:
+        """Return the status with which bytes are refused, or 0; a bound token sends them for its project."""
+        if caller == ATTEMPTS["running"]:
+            return 0
+        role = self.world.role(caller, caller.bound) if caller.bound else Role.OWNER
+        return self._user(caller, "write") or (403 if role is None or RANK[role] < RANK[Role.CONTRIBUTOR] else 0)
 
     def _last_owner(self, project: str, user: str) -> bool:
         owners = [name for (place, name), role in self.world.roles.items() if (place, role) == (project, Role.OWNER)]
