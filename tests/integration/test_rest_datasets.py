@@ -297,3 +297,12 @@ def test_damaged_versions_are_found(owner: httpx.Client, gaits: Callable[..., An
     assert not list(check_store(database))
     database.write(SYSTEM, damage)
     assert {one.code for one in check_store(database)} == {"chunk-corrupt", "commit-corrupt"}
+
+
+def test_the_numbers_of_datasets_and_of_tags_are_limited(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("marey_server.store.datasets.naming.MOST_DATASETS", 1)
+    monkeypatch.setattr("marey_server.store.datasets.naming.MOST_REFS", 1)
+    refused(owner.post(f"{LAB}/datasets", json={"name": "other"}), 409, "too-many-datasets")
+    refused(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag"}), 409, "too-many-refs")

@@ -62,7 +62,7 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
     """
     project_row = projects.require(tx, project)
     held = tx.execute(select(func.count()).where(dataset.c.project_id == project_row.id, _ALIVE)).scalar_one()
-    _require_room(held, MOST_DATASETS, "datasets in a project")
+    _require_room(held, MOST_DATASETS, "datasets in a project", "too-many-datasets")
     folder = None if request.collection is None else collections.ensure(tx, project_row, request.collection)
     dataset_id = new_id("dataset")
     row = {
@@ -77,9 +77,9 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
     return _shown(find_dataset(tx, project_row, request.name))
 
 
-def _require_room(held: int, most: int, of_what: str) -> None:
+def _require_room(held: int, most: int, of_what: str, code: str) -> None:
     if held >= most:
-        raise ConflictProblem(f"The greatest number of {of_what} is {most:,}; delete one first.", code="too-many")
+        raise ConflictProblem(f"The greatest number of {of_what} is {most:,}; delete one first.", code=code)
 
 
 def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
@@ -145,7 +145,7 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
-    _require_room(held, MOST_REFS, "branches and tags in a dataset")
+    _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
         tx.execute(insert(dataset_ref).values(**_new_ref(tx, row.id, request.name, request.kind, digest)))
     tx.emit(f"{request.kind.value}.created", row.id, project_id=project_row.id, name=request.name, commit=digest)
