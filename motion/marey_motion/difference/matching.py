@@ -19,7 +19,9 @@ from marey_motion.difference.poses import Poses, frame_costs
 UNMATCHED = 0.25
 """Cost of a removed or inserted frame. Two frames that differ by more than twice as much are removed and inserted."""
 NEW_RUN = 1.0
-"""Cost of a change of the lag inside the clips; half as much at their ends."""
+"""Cost of a change of the lag inside the clips."""
+AT_AN_END = 0.995
+"""Cost of frames that are removed or inserted at an end; if all places cost the same, they are at an end."""
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further candidates are searched."""
 MOST_ROUNDS = 64
@@ -110,12 +112,12 @@ def _diagonal(before: Poses, after: Poses, lag: int) -> _Diagonal:
 
 
 def _start_cost(one: _Diagonal) -> float:
-    return abs(one.lag) * UNMATCHED + (0.5 * NEW_RUN if one.lag else 0.0)
+    return abs(one.lag) * UNMATCHED + (AT_AN_END if one.lag else 0.0)
 
 
 def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
     left = count_before - one.stop + count_after - (one.stop + one.lag)
-    return left * UNMATCHED + (0.5 * NEW_RUN if left else 0.0)
+    return left * UNMATCHED + (AT_AN_END if left else 0.0)
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
