@@ -65,14 +65,12 @@ def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointe
         old, new = before.get(name), after.get(name)
         if _is_nothing(old) and _is_nothing(new):
             continue
-        if _is_list(old or new) and _is_list(new or old):
-            yield from changed_values(old or (), new or (), place)
-        elif _is_nothing(old):
+        if _is_nothing(old) and not _is_list(new):
             yield ChangedValue(place, "added", after=_shown(new))
-        elif _is_nothing(new):
+        elif _is_nothing(new) and not _is_list(old):
             yield ChangedValue(place, "removed", before=_shown(old))
         else:
-            yield from changed_values(old, new, place)
+            yield from changed_values([] if _is_nothing(old) else old, [] if _is_nothing(new) else new, place)
 
 
 def _is_nothing(value: Any) -> bool:

@@ -21,10 +21,10 @@ MUCH_BETTER = 0.5
 SIMILAR_ENOUGH = 0.1
 """Share of the greatest possible cost up to which no pace is searched, unless there are `MANY_RUNS`."""
 MANY_RUNS = 8
-MOST_REFINEMENTS = 6
+MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
-SLOPES = 20
-"""Slopes are measured over the number of matched frames divided by this number."""
+SLOPES, FRAMES_APART = 20, 64
+"""Slopes are measured over the number of frames divided by the first number, or over the second number of frames."""
 FARTHEST_OFFSET = 2.0
 """Maximum offset, in frames, that is estimated from velocities."""
 ROUNDED_FRAMES = 0.02
@@ -127,20 +127,29 @@ def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing
 
 
 def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Timing:
-    """Correct pace and phase by the times of the matched frames, and match the frames again, while it gets better."""
-    for _ in range(MOST_REFINEMENTS):
+    """Correct pace and phase by the times of the matched frames, and match the frames again, while it gets better.
+
+    Slopes over short and over long distances take turns: short ones are right where few frames are matched well, long
+    ones are more exact.
+    """
+    failed = False
+    for attempt in range(MOST_REFINEMENTS):
         pairs = timing.matching.pairs
-        if len(pairs) < FEWEST_PAIRS:
-            return timing
         offsets, weights = time_offsets(timing.before, after, pairs)
-        near = np.clip(offsets, -FARTHEST_OFFSET, FARTHEST_OFFSET)
-        start, step = _robust_line(pairs[:, 1].astype(np.float64), timing.pace.places(pairs[:, 0] + near), weights)
+        near = (np.abs(offsets) <= FARTHEST_OFFSET) & (weights > 0.0)
+        if np.count_nonzero(near) < FEWEST_PAIRS:
+            return timing
+        places = timing.pace.places(pairs[near, 0] + offsets[near])
+        apart = FRAMES_APART if attempt % 2 == 0 else len(places) // SLOPES
+        start, step = _robust_line(pairs[near, 1].astype(np.float64), places, weights[near], apart)
         if not 1.0 / GREATEST_PACE <= step <= GREATEST_PACE:
             return timing
         tried = _at_pace(before, after, _rounded(start, step, timing.before.frame_count), search=search)
-        if not _share(tried, after) < _share(timing, after):
+        better = _share(tried, after) < _share(timing, after)
+        if failed and not better:
             return timing
-        timing = tried
+        failed = not better
+        timing = tried if better else timing
     return timing
 
 
@@ -156,14 +165,14 @@ def _rounded(start: float, step: float, count: int) -> Pace:
     return Pace(pace, 0.0 if 1.0 / pace - phase <= SAME_PACE else phase)
 
 
-def _robust_line(places: Floats, values: Floats, weights: Floats) -> tuple[float, float]:
+def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) -> tuple[float, float]:
     """Return start and slope of a straight line through most values, which jump where frames were removed."""
-    apart = max(1, len(places) // SLOPES)
+    apart = max(1, min(apart, len(places) - 1))
     slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
     start = float(np.median(values - slope * places))
     for _ in range(2):
         near = np.abs(values - start - slope * places) <= 1.0
-        if np.count_nonzero(near & (weights > 0.0)) >= FEWEST_PAIRS:
+        if np.count_nonzero(near) >= FEWEST_PAIRS:
             start, slope = _line(places[near], values[near], weights[near])
     return start, slope
 

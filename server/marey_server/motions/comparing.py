@@ -89,14 +89,12 @@ def read_difference(
         raise NotFoundProblem(
             "The item has no revision before this one; name two revisions, or another item.", code="no-revision"
         )
-    numbers = {"before": (item, before), "after": (other, after)}
+    numbers = {"after": (other, after), "before": (item, before)}  # a revision that was asked for is missed first
     parts = {side: items.read_revision(tx, project, kind, one.id, n).parts for side, (one, n) in numbers.items()}
     digests = {side: {(name, part.document) for name, part in found.items()} for side, found in parts.items()}
     differing = {name for name, _ in digests["before"] ^ digests["after"]}
-    found = DifferenceSource(
-        kind,
-        *(_side(tx, project, one, n, parts[side], differing) for side, (one, n) in numbers.items()),
-    )
+    sides = {side: _side(tx, project, one, n, parts[side], differing) for side, (one, n) in numbers.items()}
+    found = DifferenceSource(kind, **sides)
     _require_room(found)
     return found
 
