@@ -161,8 +161,8 @@ class Program:
             self.skeletons[project] = {"item": made.json()["id"], "revision": 1}
             self.world.roles[project, user] = Role.OWNER
             self._submit_jobs(project)
-        end = update(token).where(token.c.name == EXPIRED.name).values(expires_us=1)
-        self.people.database.write(SYSTEM, lambda tx: tx.execute(end))
+        end = update(token).where(token.c.name == EXPIRED.name)
+        self.people.database.write(SYSTEM, lambda tx: tx.execute(end.values(expires_us=tx.now_us)))
 
     def _submit_jobs(self, project: str) -> None:
         """Submit two jobs with marks and claim them; one attempt goes on, the other ends."""
