@@ -71,7 +71,7 @@ def path_and_kind(key: str) -> tuple[str, str]:
 
 def revision_content(kind: str, parts: Mapping[str, str]) -> str:
     """Return the content digest of a revision from its kind and the content digests of its parts."""
-    return digest_of(canonical_json({"kind": kind, "parts": dict(parts)}))
+    return digest_of(_canonical({"kind": kind, "parts": dict(parts)}))
 
 
 def references_in(body: Any) -> Iterator[RevisionKey]:
