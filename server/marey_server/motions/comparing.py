@@ -33,8 +33,8 @@ Tree = dict[str, Any]
 
 MAKE_DIFFERENCE = "marey_server.motions.comparing:make_difference"
 """Function that child processes run."""
-MOST_NUMBERS = 30_000_000
-"""Greatest number of values in the poses of both revisions."""
+MOST_NUMBERS = 20_000_000
+"""Greatest number of values in the poses of both revisions; a child compares them within its processor time."""
 MOST_FIELDS = 1000
 """Most changed values that an answer lists."""
 
