@@ -147,9 +147,9 @@ def test_a_file_whose_name_cannot_be_sent_is_refused_and_keeps_no_other_out(
     files = find_files([tmp_path]).files
     entries = {entry.name: entry for entry in lab.imports.upload(files)}
     assert {name: entry.status for name, entry in entries.items()} == {shown: "failed", "walk.bvh": "created"}
-    assert "rename it (file-name)" in refusal_text(entries[shown])
+    assert "rename the file (file-name)" in refusal_text(entries[shown])
     assert script.answers == []
-    with pytest.raises(errors.BadFileName, match="rename it"):
+    with pytest.raises(errors.BadFileName, match="rename the file"):
         lab.imports.send(files)
 
 
