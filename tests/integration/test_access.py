@@ -123,6 +123,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "POST /projects/{project}/collections/{collection}/restore": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}/refs/{ref}": "maintainer",
+        "PATCH /projects/{project}/datasets/{dataset}/refs/{ref}": "maintainer",
         "POST /projects/{project}/datasets/{dataset}/checkout": "maintainer",
         "DELETE /projects/{project}/{kind}/{item}": "maintainer",
         "POST /projects/{project}/{kind}/{item}/restore": "maintainer",

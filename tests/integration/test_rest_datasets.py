@@ -272,6 +272,106 @@ def test_histories_that_crossed_are_not_merged(owner: httpx.Client, two_branches
     assert len(crossed["context"]["commits"]) == 2
 
 
+def test_a_commit_is_undone_and_repeated_while_later_changes_stay(
+    owner: httpx.Client, gaits: Callable[..., Any], database: Database
+) -> None:
+    put(owner, "gaits/a", "Pelvis")
+    renamed = gaits("rename a joint")["digest"]
+    change(owner, "gaits/a", tags=["slow"])
+    gaits("tag")
+    undone = ok(owner.post(f"{GAITS}/reverts", json={"version": renamed}))["commit"]
+    assert (undone["message"], len(undone["parents"])) == ("Revert 'rename a joint'", 1)
+    assert entries(owner)["a"]["parts"] == entries(owner, "main~3")["a"]["parts"]
+    assert entries(owner)["a"]["tags"] == ["slow"]
+    refused(owner.post(f"{GAITS}/reverts", json={"version": renamed}), 422, "no-changes")
+    again = {"version": renamed, "write_id": "12345678"}
+    repeated = ok(owner.post(f"{GAITS}/cherry-picks", json=again))["commit"]
+    assert (repeated["message"], repeated["tree"]) == (
+        "rename a joint", ok(owner.get(f"{GAITS}/commits/main~2"))["tree"],
+    )  # fmt: skip
+    assert ok(owner.post(f"{GAITS}/cherry-picks", json=again))["commit"] == repeated
+    assert not list(check_store(database))
+
+
+def test_a_commit_is_not_undone_over_a_later_change_of_the_same_part(
+    owner: httpx.Client, gaits: Callable[..., Any]
+) -> None:
+    put(owner, "gaits/a", "Pelvis")
+    gaits("second")
+    put(owner, "gaits/a", "Root")
+    gaits("third")
+    conflict = refused(owner.post(f"{GAITS}/reverts", json={"version": "main~1"}), 409, "merge-conflicts")["context"]
+    assert [(one["path"], one["parts"]) for one in conflict["conflicts"]] == [("a", ["hierarchy"])]
+    theirs = [{"path": "a", "kind": "skeleton", "take": "theirs"}]
+    ok(owner.post(f"{GAITS}/reverts", json={"version": "main~1", "resolutions": theirs}))
+    assert entries(owner)["a"] == entries(owner, "main~3")["a"]
+    first = ok(owner.post(f"{GAITS}/reverts", json={"version": "main~3", "preview": True}))
+    assert (first["theirs"], first["changes"]) == (None, 2)
+
+
+def test_the_changes_of_a_merge_are_those_since_a_chosen_parent(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: change(owner, "gaits/a", tags=["x"]), lambda: change(owner, "gaits/b", tags=["y"]))
+    ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))
+    refused(owner.post(f"{GAITS}/reverts", json={"version": "main"}), 422, "is-merge")
+    refused(owner.post(f"{GAITS}/reverts", json={"version": "main~1", "parent": 2}), 422, "no-parent")
+    ok(owner.post(f"{GAITS}/reverts", json={"version": "main", "parent": 1}))
+    assert {path: one["tags"] for path, one in entries(owner).items()} == {"a": [], "b": ["y"]}
+
+
+def test_a_branch_is_moved_back_to_an_earlier_version(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    change(owner, "gaits/a", tags=["slow"])
+    second = gaits("second")["digest"]
+    (main,) = ok(owner.get(f"{GAITS}/refs"))["items"]
+    moved = owner.patch(f"{GAITS}/refs/main", json={"at": "main~1"}, headers={"If-Match": '"1"'})
+    refused(moved, 412, "precondition-failed")
+    moved = owner.patch(f"{GAITS}/refs/main", json={"at": "main~1"}, headers={"If-Match": f'"{main["rev"]}"'})
+    assert ok(moved)["commit"] == ok(owner.get(f"{GAITS}/commits/{second}"))["parents"][0]
+    ok(owner.post(f"{GAITS}/refs", json={"name": "v2", "kind": "tag", "at": second}), 201)
+    refused(owner.patch(f"{GAITS}/refs/v2", json={"at": "main"}, headers={"If-Match": "*"}), 422, "is-tag")
+    refused(owner.patch(f"{GAITS}/refs/v3", json={"at": "main"}, headers={"If-Match": "*"}), 404, "no-version")
+    assert ok(owner.get(f"{GAITS}/commits/v2"))["digest"] == second
+
+
+def test_the_commits_that_changed_a_path_are_listed(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    change(owner, "gaits/a", tags=["slow"])
+    gaits("tag a")
+    ok(owner.post(f"{LAB}/skeletons", json=skeleton("a", folder="gaits/a b")), 201)
+    gaits("add a b/a")
+    change(owner, "gaits/a", tags=[])
+    gaits("untag a")
+
+    def log(path: str) -> list[str]:
+        found: list[str] = []
+        cursor: str | None = None
+        while True:
+            query: dict[str, str | int] = {"path": path, "limit": 1}
+            if cursor:
+                query["cursor"] = cursor
+            page = ok(owner.get(f"{GAITS}/commits", params=query))
+            found += [one["message"] for one in page["items"]]
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return found
+
+    assert (log("a"), log("a b"), log("nothing")) == (["untag a", "tag a", "first"], ["add a b/a"], [])
+    monkeypatch.setattr("marey_server.store.datasets.history.MOST_EXAMINED", 2)
+    assert (log("a"), log("a b"), log("b")) == (["untag a", "tag a", "first"], ["add a b/a"], ["first"])
+
+
+def test_the_origin_of_each_part_is_shown(owner: httpx.Client, two_branches: Callable[..., None]) -> None:
+    two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: change(owner, "gaits/a", name="c", tags=["slow"]))
+    ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))
+    found = ok(owner.get(f"{GAITS}/blame", params={"entry": "c", "kind": "skeleton"}))
+    assert (found["tags"]["commit"]["message"], found["place"]["commit"]["message"]) == ("on main", "on main")
+    origin = found["parts"]["hierarchy"]
+    assert (origin["commit"]["message"], origin["path"], origin["certain"]) == ("on trial", "a", True)
+    refused(owner.get(f"{GAITS}/blame", params={"entry": "a", "kind": "skeleton"}), 404, "no-entry")
+
+
 def test_readers_read_and_contributors_commit(server: Server, gaits: Callable[..., Any]) -> None:
     reader = server.client(server.make_user("rita"))
     refused(reader.get(f"{GAITS}/entries"), 404, "no-project")

@@ -51,6 +51,8 @@ BODIES = {
     "RefCreate": {"name": "another", "kind": "tag"},
     "CommitCreate": {"message": "m", "changes": [{"change": "remove", "path": CANARY, "kind": "graph"}]},
     "MergeRequest": {"version": "spare"},
+    "PickRequest": {"version": "spare"},
+    "RefMove": {"at": "main"},
     "CheckoutRequest": {"version": "spare", "discard": True},
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
@@ -86,6 +88,12 @@ _OTHER_THINGS = {
     "{project}/restore": {"project": "gone"},
 }
 """Variables of routes for other things than the clip, by a piece of their paths."""
+_QUERIES = {
+    "{item}/export": "?format=original",
+    "{item}/difference": "?from=1&to=1",
+    "{dataset}/blame": f"?entry={CANARY}&kind=graph",
+}
+"""Queries of routes that need one, by the endings of their paths."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +137,7 @@ class House:
             else:
                 content = json.dumps(BODIES[name]).encode()
                 headers["Content-Type"] = "application/json"
-        query = "?format=original" if template.endswith("{item}/export") else ""
-        if template.endswith("{item}/difference"):
-            query = "?from=1&to=1"
+        query = next((query for ending, query in _QUERIES.items() if template.endswith(ending)), "")
         if template.endswith("{project}/{kind}") and operation.method == "GET":
             query = f"?name={CANARY}"  # attempts may only look up names
         return Planned(operation.method, template.replace(":int", "").format(**variables) + query, headers, content)

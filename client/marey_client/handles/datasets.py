@@ -5,14 +5,23 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport
-from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange
+from marey_client.transport import Params, Transport, as_json, read_model
+from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
 from marey_schemas.datasets.differences import DatasetDifference
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, Resolution
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind
+from marey_schemas.datasets.merges import (
+    CheckoutAnswer,
+    CheckoutRequest,
+    MergeAnswer,
+    MergeRequest,
+    PickRequest,
+    Resolution,
+)
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
+from marey_schemas.kinds import Kind
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,23 @@ class Datasets:
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
         return DatasetHandle(self.transport, f"{self.url}/{name}")
+
+
+class PickOptions(TypedDict, total=False):
+    """Options of `DatasetHandle.cherry_pick` and `DatasetHandle.revert`."""
+
+    into: str
+    """Branch that gets the changes; default: main."""
+    parent: Literal[1, 2]
+    """For a merge: the parent with which it is compared to find its changes."""
+    message: str
+    """Message of the commit."""
+    resolutions: tuple[Resolution, ...]
+    """Decisions of conflicts."""
+    preview: bool
+    """Whether only to compute the result."""
+    expected: str
+    """Commit that the branch must be at."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +111,12 @@ class DatasetHandle:
         )
         return self.transport.post(Commit, f"{self.url}/commits", request)
 
-    def log(self, version: str = MAIN) -> Iterator[Commit]:
-        """List a version and the versions before it, newest first."""
-        return pages(self.transport, Commit, f"{self.url}/commits", {"version": version})
+    def log(self, version: str = MAIN, *, path: str = "") -> Iterator[Commit]:
+        """List a version and the versions before it, newest first.
+
+        With `path`, list only the commits that changed the entry or the folder at this path.
+        """
+        return pages(self.transport, Commit, f"{self.url}/commits", {"version": version, "path": path})
 
     def at(self, version: str = MAIN) -> Commit:
         """Return the commit that a version names."""
@@ -128,6 +157,29 @@ class DatasetHandle:
         )
         return self.transport.post(MergeAnswer, f"{self.url}/merges", request)
 
+    def cherry_pick(self, version: str, **options: Unpack[PickOptions]) -> MergeAnswer:
+        """Repeat on a branch what one commit has changed.
+
+        Raises `Conflict` with the code `merge-conflicts` if the branch has changed the same parts.
+        """
+        return self._pick("cherry-picks", version, options)
+
+    def revert(self, version: str, **options: Unpack[PickOptions]) -> MergeAnswer:
+        """Undo on a branch what one commit has changed; later changes stay.
+
+        Raises `Conflict` with the code `merge-conflicts` if later commits have changed the same parts.
+        """
+        return self._pick("reverts", version, options)
+
+    def _pick(self, resource: str, version: str, options: PickOptions) -> MergeAnswer:
+        request = PickRequest(version=version, write_id=secrets.token_hex(16), **options)
+        return self.transport.post(MergeAnswer, f"{self.url}/{resource}", request)
+
+    def blame(self, path: str, kind: Kind, version: str = MAIN) -> EntryOrigins:
+        """Return the commits that last changed the parts, the path and the tags of an entry."""
+        query: Params = {"version": version, "entry": path, "kind": kind}
+        return self.transport.get(EntryOrigins, f"{self.url}/blame", query)
+
     def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
         """Give the folder of the dataset the entries of a version.
 
@@ -152,6 +204,11 @@ class DatasetHandle:
 
     def _create(self, request: RefCreate) -> Ref:
         return self.transport.post(Ref, f"{self.url}/refs", request)
+
+    def move_branch(self, name: str, to: str) -> Ref:
+        """Move a branch to any version; the commits that it had stay."""
+        body = as_json(RefMove(at=to))
+        return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=ANY_STATE))
 
     def delete_ref(self, name: str) -> None:
         """Delete a branch or a tag; the commits stay."""

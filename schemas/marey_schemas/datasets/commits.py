@@ -100,3 +100,21 @@ class Entry(Answer):
     tags: tuple[str, ...]
     item: str | None = Field(description="Item of this project that has a revision with this content.")
     revision: int | None
+
+
+class Origin(Answer):
+    """Commit that gave an entry one of its parts."""
+
+    commit: Commit
+    path: str = Field(description="Path of the entry in that commit; it may have been moved since.")
+    certain: bool = Field(description="Whether the commit made the change; false: it or an earlier one did.")
+
+
+class EntryOrigins(Answer):
+    """Origins of the content of an entry."""
+
+    path: str
+    kind: Kind
+    parts: dict[str, Origin] = Field(description="The commit that last changed each part.")
+    place: Origin = Field(description="The commit that added the entry, or moved it to its path.")
+    tags: Origin = Field(description="The commit that last changed the tags.")

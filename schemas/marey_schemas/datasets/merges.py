@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
@@ -33,17 +33,33 @@ class Resolution(Request):
     take: Side
 
 
-class MergeRequest(Request):
-    """Request to merge a version into a branch."""
+class CombineRequest(Request):
+    """Request to change a branch by what other commits have changed."""
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
-    version: Version = Field(description="Version whose changes are merged into the branch.")
-    message: Message = Field("", description="Message of the commit; empty: a sentence that names both versions.")
+    message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
     preview: bool = Field(False, description="Compute the result without recording it.")
     expected: Digest | None = Field(None, description="Commit that the branch must be at.")
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
-        None, description="Name that the client chooses for this merge; a repeated request gets the same commit."
+        None, description="Name that the client chooses for this change; a repeated request gets the same commit."
+    )
+
+
+class MergeRequest(CombineRequest):
+    """Request to merge a version into a branch."""
+
+    version: Version = Field(description="Version whose changes are merged into the branch.")
+
+
+class PickRequest(CombineRequest):
+    """Request to repeat or undo on a branch what one commit has changed."""
+
+    version: Version = Field(description="Commit whose changes are repeated or undone.")
+    parent: Literal[1, 2] | None = Field(
+        None,
+        description="For a merge: the parent with which the commit is compared to find its changes; 1: the branch that "
+        "the merge changed.",
     )
 
 
@@ -62,12 +78,14 @@ class EntryConflict(Answer):
 
 
 class MergeAnswer(Answer):
-    """Result of a merge, or of its preview."""
+    """Result of a merge, of repeated or undone changes, or of a preview of these."""
 
     commit: Commit | None = Field(description="New commit of the branch; null for a preview and for conflicts.")
-    base: str | None = Field(description="Digest of the common commit from which both sides started.")
+    base: str | None = Field(description="Digest of the commit with which both sides are compared.")
     ours: str = Field(description="Digest of the newest commit of the branch.")
-    theirs: str = Field(description="Digest of the commit that is merged.")
+    theirs: str | None = Field(
+        description="Digest of the commit whose content is merged into the branch; null: before the first commit."
+    )
     changes: int = Field(description="Number of entries of the branch that change.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts without a resolution, by path.")
     conflict_count: int = Field(description="Number of conflicts without a resolution.")

@@ -61,6 +61,12 @@ class RefCreate(Request):
     at: Version = Field(MAIN, description="Version that the new branch or tag names.")
 
 
+class RefMove(Request):
+    """Request to move a branch to another version."""
+
+    at: Version = Field(description="Version that the branch names from now on.")
+
+
 class Ref(Answer):
     """A branch or a tag."""
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.datasets.commits import Commit, CommitCreate, Entry
+from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryOrigins, EntryPath
 from marey_schemas.datasets.differences import DatasetDifference
-from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, Version
+from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, PickRequest
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefMove, Version
+from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath
 from marey_schemas.sizes import MIB
 from marey_server.http.declarations import Access, RequestBody, reads, writes
@@ -83,6 +84,12 @@ class DatasetRef(Resource):
     path = "/projects/{project}/datasets/{dataset}/refs/{ref}"
     tag = "ProjectDatasets"
 
+    @writes(access=Access.MAINTAINER, body=RefMove, answer=Ref, etag=True, precondition="required")
+    async def patch(self, project: str, dataset: str, ref: str, body: RefMove) -> Rendered:
+        """Move a branch to any version of the dataset; the commits that it had stay."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(datasets.move_branch, project, dataset, ref, body, expected_rev=expected_rev)
+
     @writes(access=Access.MAINTAINER, precondition="required")
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
         """Delete a branch or a tag; the commits stay."""
@@ -94,6 +101,11 @@ class CommitsQuery(PageQuery):
     """Query of a list of commits."""
 
     version: Version = Field(MAIN, description="Version at which the list begins.")
+    path: CollectionPath = Field(
+        "",
+        description="Entry or folder: only commits that changed it or anything below it are listed. A page may then "
+        "be shorter than its limit although others follow.",
+    )
 
 
 class DatasetCommits(Resource):
@@ -106,7 +118,13 @@ class DatasetCommits(Resource):
     async def get(self, project: str, dataset: str, query: CommitsQuery) -> Rendered:
         """List a version and the versions before it, newest first."""
         return await self.answer(
-            datasets.list_commits, project, dataset, query.version, cursor=query.cursor, limit=query.limit
+            datasets.list_commits,
+            project,
+            dataset,
+            query.version,
+            path=query.path,
+            cursor=query.cursor,
+            limit=query.limit,
         )
 
     @writes(
@@ -140,6 +158,48 @@ class DatasetMerges(Resource):
         Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
         """
         merge = await self.look_up(datasets.prepare_merge, project, dataset, body)
+        return await self.answer(datasets.record_merge, project, dataset, body, merge)
+
+
+class CherryPicks(Resource):
+    """Changes of single commits that are repeated on branches."""
+
+    path = "/projects/{project}/datasets/{dataset}/cherry-picks"
+    tag = "ProjectDatasets"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(PickRequest, max_bytes=MAX_COMMIT_BYTES),
+        answer=MergeAnswer,
+        idempotency="key",
+    )
+    async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
+        """Repeat on a branch what one commit has changed, or preview the result.
+
+        Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
+        """
+        merge = await self.look_up(datasets.prepare_pick, project, dataset, body, undo=False)
+        return await self.answer(datasets.record_merge, project, dataset, body, merge)
+
+
+class DatasetReverts(Resource):
+    """Changes of single commits that are undone on branches."""
+
+    path = "/projects/{project}/datasets/{dataset}/reverts"
+    tag = "ProjectDatasets"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(PickRequest, max_bytes=MAX_COMMIT_BYTES),
+        answer=MergeAnswer,
+        idempotency="key",
+    )
+    async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
+        """Undo on a branch what one commit has changed, or preview the result. Later changes stay.
+
+        Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
+        """
+        merge = await self.look_up(datasets.prepare_pick, project, dataset, body, undo=True)
         return await self.answer(datasets.record_merge, project, dataset, body, merge)
 
 
@@ -198,6 +258,28 @@ class DatasetEntries(Resource):
         )
 
 
+class BlameQuery(Request):
+    """Query of the origins of an entry's content."""
+
+    version: Version = Field(MAIN, description="Version that has the entry.")
+    entry: EntryPath = Field(description="Path of the entry.")
+    kind: Kind = Field(description="Kind of the entry.")
+
+
+class EntryBlame(Resource):
+    """Origins of the content of an entry."""
+
+    path = "/projects/{project}/datasets/{dataset}/blame"
+    tag = "ProjectDatasets"
+
+    @reads(access=Access.READER, query=BlameQuery, answer=EntryOrigins)
+    async def get(self, project: str, dataset: str, query: BlameQuery) -> Rendered:
+        """Return the commits that last changed the parts, the path and the tags of an entry."""
+        return await self.answer(
+            datasets.read_origins, project, dataset, query.version, path=query.entry, kind=query.kind
+        )
+
+
 class DifferenceQuery(Request):
     """Query of the difference of two versions."""
 
@@ -227,8 +309,11 @@ RESOURCES: tuple[type[Resource], ...] = (
     DatasetRef,
     DatasetCommits,
     DatasetMerges,
+    CherryPicks,
+    DatasetReverts,
     FolderCheckout,
     DatasetCommit,
     DatasetEntries,
+    EntryBlame,
     VersionDifference,
 )

@@ -68,7 +68,11 @@ def test_a_difference_lists_the_keys_whose_values_differ(
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(differences, "COMPARED_TOGETHER", together)
-        assert [tuple(one) for one in difference(store, root, change(store, root, changes))] == expected
+        other = change(store, root, changes)
+        assert [tuple(one) for one in difference(store, root, other)] == expected
+        for prefix in ("a", "ab", "b/", "\U0001f600"):
+            inside = [one for one in expected if one[0].startswith(prefix)]
+            assert [tuple(one) for one in difference(store, root, other, prefix=prefix)] == inside
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -125,6 +129,9 @@ def test_one_change_reads_and_writes_few_chunks() -> None:
     store.loaded = 0
     assert len(list(difference(store, root, other))) == 1
     assert store.loaded < 12
+    store.loaded = 0
+    assert not list(difference(store, root, other, prefix="take-2"))
+    assert store.loaded < 6
 
 
 def test_no_key_makes_a_chunk_without_end(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import NamedTuple
 
 from marey_versions.tree.chunks import Branch, Child, ChunkStore, Leaf, Value
-from marey_versions.tree.reading import ChunkReader
+from marey_versions.tree.reading import ChunkReader, after_all_with
 
 COMPARED_TOGETHER = 256
 """Number of chunks of one level and one tree that are compared at once; it limits the memory."""
@@ -21,11 +22,29 @@ class Changed(NamedTuple):
     after: Value | None
 
 
-def difference(store: ChunkStore, before: str, after: str) -> Iterator[Changed]:
-    """Return the keys whose values differ in the trees with the given roots, sorted."""
-    reader = ChunkReader(store)
+def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, prefix: str = "") -> Iterator[Changed]:
+    """Return the keys that start with `prefix` and whose values differ in the trees with the given roots, sorted.
+
+    Comparisons with one reader share the chunks that it remembers.
+    """
+    changes = _difference(
+        ChunkReader.of(store), before, after, KeyRange(_before_all_with(prefix), after_all_with(prefix))
+    )
+    return (one for one in changes if one.key.startswith(prefix))
+
+
+def _before_all_with(prefix: str) -> str | None:
+    """Return a text that is less than all texts with the prefix, but greater than most others that are less."""
+    if not prefix:
+        return None
+    last = ord(prefix[-1])
+    return prefix[:-1] + (chr(last - 1) + chr(sys.maxunicode) if last else "")
+
+
+def _difference(reader: ChunkReader, before: str, after: str, within: KeyRange) -> Iterator[Changed]:
+    if before == after:
+        return iter(())
     pair = [reader.one(before), reader.one(after)]
-    level = max(chunk.level for chunk in pair)
     sides = [[Child(chunk.last_key, root, chunk.count)] for chunk, root in zip(pair, (before, after), strict=True)]
     levels = [chunk.level for chunk in pair]
     while max(levels) != min(levels):
@@ -33,7 +52,7 @@ def difference(store: ChunkStore, before: str, after: str) -> Iterator[Changed]:
         sides[higher] = _expanded(reader, sides[higher], levels[higher])
         levels[higher] -= 1
     level = levels[0]
-    return _compare(reader, level, sides[0], sides[1], KeyRange(None, None))
+    return _compare(reader, level, sides[0], sides[1], within)
 
 
 class KeyRange(NamedTuple):

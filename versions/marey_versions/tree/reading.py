@@ -29,6 +29,11 @@ class ChunkReader:
         self._store = store
         self._known: dict[str, Chunk] = {}
 
+    @classmethod
+    def of(cls, store: ChunkStore | ChunkReader) -> ChunkReader:
+        """Return the given reader, or a new one for a store."""
+        return store if isinstance(store, ChunkReader) else cls(store)
+
     def one(self, digest: str) -> Chunk:
         """Return a chunk. Raises `DamagedChunk`."""
         return self.several([digest])[0]
@@ -61,11 +66,11 @@ class ChunkReader:
 
 
 class Tree:
-    """Tree with a given root, to be read."""
+    """Tree with a given root, to be read. Trees with one reader share the chunks that it remembers."""
 
-    def __init__(self, store: ChunkStore, root: str) -> None:
+    def __init__(self, store: ChunkStore | ChunkReader, root: str) -> None:
         self.root = root
-        self._reader = ChunkReader(store)
+        self._reader = ChunkReader.of(store)
 
     def __len__(self) -> int:
         """Return the number of entries."""
@@ -108,7 +113,7 @@ class Tree:
 
     def count(self, prefix: str = "") -> int:
         """Return the number of entries whose keys start with `prefix`."""
-        until = _after_all_with(prefix)
+        until = after_all_with(prefix)
         return (len(self) if until is None else self._rank(until)) - (self._rank(prefix) if prefix else 0)
 
     def _rank(self, key: str) -> int:
@@ -150,7 +155,7 @@ def _spread(chunk: Branch, keys: Sequence[str]) -> Iterator[tuple[Child, Sequenc
         start = until
 
 
-def _after_all_with(prefix: str) -> str | None:
+def after_all_with(prefix: str) -> str | None:
     """Return the least text that is greater than all texts with the prefix; None if there is none."""
     for place in range(len(prefix) - 1, -1, -1):
         following = ord(prefix[place]) + 1

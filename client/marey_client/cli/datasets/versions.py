@@ -3,66 +3,30 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from marey_client.cli.datasets import combining
+from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, ProjectName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from marey_client.handles.datasets import DatasetHandle
-    from marey_client.marey import Marey
-    from marey_schemas.datasets.commits import Commit
+    from marey_schemas.datasets.commits import Commit, Origin
     from marey_schemas.datasets.differences import EntryDifference
-    from marey_schemas.datasets.merges import MergeAnswer, Resolution
 
 dataset = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Versions of datasets: commits, branches, tags, differences."
 )
 
-SHOWN_DIGITS = 12
-"""Number of digits of a commit's digest that tables show."""
-
-DatasetPlace = Annotated[str, typer.Argument(metavar="PROJECT/DATASET", help="Dataset, such as lab/gaits.")]
-VersionPlace = Annotated[
-    str,
-    typer.Argument(
-        metavar="PROJECT/DATASET[@VERSION]",
-        help="Dataset and version, such as lab/gaits@v1: a branch, a tag or a commit, with ~n for n commits earlier. "
-        "Default: @main.",
-    ),
-]
-
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module."""
+    """Register the commands of this module, and those that combine changes."""
+    combining.add_to(dataset)
     app.add_typer(dataset, name="dataset")
-
-
-class _Place(NamedTuple):
-    """Dataset and version that an argument names."""
-
-    project: str
-    dataset: str
-    version: str
-
-    def on(self, marey: Marey) -> DatasetHandle:
-        return marey.project(self.project).datasets.at(self.dataset)
-
-
-def _parse(text: str, *, version: bool = False) -> _Place:
-    place, at, named = text.partition("@")
-    project, _, name = place.strip("/").partition("/")
-    if not project or not name or "/" in name or (at and not named):
-        raise WrongUsage(f"{text!r} names no dataset; write project/dataset, such as lab/gaits")
-    if at and not version:
-        raise WrongUsage(f"{text!r} names a version, but this command works on the dataset; write {place}")
-    return _Place(project, name, named or "main")
 
 
 @dataset.command("create")
@@ -79,7 +43,7 @@ def create_dataset(
     as_json: AsJson = False,
 ) -> None:
     """Create a dataset. Its commits record the content of a folder of the project."""
-    at = _parse(place)
+    at = parse(place)
     with connect(context) as marey:
         handle = marey.project(at.project).datasets.create(
             at.dataset, collection=(folder or at.dataset).strip("/"), description=description
@@ -110,35 +74,38 @@ def commit(
     as_json: AsJson = False,
 ) -> None:
     """Record the present content of the dataset's folder as a new version."""
-    at = _parse(place)
+    at = parse(place)
     with connect(context) as marey:
         made = at.on(marey).commit(message, branch=branch)
     if as_json:
         return print_json(made)
-    return print_message(f"{branch} is at {_short(made.digest)} now, with {counted(made.entries, 'entry')}")
+    return print_message(f"{branch} is at {short(made.digest)} now, with {counted(made.entries, 'entry')}")
 
 
 @dataset.command("log")
 def log(
     context: typer.Context,
     place: VersionPlace,
+    path: Annotated[
+        str, typer.Option(help="Entry or folder: list only versions that changed it or anything below it.")
+    ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,
     as_json: AsJson = False,
 ) -> None:
     """List a version and the versions before it, newest first."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
-        found = list(islice(at.on(marey).log(at.version), most))
+        found = list(islice(at.on(marey).log(at.version, path=path.strip("/")), most))
     if as_json:
         return print_json(found)
-    rows = [(_short(one.digest), one.at, one.author, one.entries, one.message) for one in found]
+    rows = [(short(one.digest), one.at, one.author, one.entries, one.message) for one in found]
     return print_table(("commit", "time", "author", "entries", "message"), rows, right=("entries",))
 
 
 @dataset.command("show")
 def show(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -> None:
     """Show the commit that a version names."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).at(at.version)
     if as_json:
@@ -154,7 +121,7 @@ def entries(
     as_json: AsJson = False,
 ) -> None:
     """List the entries of a version by path."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
         found = list(at.on(marey).entries(at.version, path=path.strip("/")))
     if as_json:
@@ -166,12 +133,12 @@ def entries(
 @dataset.command("refs")
 def refs(context: typer.Context, place: DatasetPlace, as_json: AsJson = False) -> None:
     """List the branches and tags of a dataset."""
-    at = _parse(place)
+    at = parse(place)
     with connect(context) as marey:
         found = list(at.on(marey).refs())
     if as_json:
         return print_json(found)
-    rows = [(one.name, one.kind, _short(one.commit), one.updated_at) for one in found]
+    rows = [(one.name, one.kind, short(one.commit), one.updated_at) for one in found]
     return print_table(("name", "kind", "commit", "changed"), rows)
 
 
@@ -182,10 +149,10 @@ def branch(
     name: Annotated[str, typer.Argument(help="Name of the new branch.")],
 ) -> None:
     """Create a branch at a version."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).create_branch(name, at.version)
-    print_message(f"branch {made.name} is at {_short(made.commit)}")
+    print_message(f"branch {made.name} is at {short(made.commit)}")
 
 
 @dataset.command("tag")
@@ -195,10 +162,52 @@ def tag(
     name: Annotated[str, typer.Argument(help="Name of the new tag.")],
 ) -> None:
     """Create a tag at a version; it never moves."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).create_tag(name, at.version)
-    print_message(f"tag {made.name} is at {_short(made.commit)}")
+    print_message(f"tag {made.name} is at {short(made.commit)}")
+
+
+@dataset.command("reset")
+def reset(
+    context: typer.Context,
+    place: VersionPlace,
+    name: Annotated[str, typer.Argument(help="Branch to move.")],
+) -> None:
+    """Move a branch to a version, also to an earlier one. The commits that it had stay."""
+    at = parse(place, version=True)
+    with connect(context) as marey:
+        moved = at.on(marey).move_branch(name, at.version)
+    print_message(f"branch {moved.name} is at {short(moved.commit)} now")
+
+
+@dataset.command("blame")
+def blame(
+    context: typer.Context,
+    place: VersionPlace,
+    path: Annotated[str, typer.Argument(help="Path of an entry.")],
+    kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
+    as_json: AsJson = False,
+) -> None:
+    """List who last changed each part of an entry, its tags and its path."""
+    from marey_schemas.kinds import Kind
+
+    at = parse(place, version=True)
+    if kind not in list(Kind):
+        raise WrongUsage(f"{kind!r} is no kind; the kinds are {', '.join(Kind)}")
+    with connect(context) as marey:
+        found = at.on(marey).blame(path.strip("/"), Kind(kind), at.version)
+    if as_json:
+        return print_json(found)
+    origins = {**found.parts, "tags": found.tags, "path": found.place}
+    rows = [_origin_row(name, one, found.path) for name, one in origins.items()]
+    return print_table(("part", "commit", "time", "author", "message", "note"), rows)
+
+
+def _origin_row(name: str, one: Origin, path: str) -> tuple[object, ...]:
+    notes = [] if one.path == path else [f"then {one.path}"]
+    notes += [] if one.certain else ["or an earlier commit"]
+    return name, short(one.commit.digest), one.commit.at, one.commit.author, one.commit.message, ", ".join(notes)
 
 
 @dataset.command("diff")
@@ -212,7 +221,7 @@ def diff(
     as_json: AsJson = False,
 ) -> None:
     """List the entries that were added, removed, moved or changed between two versions."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     before, later = (f"{at.version}~1", at.version) if after is None else (at.version, after)
     with connect(context) as marey:
         found = at.on(marey).difference(before, later, limit=most)
@@ -222,7 +231,7 @@ def diff(
         ("change", "kind", "path", "what"), [(one.change, one.kind, one.path, _what(one)) for one in found.entries]
     )
     counts = ", ".join(f"{count:,} {change}" for change, count in sorted(found.counts.items()))
-    return print_message(f"{_short(found.before.digest)} to {_short(found.after.digest)}: {counts or 'no difference'}")
+    return print_message(f"{short(found.before.digest)} to {short(found.after.digest)}: {counts or 'no difference'}")
 
 
 @dataset.command("checkout")
@@ -235,86 +244,13 @@ def checkout(
     as_json: AsJson = False,
 ) -> None:
     """Give the folder of a dataset the entries of a version. Removed items can be restored."""
-    at = _parse(place, version=True)
+    at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).check_out(at.version, discard=discard)
     if as_json:
         return print_json(found)
     counts = ", ".join(f"{count:,} {name}" for name, count in found.model_dump(exclude={"commit"}).items() if count)
-    return print_message(f"the folder has the entries of {_short(found.commit)} now: {counts or 'nothing differed'}")
-
-
-@dataset.command("merge")
-def merge(
-    context: typer.Context,
-    place: VersionPlace,
-    into: Annotated[str, typer.Option(help="Branch that gets the changes.")] = "main",
-    message: Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")] = "",
-    preview: Annotated[bool, typer.Option("--preview", help="Show the result without recording it.")] = False,
-    ours: Annotated[
-        list[str] | None, typer.Option(metavar="PATH:KIND", help="Conflict in which the branch wins; can be repeated.")
-    ] = None,
-    theirs: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATH:KIND", help="Conflict in which the merged version wins; can be repeated."),
-    ] = None,
-    base: Annotated[
-        list[str] | None,
-        typer.Option(metavar="PATH:KIND", help="Conflict in which the entry stays as before both; can be repeated."),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Merge a version into a branch. Changes of different parts of one entry are combined.
-
-    If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base. In that case, the exit status is 1.
-    """
-    from marey_client.errors import Conflict
-    from marey_schemas.datasets.merges import MergeAnswer
-
-    at = _parse(place, version=True)
-    resolutions = [*_resolutions(ours, "ours"), *_resolutions(theirs, "theirs"), *_resolutions(base, "base")]
-    with connect(context) as marey:
-        try:
-            found = at.on(marey).merge(at.version, into=into, message=message, resolutions=resolutions, preview=preview)
-        except Conflict as error:
-            if error.code != "merge-conflicts":
-                raise
-            found = MergeAnswer.model_validate(error.context)
-    if as_json:
-        print_json(found)
-    else:
-        _print_merge(found, into)
-    if found.conflict_count:
-        raise typer.Exit(1)
-
-
-def _resolutions(places: Sequence[str] | None, side: str) -> list[Resolution]:
-    from marey_schemas.datasets.merges import Resolution
-
-    found = []
-    for place in places or ():
-        path, colon, kind = place.rpartition(":")
-        if not colon:
-            raise WrongUsage(f"{place!r} names no kind; write path:kind, such as raw/walk:clip")
-        found.append(Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side}))
-    return found
-
-
-def _print_merge(found: MergeAnswer, into: str) -> None:
-    if found.conflict_count:
-        rows = [(one.path, one.kind, ", ".join(one.parts)) for one in found.conflicts]
-        print_table(("conflict", "kind", "changed on both sides"), rows)
-        print_message(
-            f"{counted(found.conflict_count, 'conflict')}; nothing is merged. Decide each by --ours, --theirs or --base"
-        )
-    elif found.commit is None:
-        print_message(f"{counted(found.changes, 'entry')} of {into} would change, without conflicts")
-    else:
-        print_message(
-            f"{into} is at {_short(found.commit.digest)} now; {counted(found.changes, 'entry')} changed. "
-            "marey dataset checkout gives the folder its entries"
-        )
+    return print_message(f"the folder has the entries of {short(found.commit)} now: {counts or 'nothing differed'}")
 
 
 def _what(one: EntryDifference) -> str:
@@ -336,7 +272,3 @@ def _pairs(one: Commit) -> list[tuple[str, object]]:
         ("tree", one.tree),
         ("message", one.message),
     ]
-
-
-def _short(digest: str | None) -> str | None:
-    return None if digest is None else digest.partition(":")[2][:SHOWN_DIGITS]

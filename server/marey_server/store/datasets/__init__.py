@@ -2,8 +2,8 @@
 
 from marey_server.store.datasets.checkout import check_out
 from marey_server.store.datasets.committing import PreparedCommit, prepare_commit, record_commit
-from marey_server.store.datasets.history import compare_versions, list_commits, list_entries, read_commit
-from marey_server.store.datasets.merging import PreparedMerge, prepare_merge, record_merge
+from marey_server.store.datasets.history import compare_versions, list_commits, list_entries, read_commit, read_origins
+from marey_server.store.datasets.merging import PreparedMerge, prepare_merge, prepare_pick, record_merge
 from marey_server.store.datasets.naming import (
     create_dataset,
     create_ref,
@@ -11,6 +11,7 @@ from marey_server.store.datasets.naming import (
     delete_ref,
     list_datasets,
     list_refs,
+    move_branch,
     read_dataset,
 )
 
@@ -27,10 +28,13 @@ __all__ = [
     "list_datasets",
     "list_entries",
     "list_refs",
+    "move_branch",
     "prepare_commit",
     "prepare_merge",
+    "prepare_pick",
     "read_commit",
     "read_dataset",
+    "read_origins",
     "record_commit",
     "record_merge",
 ]

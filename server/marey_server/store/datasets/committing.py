@@ -23,7 +23,7 @@ from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.contents import Contents, find_contents_of, store_contents
 from marey_server.store.datasets.folders import read_folder, tags_of
 from marey_server.store.datasets.history import read_commit, tree_of
-from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
@@ -148,7 +148,7 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
     if ref is None:
         raise NotFoundProblem(f"The dataset has no branch {branch!r}.", code="no-version")
     if ref.kind != RefKind.BRANCH:
-        raise InvalidProblem(f"{branch!r} is a tag, which never moves; name a branch.", code="is-tag")
+        raise is_tag(branch)
     head: str | None = ref.digest
     if expected is not None and expected != head:
         raise _moved(branch, head)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
 from typing import Any
 
 from sqlalchemy import Row, literal, select
 
-from marey_schemas.datasets.commits import Commit, Entry
+from marey_schemas.datasets.commits import Commit, Entry, EntryOrigins, Origin
 from marey_schemas.datasets.differences import DatasetDifference, EntryDifference
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
@@ -21,10 +22,13 @@ from marey_server.store.datasets.naming import find_dataset, first_parents, reso
 from marey_server.store.tables import commit_parent, dataset_commit, item, revision
 from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.records import DatasetEntry, entry_of
+from marey_versions.origins import PATH, TAGS, find_origins
+from marey_versions.records import DatasetEntry, entry_of, key_of, path_and_kind
 from marey_versions.tree.difference import difference
-from marey_versions.tree.reading import Tree
+from marey_versions.tree.reading import ChunkReader, Tree
 
+MOST_EXAMINED = 1000
+"""Greatest number of commits that one request reads to find those that changed a path."""
 MOST_DIFFERENCES = 100_000
 """Greatest number of differing entries that are counted in one answer."""
 
@@ -68,25 +72,103 @@ def _parents(tx: Transaction, dataset_id: str, digests: Sequence[str]) -> dict[s
     return found
 
 
-def list_commits(tx: Transaction, project: str, name: str, version: str, *, cursor: str | None, limit: int) -> Page:
-    """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed."""
+def list_commits(
+    tx: Transaction, project: str, name: str, version: str, *, path: str, cursor: str | None, limit: int
+) -> Page:
+    """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
+
+    With `path`, list only the commits that changed the entries at this path or below it, compared with their first
+    parent. A page ends after `MOST_EXAMINED` commits, so it may be shorter than `limit` although others follow.
+    """
     row = find_dataset(tx, projects.require(tx, project), name)
     order = listing.parse_order("place", {"place": literal(0)}, unique="place")
-    identity = ["commits", row.id, version]
+    identity = ["commits", row.id, version, path]
     start = resolve(tx, row.id, version) if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
-    chain = first_parents(row.id, start, limit)
+    chain = first_parents(row.id, start, MOST_EXAMINED if path else limit)
     found = tx.execute(
         select(dataset_commit)
         .join(chain, chain.c.digest == dataset_commit.c.digest)
         .where(dataset_commit.c.dataset_id == row.id)
         .order_by(chain.c.place)
     ).all()
-    parents = _parents(tx, row.id, [one.digest for one in found])
-    shown = [_shown(one, parents.get(one.digest, ())) for one in found]
-    following = None
-    if len(shown) > limit:
-        following = listing.make_cursor(tx, order, identity, [shown[limit].digest])
-    return Page(items=tuple(shown[:limit]), next_cursor=following)
+    chosen, following = _changing(tx, found, path, limit) if path else (found[:limit], found[limit:][:1])
+    parents = _parents(tx, row.id, [one.digest for one in chosen])
+    return Page(
+        items=tuple(_shown(one, parents.get(one.digest, ())) for one in chosen),
+        next_cursor=listing.make_cursor(tx, order, identity, [following[0].digest]) if following else None,
+    )
+
+
+def _changing(
+    tx: Transaction, chain: Sequence[Row[Any]], path: str, limit: int
+) -> tuple[list[Row[Any]], Sequence[Row[Any]]]:
+    """Return the commits of a chain that changed a path, and the one, if any, at which the next page begins."""
+    reader = ChunkReader(StoredChunks(tx))
+    found: list[Row[Any]] = []
+    for place, one in enumerate(chain[:MOST_EXAMINED]):
+        if len(found) == limit:
+            return found, [one]
+        before = chain[place + 1].tree if place + 1 < len(chain) else None
+        if _path_differs(reader, before, one.tree, path):
+            found.append(one)
+    return found, chain[MOST_EXAMINED:]
+
+
+def _path_differs(reader: ChunkReader, before: str | None, after: str, path: str) -> bool:
+    prefixes = (key_of(path, ""), f"{path}/")
+    if before is None:
+        return any(Tree(reader, after).count(prefix) for prefix in prefixes)
+    return any(next(difference(reader, before, after, prefix=prefix), None) for prefix in prefixes)
+
+
+def read_origins(tx: Transaction, project: str, name: str, version: str, *, path: str, kind: Kind) -> EntryOrigins:
+    """Return the commits that last changed the parts, the path and the tags of an entry.
+
+    Raises `NotFoundProblem` if the version does not have the entry.
+    """
+    row = find_dataset(tx, projects.require(tx, project), name)
+    start, key = resolve(tx, row.id, version), key_of(path, kind)
+    reader = ChunkReader(StoredChunks(tx))
+    if Tree(reader, tree_of(tx, row.id, start)).get(key) is None:
+        raise NotFoundProblem(f"The version has no {kind.value} at {path!r}.", code="no-entry")
+    known: dict[str, _ReadCommit] = {}
+
+    def commit_of(digest: str) -> _ReadCommit:
+        if digest not in known:
+            known[digest] = _read(tx, row.id, digest)
+        return known[digest]
+
+    found = {
+        part: Origin(
+            commit=_shown(known[one.commit].row, known[one.commit].parents),
+            path=path_and_kind(one.key)[0],
+            certain=one.certain,
+        )
+        for part, one in find_origins(reader, commit_of, start, key, most=MOST_EXAMINED).items()
+    }
+    return EntryOrigins(path=path, kind=kind, place=found.pop(PATH), tags=found.pop(TAGS), parts=found)
+
+
+@dataclass(frozen=True)
+class _ReadCommit:
+    """Commit of the database, as a search for origins reads it."""
+
+    row: Row[Any]
+    parents: Sequence[str]
+
+    @property
+    def tree(self) -> str:
+        return str(self.row.tree)
+
+    @property
+    def generation(self) -> int:
+        return int(self.row.generation)
+
+
+def _read(tx: Transaction, dataset_id: str, digest: str) -> _ReadCommit:
+    of_dataset = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == digest)
+    row = tx.execute(select(dataset_commit).where(*of_dataset)).one()
+    return _ReadCommit(row, _parents(tx, dataset_id, [digest]).get(digest, ()))
 
 
 # -- entries ----------------------------------------------------------------------------------------------------------

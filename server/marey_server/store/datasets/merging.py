@@ -1,20 +1,29 @@
-"""Merges of versions into branches."""
+"""Merges of versions into branches, and changes of single commits that are repeated or undone."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Row, select
 
-from marey_schemas.datasets.merges import MOST_CONFLICTS, EntryConflict, MergeAnswer, MergeRequest
+from marey_schemas.datasets.commits import Commit
+from marey_schemas.datasets.merges import (
+    MOST_CONFLICTS,
+    CombineRequest,
+    EntryConflict,
+    MergeAnswer,
+    MergeRequest,
+    PickRequest,
+)
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.committing import PreparedCommit, head_of, record_commit, recorded_as
-from marey_server.store.datasets.history import revisions_with, shown_entry, tree_of
+from marey_server.store.datasets.history import read_commit, revisions_with, shown_entry, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.tables import commit_parent
 from marey_server.store.transaction import Transaction
@@ -43,53 +52,102 @@ def prepare_merge(tx: Transaction, project: str, name: str, request: MergeReques
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
-    recorded = recorded_as(tx, found.id, request.write_id)
-    ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
     theirs = resolve(tx, found.id, request.version)
-    if ours is None:
-        raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
-    message = request.message or f"Merge {request.version} into {request.into}"
-    commit = PreparedCommit(found.id, request.into, ours, (ours, theirs), message, request.write_id, recorded=recorded)
-    answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
-    if recorded is not None:
-        return PreparedMerge(answer, commit)
+    started = _start(tx, found, request, theirs, f"Merge {request.version} into {request.into}")
+    if started.commit.recorded is not None:
+        return started
+    ours = started.answer.ours
     base = _common(tx, found.id, ours, theirs)
     if base == theirs:
         raise InvalidProblem(
             f"The branch {request.into!r} already has all commits of {request.version!r}.", code="already-merged"
         )
-    return _merge(tx, project_row.id, request, answer.model_copy(update={"base": base}), commit)
+    answer = started.answer.model_copy(update={"base": base})
+    commit = replace(started.commit, parents=(ours, theirs), existing=theirs if base == ours else None)
+    return _combine(tx, project_row.id, request, PreparedMerge(answer, commit))
 
 
-def _merge(
-    tx: Transaction, project_id: str, request: MergeRequest, answer: MergeAnswer, commit: PreparedCommit
+def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest, *, undo: bool) -> PreparedMerge:
+    """Compute the version of a branch in which the changes of one commit are repeated, or undone.
+
+    It is a merge of the commit into the branch whose base is the parent of the commit; `undo` exchanges the two. Raises
+    `InvalidProblem` for a merge without a choice of its parent, and if the branch would not change.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    picked = read_commit(tx, project, name, request.version)
+    before = _parent_of(picked, request.parent)
+    base, theirs = (picked.digest, before) if undo else (before, picked.digest)
+    first_line = picked.message.partition("\n")[0][:100]
+    started = _start(tx, found, request, theirs, f"Revert {first_line!r}" if undo else picked.message)
+    if started.commit.recorded is not None:
+        return started
+    merge = _combine(
+        tx, project_row.id, request, replace(started, answer=started.answer.model_copy(update={"base": base}))
+    )
+    if not merge.answer.changes and not merge.answer.conflict_count:
+        raise InvalidProblem(f"The branch {request.into!r} would not change.", code="no-changes")
+    return merge
+
+
+def _parent_of(picked: Commit, parent: int | None) -> str | None:
+    if parent is None and len(picked.parents) > 1:
+        raise InvalidProblem(
+            "The commit is a merge. Choose the parent with which it is compared: 1, the branch that the merge changed, "
+            "or 2, the version that was merged.",
+            code="is-merge",
+        )
+    if parent is not None and parent > max(1, len(picked.parents)):
+        raise InvalidProblem(f"The commit has no parent {parent}.", code="no-parent")
+    return picked.parents[(parent or 1) - 1] if picked.parents else None
+
+
+def _start(
+    tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
+    """Return a merge that is not computed yet; it is finished if an earlier request has recorded it."""
+    recorded = recorded_as(tx, found.id, request.write_id)
+    ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
+    if ours is None:
+        raise InvalidProblem(f"The branch {request.into!r} has no commits yet.", code="no-commits")
+    commit = PreparedCommit(
+        found.id, request.into, ours, (ours,), request.message or message, request.write_id, recorded=recorded
+    )
+    answer = MergeAnswer(commit=None, base=None, ours=ours, theirs=theirs, changes=0, conflicts=(), conflict_count=0)
+    return PreparedMerge(answer, commit)
+
+
+def _combine(tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge) -> PreparedMerge:
+    """Merge what differs between the base and theirs into ours."""
     store = StoredChunks(tx)
-    trees = {digest: tree_of(tx, commit.dataset_id, digest) for digest in {answer.base, *commit.parents} if digest}
-    base = build(store, []) if answer.base is None else trees[answer.base]
-    mine, their = (_changed(store, base, trees[one]) for one in commit.parents)
+    answer, commit = started.answer, started.commit
+    base, ours, theirs = (
+        build(store, []) if one is None else tree_of(tx, commit.dataset_id, one)
+        for one in (answer.base, answer.ours, answer.theirs)
+    )
     resolutions = {key_of(one.path, one.kind): one.take for one in request.resolutions}
-    merged = merge_entries(mine, their, resolutions)
+    merged = merge_entries(_changed(store, base, ours), _changed(store, base, theirs), resolutions)
     if unknown := sorted(resolutions.keys() - merged.decided):
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(f"There is no conflict at {path!r} of the kind {kind} to decide.", code="no-conflict")
-    tree = change(store, trees[answer.ours], merged.changes)
+    tree = change(store, ours, merged.changes)
     held = revisions_with(tx, project_id, _contents(merged.conflicts))
     conflicts = sorted(merged.conflicts, key=lambda one: one.key)
     answer = answer.model_copy(
         update={
-            "changes": len(_changed(store, trees[answer.ours], tree)),
+            "changes": len(_changed(store, ours, tree)),
             "conflicts": tuple(_shown(one, held) for one in conflicts[:MOST_CONFLICTS]),
             "conflict_count": len(conflicts),
         }
     )
-    existing = answer.theirs if answer.base == answer.ours else None
     entries = len(Tree(store, tree))
-    return PreparedMerge(answer, replace(commit, tree=tree, entries=entries, chunks=store.new, existing=existing))
+    return PreparedMerge(answer, replace(commit, tree=tree, entries=entries, chunks=store.new))
 
 
-def record_merge(tx: Transaction, project: str, name: str, request: MergeRequest, merge: PreparedMerge) -> MergeAnswer:
-    """Record a merge, unless it is a preview, and return the result.
+def record_merge(
+    tx: Transaction, project: str, name: str, request: CombineRequest, merge: PreparedMerge
+) -> MergeAnswer:
+    """Record the result of a merge or of picked changes, unless it is a preview, and return it.
 
     Raises `ConflictProblem` if there are conflicts without a resolution, or if the branch has moved.
     """

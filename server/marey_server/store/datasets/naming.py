@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import CTE, Row, delete, func, insert, literal_column, select
 
-from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind
+from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
@@ -152,6 +152,30 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     made = find_ref(tx, row.id, request.name)
     assert made is not None
     return _shown_ref(made)
+
+
+def move_branch(
+    tx: Transaction, project: str, name: str, branch: str, request: RefMove, *, expected_rev: ExpectedRev
+) -> Ref:
+    """Move a branch to any version of the dataset; the commits that it had stay.
+
+    Raises `InvalidProblem` for a tag, and `PreconditionFailedProblem` if the branch has moved since it was read.
+    """
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    digest = resolve(tx, row.id, request.at)
+    which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == branch)
+    values = {"digest": digest, "updated_us": tx.now_us}
+    changed = change_row(tx, dataset_ref, which, values, expected_rev=expected_rev, absent=_no_version(branch))
+    if changed.kind != RefKind.BRANCH:
+        raise is_tag(branch)
+    tx.emit("branch.moved", row.id, project_id=project_row.id, branch=branch, commit=digest)
+    return _shown_ref(changed)
+
+
+def is_tag(name: str) -> InvalidProblem:
+    """Return the error for a tag where a branch is required."""
+    return InvalidProblem(f"{name!r} is a tag, which never moves; name a branch.", code="is-tag")
 
 
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:

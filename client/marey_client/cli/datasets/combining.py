@@ -1,0 +1,180 @@
+"""Dataset commands that change a branch by what other commits have changed: merge, cherry-pick and revert."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.datasets.places import NamedVersion, VersionPlace, parse, short
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_message, print_table
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from marey_client.handles.datasets import DatasetHandle, PickOptions
+    from marey_schemas.datasets.merges import MergeAnswer, Resolution
+
+Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
+CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]
+Preview = Annotated[bool, typer.Option("--preview", help="Show the result without recording it.")]
+Ours = Annotated[
+    list[str] | None, typer.Option(metavar="PATH:KIND", help="Conflict in which the branch wins; can be repeated.")
+]
+Theirs = Annotated[
+    list[str] | None,
+    typer.Option(metavar="PATH:KIND", help="Conflict in which the other version wins; can be repeated."),
+]
+Base = Annotated[
+    list[str] | None,
+    typer.Option(metavar="PATH:KIND", help="Conflict in which the entry stays as before both; can be repeated."),
+]
+Parent = Annotated[
+    int | None,
+    typer.Option(
+        min=1, max=2, help="For a merge: the parent with which it is compared; 1: the branch that the merge changed."
+    ),
+]
+
+
+def add_to(dataset: typer.Typer) -> None:
+    """Register the commands of this module."""
+    for command in (merge, cherry_pick, revert):
+        dataset.command()(command)
+
+
+def merge(
+    context: typer.Context,
+    place: VersionPlace,
+    into: Into = "main",
+    message: CommitMessage = "",
+    preview: Preview = False,
+    ours: Ours = None,
+    theirs: Theirs = None,
+    base: Base = None,
+    as_json: AsJson = False,
+) -> None:
+    """Merge a version into a branch. Changes of different parts of one entry are combined.
+
+    If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
+    --ours, --theirs or --base. In that case, the exit status is 1.
+    """
+    at = parse(place, version=True)
+    resolutions = _resolutions(ours, theirs, base)
+    _combine(
+        context, at, into, as_json,
+        lambda on: on.merge(at.version, into=into, message=message, resolutions=resolutions, preview=preview),
+    )  # fmt: skip
+
+
+def cherry_pick(
+    context: typer.Context,
+    place: VersionPlace,
+    into: Into = "main",
+    parent: Parent = None,
+    message: CommitMessage = "",
+    preview: Preview = False,
+    ours: Ours = None,
+    theirs: Theirs = None,
+    base: Base = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat on a branch what one commit has changed.
+
+    If the branch has changed the same part of an entry, nothing is recorded until each such conflict is decided by
+    --ours, --theirs or --base. In that case, the exit status is 1.
+    """
+    at = parse(place, version=True)
+    options = _pick_options(into, parent, message, preview, _resolutions(ours, theirs, base))
+    _combine(context, at, into, as_json, lambda on: on.cherry_pick(at.version, **options))
+
+
+def revert(
+    context: typer.Context,
+    place: VersionPlace,
+    into: Into = "main",
+    parent: Parent = None,
+    message: CommitMessage = "",
+    preview: Preview = False,
+    ours: Ours = None,
+    theirs: Theirs = None,
+    base: Base = None,
+    as_json: AsJson = False,
+) -> None:
+    """Undo on a branch what one commit has changed. Later changes stay.
+
+    If a later commit has changed the same part of an entry, nothing is recorded until each such conflict is decided by
+    --ours (the present content), --theirs (the content before the commit) or --base (the content of the commit). In
+    that case, the exit status is 1.
+    """
+    at = parse(place, version=True)
+    options = _pick_options(into, parent, message, preview, _resolutions(ours, theirs, base))
+    _combine(context, at, into, as_json, lambda on: on.revert(at.version, **options))
+
+
+def _pick_options(
+    into: str, parent: int | None, message: str, preview: bool, resolutions: Sequence[Resolution]
+) -> PickOptions:
+    options: PickOptions = {
+        "into": into, "message": message, "preview": preview, "resolutions": tuple(resolutions)
+    }  # fmt: skip
+    if parent is not None:
+        options["parent"] = 1 if parent == 1 else 2
+    return options
+
+
+def _combine(
+    context: typer.Context, at: NamedVersion, into: str, as_json: bool, change: Callable[[DatasetHandle], MergeAnswer]
+) -> None:
+    """Send a change of a branch and print its result; exit with 1 if there are conflicts."""
+    from marey_client.errors import Conflict
+    from marey_schemas.datasets.merges import MergeAnswer
+
+    with connect(context) as marey:
+        try:
+            found = change(at.on(marey))
+        except Conflict as error:
+            if error.code != "merge-conflicts":
+                raise
+            found = MergeAnswer.model_validate(error.context)
+    if as_json:
+        print_json(found)
+    else:
+        _print_result(found, into)
+    if found.conflict_count:
+        raise typer.Exit(1)
+
+
+def _resolutions(
+    ours: Sequence[str] | None, theirs: Sequence[str] | None, base: Sequence[str] | None
+) -> list[Resolution]:
+    from marey_schemas.datasets.merges import Resolution, Side
+
+    found = []
+    for side, places in ((Side.OURS, ours), (Side.THEIRS, theirs), (Side.BASE, base)):
+        for place in places or ():
+            path, colon, kind = place.rpartition(":")
+            if not colon:
+                raise WrongUsage(f"{place!r} names no kind; write path:kind, such as raw/walk:clip")
+            found.append(Resolution.model_validate({"path": path.strip("/"), "kind": kind, "take": side}))
+    return found
+
+
+def _print_result(found: MergeAnswer, into: str) -> None:
+    if found.conflict_count:
+        rows = [(one.path, one.kind, ", ".join(one.parts)) for one in found.conflicts]
+        print_table(("conflict", "kind", "changed on both sides"), rows)
+        print_message(
+            f"{counted(found.conflict_count, 'conflict')}; nothing is recorded. Decide each by --ours, "
+            "--theirs or --base"
+        )
+    elif found.commit is None:
+        print_message(f"{counted(found.changes, 'entry')} of {into} would change, without conflicts")
+    else:
+        print_message(
+            f"{into} is at {short(found.commit.digest)} now; {counted(found.changes, 'entry')} changed. "
+            "marey dataset checkout gives the folder its entries"
+        )

@@ -1,0 +1,54 @@
+"""Arguments of the dataset commands that name datasets and versions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from marey_client.cli.failures import WrongUsage
+
+if TYPE_CHECKING:
+    from marey_client.handles.datasets import DatasetHandle
+    from marey_client.marey import Marey
+
+SHOWN_DIGITS = 12
+"""Number of digits of a commit's digest that tables show."""
+
+DatasetPlace = Annotated[str, typer.Argument(metavar="PROJECT/DATASET", help="Dataset, such as lab/gaits.")]
+VersionPlace = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROJECT/DATASET[@VERSION]",
+        help="Dataset and version, such as lab/gaits@v1: a branch, a tag or a commit, with ~n for n commits earlier. "
+        "Default: @main.",
+    ),
+]
+
+
+class NamedVersion(NamedTuple):
+    """Dataset and version that an argument names."""
+
+    project: str
+    dataset: str
+    version: str
+
+    def on(self, marey: Marey) -> DatasetHandle:
+        """Return a handle of the dataset."""
+        return marey.project(self.project).datasets.at(self.dataset)
+
+
+def parse(text: str, *, version: bool = False) -> NamedVersion:
+    """Read an argument. Raises `WrongUsage` for a version if the command takes none."""
+    place, at, named = text.partition("@")
+    project, _, name = place.strip("/").partition("/")
+    if not project or not name or "/" in name or (at and not named):
+        raise WrongUsage(f"{text!r} names no dataset; write project/dataset, such as lab/gaits")
+    if at and not version:
+        raise WrongUsage(f"{text!r} names a version, but this command works on the dataset; write {place}")
+    return NamedVersion(project, name, named or "main")
+
+
+def short(digest: str | None) -> str | None:
+    """Return the first digits of a commit's digest."""
+    return None if digest is None else digest.partition(":")[2][:SHOWN_DIGITS]

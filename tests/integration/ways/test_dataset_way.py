@@ -1,0 +1,94 @@
+"""The way of a dataset as users walk it: the commands of the how-to page, on a real server."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.support.command_line import CommandLine
+
+from marey_client.handles.clips import ClipHandle
+from marey_client.project import ProjectHandle
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+
+pytestmark = pytest.mark.timeout(300)
+
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "version-a-dataset.md"
+
+
+@pytest.fixture
+def project(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
+    """A project with the clips `walk` and `turn` in the folder `gaits/raw`."""
+    for name, step in (("walk", 0.5), ("turn", 0.6)):
+        (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 1.0)))
+    return lab_of(tmp_path / "walk.bvh", tmp_path / "turn.bvh", collection="gaits/raw")
+
+
+class Walker:
+    """Somebody who follows the page, and changes clips in between."""
+
+    def __init__(self, run: CommandLine, project: ProjectHandle) -> None:
+        self.run = run
+        self.project = project
+        self.blocks = iter(re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL))
+
+    def follow(self, **placeholders: str) -> list[str]:
+        """Run the commands of the next block of the page, and return their outputs."""
+        block = next(self.blocks)
+        for text, value in placeholders.items():
+            assert text in block
+            block = block.replace(text, value)
+        return [self.run(*shlex.split(line, comments=True)[1:]).stderr or "" for line in block.splitlines()]
+
+    def clip(self, name: str) -> ClipHandle:
+        """The clip in the folder of the dataset."""
+        (found,) = (one for one in self.project.clips.list() if one.name == name)
+        return found
+
+    def comment(self, name: str, text: str) -> None:
+        """Change the description of a clip."""
+        clip = self.clip(name)
+        clip.put_info(clip.info().model_copy(update={"comment": text}))
+
+    def commit(self, message: str, branch: str, comment: str) -> None:
+        """Check out a branch, change the descriptions of both clips, and commit."""
+        self.run("dataset", "checkout", f"lab/gaits@{branch}")
+        for name in ("walk", "turn"):
+            self.comment(name, comment)
+        self.run("dataset", "commit", "lab/gaits", "-m", message, "--branch", branch)
+
+
+def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project: ProjectHandle) -> None:
+    walker = Walker(run, project)
+    gaits = project.datasets.at("gaits")
+    walker.follow()
+    run("tag", "lab/gaits/raw/walk", "--add", "slow")
+    walker.follow()
+    trimmed = gaits.at()
+    walker.follow()
+    assert walker.clip("walk").item.tags == ()
+    branch, checkout, commit = next(walker.blocks).splitlines()
+    for line in (branch, checkout):
+        run(*shlex.split(line)[1:])
+    walker.comment("walk", "on trial")
+    run(*shlex.split(commit)[1:])
+    walker.follow()
+    assert (walker.clip("walk").item.tags, walker.clip("walk").info().comment) == (("slow",), "on trial")
+    walker.commit("Theirs", "trial", "theirs")
+    walker.commit("Ours", "main", "ours")
+    assert "nothing is recorded" in run("dataset", "merge", "lab/gaits@trial", status=1).stderr
+    walker.follow()
+    run("dataset", "checkout", "lab/gaits")
+    assert [walker.clip(name).info().comment for name in ("walk", "turn")] == ["ours", "theirs"]
+    run("dataset", "checkout", "lab/gaits@trial")
+    run("tag", "lab/gaits/raw/turn", "--add", "fast")
+    run("dataset", "commit", "lab/gaits", "-m", "Tag the turn", "--branch", "trial")
+    walker.follow(**{"1f3a9c07": trimmed.digest.removeprefix("sha256:")[:8]})
+    run("dataset", "checkout", "lab/gaits")
+    assert [walker.clip(name).item.tags for name in ("walk", "turn")] == [(), ("fast",)]
+    assert gaits.at("trial") == gaits.at("v1")
+    assert next(one.message for one in gaits.log(path="raw/walk")) == "Revert 'Trim the turns, drop the falls'"

@@ -1,0 +1,139 @@
+"""Origins of an entry's content: for each part, the commit that last changed it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import islice
+from typing import Any, NamedTuple, Protocol
+
+from marey_versions.compared import compare_entries
+from marey_versions.records import DatasetEntry, entry_of
+from marey_versions.tree.difference import difference
+from marey_versions.tree.reading import ChunkReader, Tree
+
+PATH = "path"
+"""Name under which the origin of an entry's path is given: the commit that added or moved the entry."""
+TAGS = "tags"
+"""Name under which the origin of an entry's tags is given."""
+MOST_CHANGES = 100_000
+"""Greatest number of entries that differ between two commits among which a moved entry is sought."""
+
+
+class HistoricCommit(Protocol):
+    """Commit, as a search for origins reads it."""
+
+    @property
+    def tree(self) -> str:
+        """The digest of the root of the tree of entries."""
+
+    @property
+    def parents(self) -> Sequence[str]:
+        """The digests of the commits that it follows."""
+
+    @property
+    def generation(self) -> int:
+        """A number that is greater than those of all parents."""
+
+
+class FoundOrigin(NamedTuple):
+    """Commit that gave an entry one of its parts, its path or its tags."""
+
+    commit: str
+    key: str
+    """Key that the entry had in this commit; an entry may have been moved since."""
+    certain: bool
+    """False if the search ended at this commit, so that an earlier one may be the origin."""
+
+
+@dataclass
+class _OriginSearch:
+    """Search through the history, from later commits to earlier ones."""
+
+    reader: ChunkReader
+    commit_of: Callable[[str], HistoricCommit]
+    waiting: list[tuple[int, str, str]] = field(default_factory=list)
+    """Commits and keys to look at, as a heap by falling generation."""
+    sought: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    """Names of the parts whose origin is this commit or an earlier one, by commit and key."""
+    ended: set[str] = field(default_factory=set)
+    """Commits that changed so many entries that moved ones were not sought."""
+
+    def add(self, commit: str, key: str, names: set[str]) -> None:
+        if (commit, key) not in self.sought:
+            heappush(self.waiting, (-self.commit_of(commit).generation, commit, key))
+        self.sought.setdefault((commit, key), set()).update(names)
+
+    def entry(self, commit: str, key: str) -> DatasetEntry | None:
+        value = Tree(self.reader, self.commit_of(commit).tree).get(key)
+        return None if value is None else entry_of(key, value)
+
+    def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
+        """Return the entry in a parent of a commit, which may have it under another key; None if it is new."""
+        trees = [self.commit_of(one).tree for one in (parent, commit)]
+        same, present = self.entry(parent, key), self.entry(commit, key)
+        if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
+            return same
+        changes = list(islice(difference(self.reader, *trees), MOST_CHANGES + 1))
+        if len(changes) > MOST_CHANGES:
+            self.ended.add(commit)
+            return None
+        for one in compare_entries(changes):
+            if one.after is not None and one.after.key == key:
+                return one.before
+        return None
+
+
+def find_origins(
+    reader: ChunkReader, commit_of: Callable[[str], HistoricCommit], commit: str, key: str, *, most: int
+) -> dict[str, FoundOrigin]:
+    """Return the origin of each part of an entry, of its path and of its tags, by name.
+
+    A merge is an origin only of what differs from both sides. Moved entries are followed by their content, as
+    differences recognise them.
+
+    Parameters
+    ----------
+    reader : chunks of the trees of all commits
+    commit_of : returns a commit by its digest
+    commit, key : the commit and the entry in it, which exists
+    most : greatest number of commits to look at; origins that were not found then are not certain
+    """
+    search = _OriginSearch(reader, commit_of)
+    present = search.entry(commit, key)
+    if present is None:
+        raise KeyError(key)
+    search.add(commit, key, set(_named(present)))
+    origins: dict[str, FoundOrigin] = {}
+    for _ in range(most):
+        if not search.waiting:
+            break
+        _, commit, key = heappop(search.waiting)
+        names = search.sought.pop((commit, key))
+        names -= _pass_to_parents(search, commit, key, names)
+        origins.update((name, FoundOrigin(commit, key, commit not in search.ended)) for name in names)
+    for (commit, key), names in search.sought.items():
+        origins.update((name, FoundOrigin(commit, key, False)) for name in names)
+    return origins
+
+
+def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
+    """Add the parents that have the same content to the search, and return the names of that content."""
+    present = search.entry(commit, key)
+    assert present is not None
+    values = _named(present)
+    passed: set[str] = set()
+    for parent in search.commit_of(commit).parents:
+        earlier = search.before(parent, commit, key)
+        of_parent = {} if earlier is None else _named(earlier)
+        same = {name for name in names - passed if name in of_parent and of_parent[name] == values[name]}
+        if earlier is not None and same:
+            search.add(parent, earlier.key, same)
+            passed |= same
+    return passed
+
+
+def _named(entry: DatasetEntry) -> Mapping[str, Any]:
+    """Return what a commit can change of an entry, by name."""
+    return {**entry.parts, PATH: entry.path, TAGS: entry.tags}
