@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from sqlalchemy import select
 from tests.support.furnished_house import House, build_house
-from tests.support.hostile_client import ATTACKED, fire_all, shots, some
+from tests.support.hostile_client import ATTACKED, Outcome, fire_all, shots, some
 from tests.support.process_cost import ProcessCost
 from tests.support.rest_server import People
 from tests.support.server_process import ServerProcess
@@ -39,6 +39,11 @@ class Attacked:
     process: ServerProcess
     house: House
     cost: ProcessCost
+
+    def faults(self, outcomes: Iterable[Outcome]) -> list[str]:
+        """Return the faults among outcomes, each with the end of what the server has logged."""
+        log = self.process.log.read_text()[-5000:]
+        return [f"{one.fault}; the server's log: {log}" for one in outcomes if one.fault]
 
     def fingerprint(self) -> dict[str, str]:
         """Return a digest of the rows of each table, except for what the server writes by itself."""
@@ -73,12 +78,12 @@ def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_we
     refused = [shot for shot in every if shot.refusal]
     before = attacked.fingerprint()
     outcomes = asyncio.run(fire_all(attacked.process.url, refused, 8))
-    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert attacked.faults(outcomes) == []
     assert attacked.fingerprint() == before
 
     accepted = [shot for shot in every if not shot.refusal]
     outcomes = asyncio.run(fire_all(attacked.process.url, accepted, 8))
-    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert attacked.faults(outcomes) == []
     assert accepted
     assert refused
     assert attacked.cost.peak_mb() < MOST_MB
@@ -90,5 +95,5 @@ def test_a_hostile_client_is_refused_and_changes_nothing_and_the_server_stays_we
 def test_two_hundred_hostile_connections_leave_no_fault(attacked: Attacked) -> None:
     outsiders = [shot for shot in shots(attacked.house, OUTSIDERS) if shot.refusal]
     outcomes = asyncio.run(fire_all(attacked.process.url, some(outsiders, SHOTS, SEED), 200))
-    assert [outcome.fault for outcome in outcomes if outcome.fault] == []
+    assert attacked.faults(outcomes) == []
     assert attacked.cost.peak_mb() < MOST_MB
