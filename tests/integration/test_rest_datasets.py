@@ -95,6 +95,10 @@ def test_commits_record_the_folder_and_name_its_items(owner: httpx.Client, gaits
     assert difference(owner, "main~1", "main") == [
         ("changed", "a", None), ("moved", "c", "b"), ("added", "more/d", None),
     ]  # fmt: skip
+    below = ok(owner.get(f"{GAITS}/difference", params={"path": "more"}))
+    assert (below["counts"], below["folders"]) == ({"added": 1}, {"more": {"added": 1}})
+    folders = ok(owner.get(f"{GAITS}/difference"))["folders"]
+    assert folders == {"": {"changed": 1, "moved": 1}, "more": {"added": 1}}
     assert entries(owner, "main~1") == first
     log = ok(owner.get(f"{GAITS}/commits", params={"limit": 1}))
     assert [one["message"] for one in log["items"]] == ["second"]

@@ -126,9 +126,14 @@ class DatasetHandle:
         """List the entries of a version by path, all or those below a folder."""
         return pages(self.transport, Entry, f"{self.url}/entries", {"version": version, "path": path, "limit": 1000})
 
-    def difference(self, before: str = f"{MAIN}~1", after: str = MAIN, *, limit: int = 1000) -> DatasetDifference:
-        """Return the entries that differ in two versions; at most `limit` of them are listed."""
-        query: Params = {"before": before, "after": after, "limit": limit}
+    def difference(
+        self, before: str = f"{MAIN}~1", after: str = MAIN, *, path: str = "", limit: int = 1000
+    ) -> DatasetDifference:
+        """Return the entries that differ in two versions; at most `limit` of them are listed.
+
+        With `path`, only the entry or the folder at this path is compared.
+        """
+        query: Params = {"before": before, "after": after, "path": path, "limit": limit}
         return self.transport.get(DatasetDifference, f"{self.url}/difference", query)
 
     def merge(

@@ -34,5 +34,9 @@ class DatasetDifference(Answer):
     before: Commit
     after: Commit
     counts: dict[ChangeKind, int] = Field(description="Number of entries by change.")
+    folders: dict[str, dict[ChangeKind, int]] = Field(
+        description="Number of differing entries directly in each folder, by change. Removed entries count where they "
+        "were. At most as many folders as entries are listed."
+    )
     entries: tuple[EntryDifference, ...]
     complete: bool = Field(description="Whether all differing entries are listed and counted.")

@@ -285,6 +285,7 @@ class DifferenceQuery(Request):
 
     before: Version = Field(f"{MAIN}~1", description="The earlier version.")
     after: Version = Field(MAIN, description="The later version.")
+    path: CollectionPath = Field("", description="Entry or folder to compare; empty: all entries.")
     limit: int = Field(1000, ge=1, le=10_000, description="Greatest number of entries that are listed.")
 
 
@@ -298,7 +299,13 @@ class VersionDifference(Resource):
     async def get(self, project: str, dataset: str, query: DifferenceQuery) -> Rendered:
         """Return the entries that were added, removed, moved or changed between two versions."""
         return await self.answer(
-            datasets.compare_versions, project, dataset, query.before, query.after, limit=query.limit
+            datasets.compare_versions,
+            project,
+            dataset,
+            query.before,
+            query.after,
+            path=query.path,
+            limit=query.limit,
         )
 
 

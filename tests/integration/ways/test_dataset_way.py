@@ -42,7 +42,7 @@ class Walker:
         for text, value in placeholders.items():
             assert text in block
             block = block.replace(text, value)
-        return [self.run(*shlex.split(line, comments=True)[1:]).stderr or "" for line in block.splitlines()]
+        return [self.run(*shlex.split(line, comments=True)[1:]).stdout for line in block.splitlines()]
 
     def clip(self, name: str) -> ClipHandle:
         """The clip in the folder of the dataset."""
@@ -66,8 +66,12 @@ def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project:
     walker = Walker(run, project)
     gaits = project.datasets.at("gaits")
     walker.follow()
+    walker.comment("turn", "a good take")
+    run("dataset", "commit", "lab/gaits", "-m", "Describe the turn")
     run("tag", "lab/gaits/raw/walk", "--add", "slow")
-    walker.follow()
+    outputs = walker.follow()
+    assert outputs[3].splitlines()[-2].split() == ["raw", "2", "changed"]
+    assert outputs[4].splitlines()[-2:] == ["raw/turn:", "  info/comment added: a good take"]
     trimmed = gaits.at()
     walker.follow()
     assert walker.clip("walk").item.tags == ()

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.datasets import combining
+from marey_client.cli.addresses import kind_named
+from marey_client.cli.datasets import combining, comparing
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
-from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, ProjectName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_schemas.datasets.commits import Commit, Origin
-    from marey_schemas.datasets.differences import EntryDifference
 
 dataset = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Versions of datasets: commits, branches, tags, differences."
@@ -24,8 +23,9 @@ dataset = typer.Typer(
 
 
 def add_to(app: typer.Typer) -> None:
-    """Register the commands of this module, and those that combine changes."""
+    """Register all commands of datasets."""
     combining.add_to(dataset)
+    comparing.add_to(dataset)
     app.add_typer(dataset, name="dataset")
 
 
@@ -190,13 +190,9 @@ def blame(
     as_json: AsJson = False,
 ) -> None:
     """List who last changed each part of an entry, its tags and its path."""
-    from marey_schemas.kinds import Kind
-
     at = parse(place, version=True)
-    if kind not in list(Kind):
-        raise WrongUsage(f"{kind!r} is no kind; the kinds are {', '.join(Kind)}")
     with connect(context) as marey:
-        found = at.on(marey).blame(path.strip("/"), Kind(kind), at.version)
+        found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)
     if as_json:
         return print_json(found)
     origins = {**found.parts, "tags": found.tags, "path": found.place}
@@ -208,30 +204,6 @@ def _origin_row(name: str, one: Origin, path: str) -> tuple[object, ...]:
     notes = [] if one.path == path else [f"then {one.path}"]
     notes += [] if one.certain else ["or an earlier commit"]
     return name, short(one.commit.digest), one.commit.at, one.commit.author, one.commit.message, ", ".join(notes)
-
-
-@dataset.command("diff")
-def diff(
-    context: typer.Context,
-    place: VersionPlace,
-    after: Annotated[
-        str | None, typer.Argument(help="Later version; default: the given version is compared with the one before it.")
-    ] = None,
-    most: Annotated[int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries.")] = 1000,
-    as_json: AsJson = False,
-) -> None:
-    """List the entries that were added, removed, moved or changed between two versions."""
-    at = parse(place, version=True)
-    before, later = (f"{at.version}~1", at.version) if after is None else (at.version, after)
-    with connect(context) as marey:
-        found = at.on(marey).difference(before, later, limit=most)
-    if as_json:
-        return print_json(found)
-    print_table(
-        ("change", "kind", "path", "what"), [(one.change, one.kind, one.path, _what(one)) for one in found.entries]
-    )
-    counts = ", ".join(f"{count:,} {change}" for change, count in sorted(found.counts.items()))
-    return print_message(f"{short(found.before.digest)} to {short(found.after.digest)}: {counts or 'no difference'}")
 
 
 @dataset.command("checkout")
@@ -251,15 +223,6 @@ def checkout(
         return print_json(found)
     counts = ", ".join(f"{count:,} {name}" for name, count in found.model_dump(exclude={"commit"}).items() if count)
     return print_message(f"the folder has the entries of {short(found.commit)} now: {counts or 'nothing differed'}")
-
-
-def _what(one: EntryDifference) -> str:
-    changes = [f"was {one.was}"] if one.was else []
-    if one.before is not None and one.after is not None:
-        changes += [f"{part} {change}" for part, change in one.parts.items()]
-    changes += [f"+{tag}" for tag in one.tags_added if one.before is not None]
-    changes += [f"-{tag}" for tag in one.tags_removed if one.after is not None]
-    return ", ".join(changes)
 
 
 def _pairs(one: Commit) -> list[tuple[str, object]]:

@@ -38,6 +38,11 @@ def described(difference: Difference) -> Iterator[str]:
     first = f"{before.name}: revision {before.revision}" if same else f"{before.name} revision {before.revision}"
     second = f"revision {after.revision}" if same else f"{after.name} revision {after.revision}"
     yield f"{first} → {second}"
+    yield from changes_in_words(difference)
+
+
+def changes_in_words(difference: Difference) -> Iterator[str]:
+    """Yield a line for each change."""
     lines = list(_changes(difference))
     yield from lines or ["no difference"]
 

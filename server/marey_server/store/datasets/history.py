@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 from sqlalchemy import Row, literal, select
 
 from marey_schemas.datasets.commits import Commit, Entry, EntryOrigins, Origin
-from marey_schemas.datasets.differences import DatasetDifference, EntryDifference
+from marey_schemas.datasets.differences import ChangeKind, DatasetDifference, EntryDifference
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, NotFoundProblem
@@ -24,7 +24,7 @@ from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.origins import PATH, TAGS, find_origins
 from marey_versions.records import DatasetEntry, entry_of, key_of, path_and_kind
-from marey_versions.tree.difference import difference
+from marey_versions.tree.difference import Changed, difference
 from marey_versions.tree.reading import ChunkReader, Tree
 
 MOST_EXAMINED = 1000
@@ -84,12 +84,12 @@ def list_commits(
     order = listing.parse_order("place", {"place": literal(0)}, unique="place")
     identity = ["commits", row.id, version, path]
     start = resolve(tx, row.id, version) if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
-    chain = first_parents(row.id, start, MOST_EXAMINED if path else limit)
+    earlier = first_parents(row.id, start, MOST_EXAMINED if path else limit)
     found = tx.execute(
         select(dataset_commit)
-        .join(chain, chain.c.digest == dataset_commit.c.digest)
+        .join(earlier, earlier.c.digest == dataset_commit.c.digest)
         .where(dataset_commit.c.dataset_id == row.id)
-        .order_by(chain.c.place)
+        .order_by(earlier.c.place)
     ).all()
     chosen, following = _changing(tx, found, path, limit) if path else (found[:limit], found[limit:][:1])
     parents = _parents(tx, row.id, [one.digest for one in chosen])
@@ -100,25 +100,34 @@ def list_commits(
 
 
 def _changing(
-    tx: Transaction, chain: Sequence[Row[Any]], path: str, limit: int
+    tx: Transaction, commits: Sequence[Row[Any]], path: str, limit: int
 ) -> tuple[list[Row[Any]], Sequence[Row[Any]]]:
-    """Return the commits of a chain that changed a path, and the one, if any, at which the next page begins."""
+    """Return those of successive commits that changed a path, and the one, if any, at which the next page begins."""
     reader = ChunkReader(StoredChunks(tx))
     found: list[Row[Any]] = []
-    for place, one in enumerate(chain[:MOST_EXAMINED]):
+    for place, one in enumerate(commits[:MOST_EXAMINED]):
         if len(found) == limit:
             return found, [one]
-        before = chain[place + 1].tree if place + 1 < len(chain) else None
+        before = commits[place + 1].tree if place + 1 < len(commits) else None
         if _path_differs(reader, before, one.tree, path):
             found.append(one)
-    return found, chain[MOST_EXAMINED:]
+    return found, commits[MOST_EXAMINED:]
 
 
 def _path_differs(reader: ChunkReader, before: str | None, after: str, path: str) -> bool:
-    prefixes = (key_of(path, ""), f"{path}/")
     if before is None:
-        return any(Tree(reader, after).count(prefix) for prefix in prefixes)
-    return any(next(difference(reader, before, after, prefix=prefix), None) for prefix in prefixes)
+        return any(Tree(reader, after).count(prefix) for prefix in _prefixes_of(path))
+    return next(_changes_at(reader, before, after, path), None) is not None
+
+
+def _changes_at(reader: ChunkReader, before: str, after: str, path: str) -> Iterator[Changed]:
+    """Return the differences of two trees at a path and below it, or all for an empty path."""
+    return chain.from_iterable(difference(reader, before, after, prefix=prefix) for prefix in _prefixes_of(path))
+
+
+def _prefixes_of(path: str) -> tuple[str, ...]:
+    """Return the prefixes of the keys of the entries at a path and below it, in the order of the keys."""
+    return (key_of(path, ""), f"{path}/") if path else ("",)
 
 
 def read_origins(tx: Transaction, project: str, name: str, version: str, *, path: str, kind: Kind) -> EntryOrigins:
@@ -223,13 +232,18 @@ def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) ->
 
 
 def compare_versions(
-    tx: Transaction, project: str, name: str, before: str, after: str, *, limit: int
+    tx: Transaction, project: str, name: str, before: str, after: str, *, path: str, limit: int
 ) -> DatasetDifference:
-    """Return the entries that differ in two versions; at most `limit` of them are listed."""
+    """Return the entries that differ in two versions; at most `limit` of them are listed.
+
+    With `path`, compare only the entries at this path or below it. What was moved from or to another folder then counts
+    as added or removed.
+    """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     old, new = (_commit(tx, row.id, resolve(tx, row.id, version)) for version in (before, after))
-    found = list(islice(difference(StoredChunks(tx), old.tree, new.tree), MOST_DIFFERENCES + 1))
+    changes = _changes_at(ChunkReader(StoredChunks(tx)), old.tree, new.tree, path)
+    found = list(islice(changes, MOST_DIFFERENCES + 1))
     if len(found) > MOST_DIFFERENCES:
         raise BadRequestProblem(
             f"The versions differ in more than {MOST_DIFFERENCES:,} entries; compare versions that are closer.",
@@ -243,9 +257,17 @@ def compare_versions(
         before=old,
         after=new,
         counts=dict(Counter(one.change for one in compared)),
+        folders=dict(islice(_counts_by_folder(compared).items(), limit)),
         entries=tuple(_shown_difference(one, held) for one in shown),
         complete=len(shown) == len(compared),
     )
+
+
+def _counts_by_folder(compared: Sequence[ComparedEntry]) -> dict[str, dict[ChangeKind, int]]:
+    counts: dict[str, Counter[ChangeKind]] = {}
+    for one in compared:
+        counts.setdefault(one.present.path.rpartition("/")[0], Counter())[one.change] += 1
+    return {folder: dict(counts[folder]) for folder in sorted(counts)}
 
 
 def _shown_difference(one: ComparedEntry, held: dict[str, tuple[str, int]]) -> EntryDifference:
