@@ -124,6 +124,8 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "DELETE /projects/{project}/datasets/{dataset}": "maintainer",
         "DELETE /projects/{project}/datasets/{dataset}/refs/{ref}": "maintainer",
         "PATCH /projects/{project}/datasets/{dataset}/refs/{ref}": "maintainer",
+        "PUT /projects/{project}/datasets/{dataset}/refs/{ref}/protection": "maintainer",
+        "DELETE /projects/{project}/datasets/{dataset}/refs/{ref}/protection": "maintainer",
         "POST /projects/{project}/datasets/{dataset}/checkout": "maintainer",
         "DELETE /projects/{project}/{kind}/{item}": "maintainer",
         "POST /projects/{project}/{kind}/{item}/restore": "maintainer",

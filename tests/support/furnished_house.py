@@ -53,6 +53,12 @@ BODIES = {
     "MergeRequest": {"version": "spare"},
     "PickRequest": {"version": "spare"},
     "RefMove": {"at": "main"},
+    "ProtectionRule": {"approvals": 1},
+    "ProposalCreate": {"title": CANARY, "source": "spare"},
+    "CommentCreate": {"text": CANARY},
+    "ReviewCreate": {"verdict": "approve"},
+    "CheckReport": {"name": "evaluation", "state": "pending"},
+    "ProposalMerge": {"when_green": True},
     "CheckoutRequest": {"version": "spare", "discard": True},
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
@@ -211,7 +217,10 @@ def _furnish(owner: Any) -> dict[str, str]:
     assert owner.post(datasets, json={"name": CANARY, "collection": CANARY}).status_code == 201
     assert owner.post(f"{datasets}/{CANARY}/commits", json={"message": CANARY}).status_code == 201
     assert owner.post(f"{datasets}/{CANARY}/refs", json={"name": "spare", "kind": "tag"}).status_code == 201
+    proposal = f"{datasets}/{CANARY}/proposals"
+    assert owner.post(proposal, json=BODIES["ProposalCreate"]).status_code == 201
+    assert owner.post(f"{proposal}/1/comments", json=BODIES["CommentCreate"]).status_code == 201
     return {
         "collection": collection, "item": made.json()["id"], "annotation": annotation.json()["id"], "dataset": CANARY,
-        "ref": "spare", "version": "spare",
+        "ref": "spare", "version": "spare", "proposal": "1",
     }  # fmt: skip

@@ -25,7 +25,7 @@ from marey_client.cli import (
     skeletons,
     tokens,
 )
-from marey_client.cli.datasets import versions
+from marey_client.cli.datasets import proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.invocation import Invocation
 
@@ -75,6 +75,7 @@ for register in (
     organise,
     diff,
     versions,
+    proposals,
     skeletons,
     clip_jobs,
     annotating,

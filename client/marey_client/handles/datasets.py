@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
+from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
@@ -21,6 +22,7 @@ from marey_schemas.datasets.merges import (
     Resolution,
 )
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
+from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
 
 
@@ -86,6 +88,11 @@ class DatasetHandle:
     def delete(self) -> None:
         """Delete the dataset; its items stay."""
         self.transport.send("DELETE", self.url, headers=ANY_STATE)
+
+    @property
+    def proposals(self) -> Proposals:
+        """The proposals to merge versions into branches of the dataset."""
+        return Proposals(self.transport, f"{self.url}/proposals")
 
     # -- versions ------------------------------------------------------------------------------------------------------
 
@@ -214,6 +221,20 @@ class DatasetHandle:
         """Move a branch to any version; the commits that it had stay."""
         body = as_json(RefMove(at=to))
         return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=ANY_STATE))
+
+    def ref(self, name: str) -> Ref:
+        """Return a branch with its protection, or a tag."""
+        return self.transport.get(Ref, f"{self.url}/refs/{name}")
+
+    def protect(self, branch: str, rule: ProtectionRule) -> Ref:
+        """Protect a branch, or replace its rule; maintainers may do this."""
+        body, url = as_json(rule), f"{self.url}/refs/{branch}/protection"
+        return read_model(Ref, self.transport.send("PUT", url, content=body, headers=ANY_STATE))
+
+    def unprotect(self, branch: str) -> Ref:
+        """Remove the rule of a branch."""
+        url = f"{self.url}/refs/{branch}/protection"
+        return read_model(Ref, self.transport.send("DELETE", url, headers=ANY_STATE))
 
     def delete_ref(self, name: str) -> None:
         """Delete a branch or a tag; the commits stay."""

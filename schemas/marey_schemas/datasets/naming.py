@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.protection import Protection
 from marey_schemas.names import CollectionPath
 
 MAIN = "main"
@@ -73,6 +74,7 @@ class Ref(Answer):
     name: str
     kind: RefKind
     commit: str | None = Field(description="Digest of the commit; null for a branch without commits.")
+    protection: Protection | None = Field(None, description="Rule of the branch; null if it is not protected.")
     created_at: datetime
     updated_at: datetime
     rev: int

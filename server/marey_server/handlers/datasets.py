@@ -9,6 +9,7 @@ from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryOri
 from marey_schemas.datasets.differences import DatasetDifference
 from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, PickRequest
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefMove, Version
+from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath
 from marey_schemas.sizes import MIB
@@ -84,6 +85,11 @@ class DatasetRef(Resource):
     path = "/projects/{project}/datasets/{dataset}/refs/{ref}"
     tag = "ProjectDatasets"
 
+    @reads(access=Access.READER, answer=Ref, etag=True)
+    async def get(self, project: str, dataset: str, ref: str) -> Rendered:
+        """Return a branch with its protection, or a tag."""
+        return await self.answer(datasets.read_ref, project, dataset, ref)
+
     @writes(access=Access.MAINTAINER, body=RefMove, answer=Ref, etag=True, precondition="required")
     async def patch(self, project: str, dataset: str, ref: str, body: RefMove) -> Rendered:
         """Move a branch to any version of the dataset; the commits that it had stay."""
@@ -95,6 +101,25 @@ class DatasetRef(Resource):
         """Delete a branch or a tag; the commits stay."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.delete_ref, project, dataset, ref, expected_rev=expected_rev)
+
+
+class BranchProtection(Resource):
+    """Rule of a branch."""
+
+    path = "/projects/{project}/datasets/{dataset}/refs/{ref}/protection"
+    tag = "ProjectDatasets"
+
+    @writes(access=Access.MAINTAINER, body=ProtectionRule, answer=Ref, etag=True, precondition="required")
+    async def put(self, project: str, dataset: str, ref: str, body: ProtectionRule) -> Rendered:
+        """Protect a branch, or replace its rule. A protected branch can be neither deleted nor reset."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(datasets.protect_branch, project, dataset, ref, body, expected_rev=expected_rev)
+
+    @writes(access=Access.MAINTAINER, answer=Ref, etag=True, precondition="required")
+    async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
+        """Remove the rule of a branch."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(datasets.protect_branch, project, dataset, ref, None, expected_rev=expected_rev)
 
 
 class CommitsQuery(PageQuery):
@@ -314,6 +339,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     DatasetResource,
     DatasetRefs,
     DatasetRef,
+    BranchProtection,
     DatasetCommits,
     DatasetMerges,
     CherryPicks,

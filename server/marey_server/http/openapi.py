@@ -36,6 +36,7 @@ PATH_VARIABLES: dict[str, tuple[str, Schema]] = {
     "revision": ("Number of the revision.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
     "dataset": ("Name of the dataset.", _NAME),
     "ref": ("Name of the branch or tag.", _NAME),
+    "proposal": ("Number of the proposal.", {"type": "integer", "minimum": 1, "maximum": 999_999_999}),
     "version": ("Branch, tag or commit; with ~n at its end, the version n commits earlier.", _NAME),
     "token": ("Id of the token.", _NAME),
     "upload": ("Id of the upload.", _NAME),

@@ -13,6 +13,8 @@ from typing import Any
 
 from sqlalchemy import Column, Row, Select, Table, and_, exists, func, select, text
 
+from marey_schemas.datasets.naming import RefKind
+from marey_schemas.datasets.proposal_states import ProposalState
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
@@ -28,10 +30,12 @@ from marey_server.store.tables import (
     commit_parent,
     dataset,
     dataset_commit,
+    dataset_ref,
     document,
     document_blob,
     item,
     project,
+    proposal,
     revision,
     revision_part,
     tree_chunk,
@@ -274,7 +278,25 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         record = CommitRecord(one.tree, tuple(parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
             findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
-    return findings
+    return findings + _check_proposals(tx, row)
+
+
+def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Check that each proposal has the commits of its state, and that its branches exist while it is open."""
+    of_dataset = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.kind == RefKind.BRANCH.value)
+    branches = set(tx.execute(select(dataset_ref.c.name).where(*of_dataset)).scalars())
+    return [
+        StoreDefect("proposal-corrupt", row.id, f"the proposal {one.number} has not what its state {one.state} needs")
+        for one in tx.execute(select(proposal).where(proposal.c.dataset_id == row.id))
+        if not _is_consistent(one, branches)
+    ]
+
+
+def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
+    if one.state == ProposalState.OPEN:
+        followed = {one.target} if one.head is not None else {one.target, one.source}
+        return followed <= branches and one.ended_us is None and one.merged is None
+    return None not in (one.head, one.ended_us) and (one.merged is not None) == (one.state == ProposalState.MERGED)
 
 
 def find_faults(tx: Transaction) -> list[str]:

@@ -557,9 +557,87 @@ dataset_ref = Table(  # a branch or a tag
     Column("name", Name, primary_key=True),
     Column("kind", String(8), nullable=False),
     Column("digest", DIGEST),  # null: a branch without commits
+    Column("protection", Document),  # rule of a protected branch
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
     Column("rev", Integer, nullable=False, default=1),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal = Table(  # to merge a version into a branch
+    "proposal",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("title", String(255), nullable=False),
+    Column("description", Text, nullable=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("source", String(255), nullable=False),
+    Column("target", Name, nullable=False),
+    Column("state", String(8), nullable=False),
+    Column("head", DIGEST),  # null: that of the branch `source`, while the proposal is open
+    Column("target_commit", DIGEST),  # null: that of the branch `target`, while the proposal is open
+    Column("merged", DIGEST),
+    Column("when_green_id", ID, ForeignKey("user.id")),  # user for whom it is merged when nothing is missing
+    Column("ended_id", ID, ForeignKey("user.id")),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("ended_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    *(
+        ForeignKeyConstraint(["dataset_id", column], ["dataset_commit.dataset_id", "dataset_commit.digest"])
+        for column in ("head", "target_commit", "merged")
+    ),
+    Index("ix_proposal_state", "dataset_id", "state", "number"),
+)
+
+proposal_comment = Table(
+    "proposal_comment",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("path", Text),
+    Column("kind", String(32)),
+    Column("first_frame", Integer),
+    Column("end_frame", Integer),  # the frame after the last one
+    Column("digest", DIGEST, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal_review = Table(
+    "proposal_review",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("verdict", String(16), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("digest", DIGEST, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal_check = Table(
+    "proposal_check",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("digest", DIGEST, primary_key=True),
+    Column("name", Name, primary_key=True),
+    Column("state", String(16), nullable=False),
+    Column("job_id", ID),
+    Column("link", Text),
+    Column("text", Text, nullable=False),
+    Column("reporter_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
     ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
 )
 

@@ -63,7 +63,7 @@ def merge(
     --ours, --theirs or --base. In that case, the exit status is 1.
     """
     at = parse(place, version=True)
-    resolutions = _resolutions(ours, theirs, base)
+    resolutions = resolutions_of(ours, theirs, base)
     _combine(
         context, at, into, as_json,
         lambda on: on.merge(at.version, into=into, message=message, resolutions=resolutions, preview=preview),
@@ -88,7 +88,7 @@ def cherry_pick(
     --ours, --theirs or --base. In that case, the exit status is 1.
     """
     at = parse(place, version=True)
-    options = _pick_options(into, parent, message, preview, _resolutions(ours, theirs, base))
+    options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
     _combine(context, at, into, as_json, lambda on: on.cherry_pick(at.version, **options))
 
 
@@ -111,7 +111,7 @@ def revert(
     that case, the exit status is 1.
     """
     at = parse(place, version=True)
-    options = _pick_options(into, parent, message, preview, _resolutions(ours, theirs, base))
+    options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
     _combine(context, at, into, as_json, lambda on: on.revert(at.version, **options))
 
 
@@ -148,9 +148,10 @@ def _combine(
         raise typer.Exit(1)
 
 
-def _resolutions(
+def resolutions_of(
     ours: Sequence[str] | None, theirs: Sequence[str] | None, base: Sequence[str] | None
 ) -> list[Resolution]:
+    """Return the decisions of conflicts that the options --ours, --theirs and --base name."""
     from marey_schemas.datasets.merges import Resolution, Side
 
     found = []

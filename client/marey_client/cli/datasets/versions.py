@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import kind_named
-from marey_client.cli.datasets import combining, comparing
+from marey_client.cli.datasets import combining, comparing, proposals
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.invocation import AsJson, ProjectName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
@@ -16,6 +16,7 @@ from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_schemas.datasets.commits import Commit, Origin
+    from marey_schemas.datasets.protection import Protection
 
 dataset = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Versions of datasets: commits, branches, tags, differences."
@@ -26,6 +27,7 @@ def add_to(app: typer.Typer) -> None:
     """Register all commands of datasets."""
     combining.add_to(dataset)
     comparing.add_to(dataset)
+    proposals.add_protection_to(dataset)
     app.add_typer(dataset, name="dataset")
 
 
@@ -138,8 +140,18 @@ def refs(context: typer.Context, place: DatasetPlace, as_json: AsJson = False) -
         found = list(at.on(marey).refs())
     if as_json:
         return print_json(found)
-    rows = [(one.name, one.kind, short(one.commit), one.updated_at) for one in found]
-    return print_table(("name", "kind", "commit", "changed"), rows)
+    rows = [(one.name, one.kind, short(one.commit), one.updated_at, _rule(one.protection)) for one in found]
+    return print_table(("name", "kind", "commit", "changed", "protection"), rows)
+
+
+def _rule(rule: Protection | None) -> str:
+    if rule is None:
+        return ""
+    needs = [] if rule.direct_commits else ["proposals"]
+    needs += [counted(rule.approvals, "approval")] if rule.approvals else []
+    needs += [f"check {name}" for name in rule.checks]
+    needs += ["up to date"] if rule.up_to_date else []
+    return ", ".join([f"{rule.role} or higher", *needs])
 
 
 @dataset.command("branch")

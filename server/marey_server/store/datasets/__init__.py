@@ -12,7 +12,9 @@ from marey_server.store.datasets.naming import (
     list_datasets,
     list_refs,
     move_branch,
+    protect_branch,
     read_dataset,
+    read_ref,
 )
 
 __all__ = [
@@ -32,9 +34,11 @@ __all__ = [
     "prepare_commit",
     "prepare_merge",
     "prepare_pick",
+    "protect_branch",
     "read_commit",
     "read_dataset",
     "read_origins",
+    "read_ref",
     "record_commit",
     "record_merge",
 ]

@@ -24,6 +24,7 @@ from marey_server.store.datasets.contents import Contents, find_contents_of, sto
 from marey_server.store.datasets.folders import read_folder, tags_of
 from marey_server.store.datasets.history import read_commit, tree_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
+from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
@@ -32,6 +33,9 @@ from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
+
+BRANCH_MOVED = "branch-moved"
+"""Code of the error for a branch that has another newest commit than expected."""
 
 
 @dataclass(frozen=True)
@@ -87,44 +91,43 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
     )  # fmt: skip
 
 
-def record_commit(tx: Transaction, project: str, name: str, prepared: PreparedCommit) -> Commit:
-    """Record a prepared commit, and move the branch to it.
+def record_commit(
+    tx: Transaction, project: str, name: str, prepared: PreparedCommit, mover: Mover | None = None
+) -> Commit:
+    """Record a prepared commit, and move the branch to it on behalf of the `mover`, by default the caller.
 
-    Raises `ConflictProblem` if the branch has moved since the commit was prepared.
+    Raises `ConflictProblem` if the branch has moved since the commit was prepared, and what `require_move` raises.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     if found.id != prepared.dataset_id:
-        raise _moved(prepared.branch, None)
+        raise branch_moved(prepared.branch, None)
     recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
+    mover = mover or Mover(_author(tx), project_row.role)
     store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)
-    digest = prepared.existing or _insert(tx, prepared)
+    digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.of_folder:
         tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
-    _move_branch(tx, found.id, prepared, digest)
+    _move_branch(tx, prepared, digest, mover)
     tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
     faults.point("dataset_commit.before_commit")
     tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
     return read_commit(tx, project, name, digest)
 
 
-def _move_branch(tx: Transaction, dataset_id: str, prepared: PreparedCommit, digest: str) -> None:
-    moved = (
-        update(dataset_ref)
-        .where(
-            dataset_ref.c.dataset_id == dataset_id,
-            dataset_ref.c.name == prepared.branch,
-            dataset_ref.c.kind == RefKind.BRANCH.value,
-            dataset_ref.c.digest.is_not_distinct_from(prepared.head),
-        )
-        .values(digest=digest, updated_us=tx.now_us, rev=dataset_ref.c.rev + 1)
+def _move_branch(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
+    """Move a branch to a commit that follows the newest one that the branch had when the move was prepared."""
+    ref = find_ref(tx, prepared.dataset_id, prepared.branch, lock=True)
+    if ref is None or ref.kind != RefKind.BRANCH or ref.digest != prepared.head:
+        raise branch_moved(prepared.branch, None if ref is None else ref.digest)
+    require_move(ref, mover)
+    moved = update(dataset_ref).where(
+        dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch
     )
-    if tx.execute(moved).rowcount == 0:
-        current = find_ref(tx, dataset_id, prepared.branch)
-        raise _moved(prepared.branch, None if current is None else current.digest)
+    tx.execute(moved.values(digest=digest, updated_us=tx.now_us, rev=dataset_ref.c.rev + 1))
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
@@ -151,21 +154,22 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
         raise is_tag(branch)
     head: str | None = ref.digest
     if expected is not None and expected != head:
-        raise _moved(branch, head)
+        raise branch_moved(branch, head)
     return head
 
 
-def _moved(branch: str, head: str | None) -> ConflictProblem:
+def branch_moved(branch: str, head: str | None) -> ConflictProblem:
+    """Return the error for a branch that has another newest commit than expected; `context.commit` is its digest."""
     return ConflictProblem(
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
-        code="branch-moved",
+        code=BRANCH_MOVED,
         context={"commit": head},
     )
 
 
-def _insert(tx: Transaction, prepared: PreparedCommit) -> str:
+def _insert(tx: Transaction, prepared: PreparedCommit, author: str) -> str:
     at = datetime_of(tx.now_us).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-    record = CommitRecord(prepared.tree, prepared.parents, _author(tx), prepared.message, at)
+    record = CommitRecord(prepared.tree, prepared.parents, author, prepared.message, at)
     above = select(dataset_commit.c.generation).where(
         dataset_commit.c.dataset_id == prepared.dataset_id, dataset_commit.c.digest.in_(prepared.parents)
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 from sqlalchemy import Row, select
@@ -25,6 +26,7 @@ from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.committing import PreparedCommit, head_of, record_commit, recorded_as
 from marey_server.store.datasets.history import read_commit, revisions_with, shown_entry, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
+from marey_server.store.datasets.protection import Mover
 from marey_server.store.tables import commit_parent
 from marey_server.store.transaction import Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
@@ -35,6 +37,9 @@ from marey_versions.tree.difference import difference
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
+LARGE_MERGE = "large-merge"
+"""Code of the error for a merge with too many changes to be previewed."""
+
 
 @dataclass(frozen=True)
 class PreparedMerge:
@@ -44,11 +49,14 @@ class PreparedMerge:
     commit: PreparedCommit
 
 
-def prepare_merge(tx: Transaction, project: str, name: str, request: MergeRequest) -> PreparedMerge:
+def prepare_merge(
+    tx: Transaction, project: str, name: str, request: MergeRequest, *, most: int | None = None
+) -> PreparedMerge:
     """Compute the merge of a version into a branch.
 
-    Raises `InvalidProblem` if the branch has all commits of the version, and `ConflictProblem` if the branch is not at
-    the expected commit, or if the two have several nearest common commits.
+    Raises `InvalidProblem` if the branch has all commits of the version, or if a side has more than `most` changes,
+    and `ConflictProblem` if the branch is not at the expected commit, or if the two have several nearest common
+    commits.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -64,7 +72,7 @@ def prepare_merge(tx: Transaction, project: str, name: str, request: MergeReques
         )
     answer = started.answer.model_copy(update={"base": base})
     commit = replace(started.commit, parents=(ours, theirs), existing=theirs if base == ours else None)
-    return _combine(tx, project_row.id, request, PreparedMerge(answer, commit))
+    return _combine(tx, project_row.id, request, PreparedMerge(answer, commit), most)
 
 
 def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest, *, undo: bool) -> PreparedMerge:
@@ -117,7 +125,9 @@ def _start(
     return PreparedMerge(answer, commit)
 
 
-def _combine(tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge) -> PreparedMerge:
+def _combine(
+    tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge, most: int | None = None
+) -> PreparedMerge:
     """Merge what differs between the base and theirs into ours."""
     store = StoredChunks(tx)
     answer, commit = started.answer, started.commit
@@ -126,7 +136,8 @@ def _combine(tx: Transaction, project_id: str, request: CombineRequest, started:
         for one in (answer.base, answer.ours, answer.theirs)
     )
     resolutions = {key_of(one.path, one.kind): one.take for one in request.resolutions}
-    merged = merge_entries(_changed(store, base, ours), _changed(store, base, theirs), resolutions)
+    mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
+    merged = merge_entries(mine, their, resolutions)
     if unknown := sorted(resolutions.keys() - merged.decided):
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(f"There is no conflict at {path!r} of the kind {kind} to decide.", code="no-conflict")
@@ -145,9 +156,16 @@ def _combine(tx: Transaction, project_id: str, request: CombineRequest, started:
 
 
 def record_merge(
-    tx: Transaction, project: str, name: str, request: CombineRequest, merge: PreparedMerge
+    tx: Transaction,
+    project: str,
+    name: str,
+    request: CombineRequest,
+    merge: PreparedMerge,
+    mover: Mover | None = None,
 ) -> MergeAnswer:
-    """Record the result of a merge or of picked changes, unless it is a preview, and return it.
+    """Record the result of a merge or of picked changes on behalf of the `mover`, by default the caller; return it.
+
+    A preview is returned without being recorded.
 
     Raises `ConflictProblem` if there are conflicts without a resolution, or if the branch has moved.
     """
@@ -160,12 +178,18 @@ def record_merge(
             code="merge-conflicts",
             context=merge.answer.model_dump(mode="json"),
         )
-    commit = record_commit(tx, project, name, merge.commit)
+    commit = record_commit(tx, project, name, merge.commit, mover)
     return merge.answer.model_copy(update={"commit": commit})
 
 
-def _changed(store: StoredChunks, base: str, tree: str) -> list[ComparedEntry]:
-    return compare_entries(difference(store, base, tree))
+def _changed(store: StoredChunks, base: str, tree: str, most: int | None = None) -> list[ComparedEntry]:
+    found = list(islice(difference(store, base, tree), None if most is None else most + 1))
+    if most is not None and len(found) > most:
+        raise InvalidProblem(
+            f"A side has changed more than {most:,} entries; preview the merge to compute its result.",
+            code=LARGE_MERGE,
+        )
+    return compare_entries(found)
 
 
 def _contents(conflicts: Iterable[MergeConflict]) -> set[str]:

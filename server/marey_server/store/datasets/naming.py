@@ -5,14 +5,21 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from sqlalchemy import CTE, Row, delete, func, insert, literal_column, select
+from sqlalchemy import CTE, Row, delete, func, insert, literal_column, null, select
 
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
+from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.items import Page
 from marey_server.errors import ConflictProblem, InvalidProblem, NotFoundProblem
 from marey_server.store import collections, listing, projects
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.violations import taken
+from marey_server.store.datasets.protection import (
+    require_deletable,
+    require_no_protected_branch,
+    require_reset,
+    rule_of,
+)
 from marey_server.store.ids import new_id
 from marey_server.store.projects import ProjectRow
 from marey_server.store.revs import ExpectedRev, change_row
@@ -98,9 +105,14 @@ def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: i
 
 
 def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: ExpectedRev) -> None:
-    """Hide a dataset. Its name can be used again, and its commits stay in the database."""
+    """Hide a dataset. Its name can be used again, and its commits stay in the database.
+
+    Raises `ConflictProblem` if it has a protected branch.
+    """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
+    lock_refs(tx, row.id)
+    require_no_protected_branch(tx, row.id)
     absent = NotFoundProblem(f"There is no dataset {name!r} in this project.", code="no-dataset")
     values = {"deleted_us": tx.now_us, "updated_us": tx.now_us}
     change_row(tx, dataset, (dataset.c.id == row.id, _ALIVE), values, expected_rev=expected_rev, absent=absent)
@@ -119,8 +131,8 @@ def _new_ref(tx: Transaction, dataset_id: str, name: str, kind: RefKind, digest:
 
 def _shown_ref(row: Row[Any]) -> Ref:
     return Ref(
-        name=row.name, kind=RefKind(row.kind), commit=row.digest, created_at=datetime_of(row.created_us),
-        updated_at=datetime_of(row.updated_us), rev=row.rev,
+        name=row.name, kind=RefKind(row.kind), commit=row.digest, protection=rule_of(row),
+        created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us), rev=row.rev,
     )  # fmt: skip
 
 
@@ -137,6 +149,20 @@ def find_ref(tx: Transaction, dataset_id: str, name: str, *, lock: bool = False)
     """Return the row of a branch or tag, or None; with `lock`, it stays as it is until the transaction ends."""
     statement = select(dataset_ref).where(dataset_ref.c.dataset_id == dataset_id, dataset_ref.c.name == name)
     return tx.execute(statement.with_for_update() if lock else statement).first()
+
+
+def lock_refs(tx: Transaction, dataset_id: str) -> None:
+    """Let no other transaction delete or protect a branch of the dataset, or open a proposal, until this one ends."""
+    tx.lock(f"refs of {dataset_id}")
+
+
+def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
+    """Return a branch or a tag."""
+    row = find_dataset(tx, projects.require(tx, project), name)
+    found = find_ref(tx, row.id, ref)
+    if found is None:
+        raise _no_version(ref)
+    return _shown_ref(found)
 
 
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
@@ -159,7 +185,8 @@ def move_branch(
 ) -> Ref:
     """Move a branch to any version of the dataset; the commits that it had stay.
 
-    Raises `InvalidProblem` for a tag, and `PreconditionFailedProblem` if the branch has moved since it was read.
+    Raises `InvalidProblem` for a tag, `PreconditionFailedProblem` if the branch has moved since it was read, and
+    `ConflictProblem` if the branch is protected.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
@@ -169,6 +196,7 @@ def move_branch(
     changed = change_row(tx, dataset_ref, which, values, expected_rev=expected_rev, absent=_no_version(branch))
     if changed.kind != RefKind.BRANCH:
         raise is_tag(branch)
+    require_reset(changed)
     tx.emit("branch.moved", row.id, project_id=project_row.id, branch=branch, commit=digest)
     return _shown_ref(changed)
 
@@ -179,17 +207,40 @@ def is_tag(name: str) -> InvalidProblem:
 
 
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
-    """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted."""
+    """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted.
+
+    Raises `ConflictProblem` if it is protected, or if an open proposal is about it.
+    """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
+    lock_refs(tx, row.id)
     if ref == MAIN:
         raise InvalidProblem(f"The branch {MAIN!r} cannot be deleted.", code="is-main")
     which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == ref)
     changed = change_row(
         tx, dataset_ref, which, {"updated_us": tx.now_us}, expected_rev=expected_rev, absent=_no_version(ref)
     )
+    require_deletable(tx, changed)
     tx.execute(delete(dataset_ref).where(*which))
     tx.emit(f"{changed.kind}.deleted", row.id, project_id=project_row.id, name=ref, commit=changed.digest)
+
+
+def protect_branch(
+    tx: Transaction, project: str, name: str, branch: str, rule: ProtectionRule | None, *, expected_rev: ExpectedRev
+) -> Ref:
+    """Set the rule of a branch; None removes it. Raises `InvalidProblem` for a tag."""
+    project_row = projects.require(tx, project)
+    row = find_dataset(tx, project_row, name)
+    lock_refs(tx, row.id)
+    which = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.name == branch)
+    stored = null() if rule is None else rule.model_dump(mode="json")
+    values = {"protection": stored, "updated_us": tx.now_us}
+    changed = change_row(tx, dataset_ref, which, values, expected_rev=expected_rev, absent=_no_version(branch))
+    if changed.kind != RefKind.BRANCH:
+        raise is_tag(branch)
+    kind = "branch.protected" if rule is not None else "branch.unprotected"
+    tx.emit(kind, row.id, project_id=project_row.id, branch=branch)
+    return _shown_ref(changed)
 
 
 # -- versions ---------------------------------------------------------------------------------------------------------

@@ -1,0 +1,284 @@
+"""Commands `proposal`: changes of a branch that others review; and commands that protect branches."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.datasets.combining import Base, CommitMessage, Into, Ours, Theirs, resolutions_of
+from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
+from marey_client.cli.failures import WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
+from marey_schemas.kinds import Kind
+
+if TYPE_CHECKING:
+    from marey_schemas.datasets.proposals import Proposal, ProposalDetail
+
+proposal = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Proposals to merge a version of a dataset into a branch."
+)
+
+Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; marey proposal ls lists the numbers.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this module."""
+    app.add_typer(proposal, name="proposal")
+
+
+def add_protection_to(dataset: typer.Typer) -> None:
+    """Register the commands that protect branches."""
+    dataset.command()(protect)
+    dataset.command()(unprotect)
+
+
+@proposal.command("open")
+def open_proposal(
+    context: typer.Context,
+    place: VersionPlace,
+    title: Annotated[str, typer.Option("--title", "-t", help="What the proposal changes.")],
+    description: Annotated[str, typer.Option(help="Why, and what reviewers should look at.")] = "",
+    into: Into = "main",
+    as_json: AsJson = False,
+) -> None:
+    """Propose to merge a version into a branch. A proposal of a branch includes its later commits."""
+    at = parse(place, version=True)
+    with connect(context) as marey:
+        made = at.on(marey).proposals.open(title, at.version, into=into, description=description).read()
+    if as_json:
+        return print_json(made)
+    return print_message(f"opened the proposal {made.number}; {_missing_words(made)}")
+
+
+@proposal.command("ls")
+def list_proposals(
+    context: typer.Context,
+    place: DatasetPlace,
+    state: Annotated[ProposalState | None, typer.Option(help="List only proposals in this state.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the proposals of a dataset, newest first."""
+    at = parse(place)
+    with connect(context) as marey:
+        found = list(at.on(marey).proposals.list(state))
+    if as_json:
+        return print_json(found)
+    rows = [(one.number, one.state, one.source, one.target, one.author, one.title) for one in found]
+    return print_table(("number", "state", "source", "target", "author", "title"), rows)
+
+
+@proposal.command("show")
+def show(context: typer.Context, place: DatasetPlace, number: Number, as_json: AsJson = False) -> None:
+    """Show a proposal with its comments, reviews and checks, and what is missing before it can be merged."""
+    at = parse(place)
+    with connect(context) as marey:
+        handle = at.on(marey).proposals.at(number)
+        found, comments = handle.read(), list(handle.comments())
+    if as_json:
+        return print_json({"proposal": found, "comments": comments})
+    print_pairs(_pairs(found))
+    for review in found.reviews:
+        print_message(f"{review.author}: {review.verdict}{' (of an earlier commit)' if review.stale else ''}")
+    for check in found.checks:
+        print_message(f"check {check.name}: {check.state} {check.text}".rstrip())
+    for comment in comments:
+        frames = "" if comment.frames is None else f" frames {comment.frames[0]} to {comment.frames[1] - 1}"
+        where = "" if comment.path is None else f" on {comment.path} ({comment.kind}){frames}"
+        print_message(f"{comment.author}{where}: {comment.text}")
+    return None
+
+
+def _pairs(found: ProposalDetail) -> list[tuple[str, object]]:
+    computed = found.mergeability
+    return [
+        ("proposal", found.number),
+        ("title", found.title),
+        ("description", found.description),
+        ("author", found.author),
+        ("state", found.state),
+        ("source", f"{found.source} at {short(found.head)}"),
+        ("target", f"{found.target} at {short(found.target_commit)}"),
+        ("merged", short(found.merged)),
+        ("ended by", found.ended_by),
+        ("merged for", found.when_green),
+        ("changes", None if computed is None else computed.changes),
+        ("conflicts", None if computed is None else computed.conflict_count),
+        ("missing", "" if computed is None else " ".join(one.detail for one in computed.missing)),
+    ]
+
+
+def _missing_words(found: ProposalDetail) -> str:
+    missing = () if found.mergeability is None else found.mergeability.missing
+    return " ".join(one.detail for one in missing) or "nothing is missing, so it can be merged"
+
+
+@proposal.command("comment")
+def comment(
+    context: typer.Context,
+    place: DatasetPlace,
+    number: Number,
+    text: Annotated[str, typer.Argument(help="Text of the comment.")],
+    entry: Annotated[
+        str | None, typer.Option(metavar="PATH:KIND", help="Entry that the comment is about, such as raw/walk:clip.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="FIRST:END", help="Frames of the entry, up to the one before END.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Comment on a proposal, on one of its entries, or on frames of an entry."""
+    at = parse(place)
+    path, kind = _entry(entry)
+    with connect(context) as marey:
+        made = at.on(marey).proposals.at(number).comment(text, path=path, kind=kind, frames=_frames(frames))
+    if as_json:
+        return print_json(made)
+    return print_message(f"added the comment {made.number}")
+
+
+def _entry(text: str | None) -> tuple[str | None, Kind | None]:
+    if text is None:
+        return None, None
+    path, colon, kind = text.rpartition(":")
+    if not colon or kind not in set(Kind):
+        raise WrongUsage(f"{text!r} names no kind; write path:kind, such as raw/walk:clip")
+    return path.strip("/"), Kind(kind)
+
+
+def _frames(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    first, _, end = text.partition(":")
+    if not first.isdecimal() or not end.isdecimal():
+        raise WrongUsage(f"{text!r} names no frames; write the first one and the one after the last, such as 120:180")
+    return int(first), int(end)
+
+
+@proposal.command("review")
+def review(
+    context: typer.Context,
+    place: DatasetPlace,
+    number: Number,
+    verdict: Annotated[Verdict, typer.Argument(help="Verdict on the newest commit.")],
+    text: Annotated[str, typer.Option("--message", "-m", help="Reasons.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Review the newest commit of a proposal. A later commit makes an approval stale."""
+    at = parse(place)
+    with connect(context) as marey:
+        made = at.on(marey).proposals.at(number).review(verdict, text)
+    if as_json:
+        return print_json(made)
+    return print_message(f"recorded {made.verdict} for {short(made.commit)}")
+
+
+@proposal.command("check")
+def check(
+    context: typer.Context,
+    place: DatasetPlace,
+    number: Number,
+    name: Annotated[str, typer.Argument(help="Name of the check, such as evaluation.")],
+    state: Annotated[CheckState, typer.Argument(help="State of the check.")],
+    job: Annotated[str | None, typer.Option(help="Job that checks; a success needs a job that has succeeded.")] = None,
+    link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
+    text: Annotated[str, typer.Option("--message", "-m", help="Result in words.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Report the state of a check of the newest commit of a proposal."""
+    at = parse(place)
+    with connect(context) as marey:
+        made = at.on(marey).proposals.at(number).report_check(name, state, text=text, job=job, link=link)
+    if as_json:
+        return print_json(made)
+    return print_message(f"the check {made.name} of {short(made.commit)} is {made.state}")
+
+
+@proposal.command("merge")
+def merge(
+    context: typer.Context,
+    place: DatasetPlace,
+    number: Number,
+    message: CommitMessage = "",
+    ours: Ours = None,
+    theirs: Theirs = None,
+    base: Base = None,
+    when_green: Annotated[
+        bool, typer.Option("--when-green", help="If something is missing, merge as soon as nothing is.")
+    ] = False,
+    withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw an earlier --when-green.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Merge a proposal into its target. The command lists what is missing if it cannot be merged."""
+    at = parse(place)
+    with connect(context) as marey:
+        handle = at.on(marey).proposals.at(number)
+        if withdraw:
+            found = handle.withdraw_merge()
+        else:
+            resolutions = resolutions_of(ours, theirs, base)
+            found = handle.merge(message=message, resolutions=resolutions, when_green=when_green)
+    return print_json(found) if as_json else print_message(_outcome(found))
+
+
+def _outcome(found: Proposal) -> str:
+    if found.state is ProposalState.MERGED:
+        return f"merged; {found.target} is at {short(found.merged)} now"
+    if found.when_green is not None:
+        return f"the proposal {found.number} will be merged for {found.when_green} as soon as nothing is missing"
+    return f"the proposal {found.number} waits for a merge"
+
+
+@proposal.command("close")
+def close(context: typer.Context, place: DatasetPlace, number: Number, as_json: AsJson = False) -> None:
+    """Close a proposal without merging it; only its author and maintainers may do this."""
+    at = parse(place)
+    with connect(context) as marey:
+        found = at.on(marey).proposals.at(number).close()
+    return print_json(found) if as_json else print_message(f"closed the proposal {found.number}")
+
+
+# -- protection -------------------------------------------------------------------------------------------------------
+
+
+def protect(
+    context: typer.Context,
+    place: VersionPlace,
+    role: Annotated[
+        str, typer.Option(help="Least role of a user who may move the branch: contributor, maintainer or owner.")
+    ] = "contributor",
+    direct_commits: Annotated[
+        bool, typer.Option("--direct-commits", help="Allow commits and merges without a proposal.")
+    ] = False,
+    approvals: Annotated[int, typer.Option(min=0, help="Approvals that a proposal needs, without the author's.")] = 0,
+    checks: Annotated[
+        list[str] | None, typer.Option("--check", metavar="NAME", help="Check that must succeed; can be repeated.")
+    ] = None,
+    up_to_date: Annotated[
+        bool, typer.Option("--up-to-date", help="A proposal must contain the newest commit of the branch.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Protect a branch: it can be neither deleted nor reset, and moves only as the options allow."""
+    from marey_schemas.datasets.protection import ProtectionRule
+
+    at = parse(place, version=True)
+    rule = ProtectionRule.model_validate(
+        {
+            "role": role, "direct_commits": direct_commits, "approvals": approvals, "checks": tuple(checks or ()),
+            "up_to_date": up_to_date,
+        }
+    )  # fmt: skip
+    with connect(context) as marey:
+        found = at.on(marey).protect(at.version, rule)
+    return print_json(found) if as_json else print_message(f"the branch {found.name} is protected")
+
+
+def unprotect(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -> None:
+    """Remove the protection of a branch."""
+    at = parse(place, version=True)
+    with connect(context) as marey:
+        found = at.on(marey).unprotect(at.version)
+    return print_json(found) if as_json else print_message(f"the branch {found.name} is not protected any more")

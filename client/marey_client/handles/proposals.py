@@ -1,0 +1,119 @@
+"""Proposals of a dataset: comments, reviews, checks and merges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from marey_client.paging import pages
+from marey_client.transport import Params, Transport, read_model
+from marey_schemas.datasets.merges import Resolution
+from marey_schemas.datasets.naming import MAIN
+from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
+from marey_schemas.datasets.proposals import (
+    CheckReport,
+    Comment,
+    CommentCreate,
+    Proposal,
+    ProposalCheck,
+    ProposalCreate,
+    ProposalDetail,
+    ProposalMerge,
+    Review,
+    ReviewCreate,
+)
+from marey_schemas.kinds import Kind
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """Proposals of a dataset."""
+
+    transport: Transport
+    url: str
+
+    def open(self, title: str, source: str, *, into: str = MAIN, description: str = "") -> ProposalHandle:
+        """Propose to merge a version into a branch. A proposal of a branch includes the branch's later commits."""
+        request = ProposalCreate(title=title, source=source, target=into, description=description)
+        return self.at(self.transport.post(Proposal, self.url, request).number)
+
+    def list(self, state: ProposalState | None = None) -> Iterator[Proposal]:
+        """List the proposals, newest first; with `state`, only those in this state."""
+        query: Params = {} if state is None else {"state": state.value}
+        return pages(self.transport, Proposal, self.url, query)
+
+    def at(self, number: int) -> ProposalHandle:
+        """Return a handle of the proposal with this number; no request is sent."""
+        return ProposalHandle(self.transport, f"{self.url}/{number}")
+
+
+@dataclass(frozen=True)
+class ProposalHandle:
+    """Handle of a proposal; requests are sent only by its methods."""
+
+    transport: Transport
+    url: str
+
+    def read(self) -> ProposalDetail:
+        """Return the proposal with its reviews and checks, and what is missing before it can be merged."""
+        return self.transport.get(ProposalDetail, self.url)
+
+    def comment(
+        self,
+        text: str,
+        *,
+        path: str | None = None,
+        kind: Kind | None = None,
+        frames: tuple[int, int] | None = None,
+    ) -> Comment:
+        """Comment on the proposal, on the entry at `path` of a `kind`, or on its frames from one to before another."""
+        request = CommentCreate(text=text, path=path, kind=kind, frames=frames)
+        return self.transport.post(Comment, f"{self.url}/comments", request)
+
+    def comments(self) -> Iterator[Comment]:
+        """List the comments, oldest first."""
+        return pages(self.transport, Comment, f"{self.url}/comments")
+
+    def review(self, verdict: Verdict, text: str = "", *, commit: str | None = None) -> Review:
+        """Review the newest commit; raises `Conflict` if `commit` is given and the newest commit is another one."""
+        request = ReviewCreate(verdict=verdict, text=text, commit=commit)
+        return self.transport.post(Review, f"{self.url}/reviews", request)
+
+    def reviews(self) -> Iterator[Review]:
+        """List all reviews, oldest first."""
+        return pages(self.transport, Review, f"{self.url}/reviews")
+
+    def report_check(
+        self,
+        name: str,
+        state: CheckState,
+        *,
+        text: str = "",
+        job: str | None = None,
+        link: str | None = None,
+        commit: str | None = None,
+    ) -> ProposalCheck:
+        """Report the state of a check of the newest commit.
+
+        Raises `Conflict` if `commit` is given and the newest commit is another one, and if a success is reported of a
+        job that has not succeeded.
+        """
+        request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
+        return self.transport.post(ProposalCheck, f"{self.url}/checks", request)
+
+    def merge(self, *, message: str = "", resolutions: Sequence[Resolution] = (), when_green: bool = False) -> Proposal:
+        """Merge the proposal; with `when_green`, as soon as nothing is missing.
+
+        Raises `Conflict` with the code `proposal-not-green` if something is missing, with the list `missing` in the
+        context, and `merge-conflicts` if `resolutions` do not decide all conflicts.
+        """
+        request = ProposalMerge(message=message, resolutions=tuple(resolutions), when_green=when_green)
+        return self.transport.post(Proposal, f"{self.url}/merge", request)
+
+    def withdraw_merge(self) -> Proposal:
+        """Withdraw the request to merge the proposal as soon as nothing is missing."""
+        return read_model(Proposal, self.transport.send("DELETE", f"{self.url}/merge"))
+
+    def close(self) -> Proposal:
+        """Close the proposal without merging it; only its author and maintainers may do this."""
+        return self.transport.post(Proposal, f"{self.url}/close")

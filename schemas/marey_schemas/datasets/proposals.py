@@ -1,0 +1,190 @@
+"""Proposals to merge a version into a branch, with comments, reviews and checks, in requests and answers."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+
+from pydantic import Field, StringConstraints, model_validator
+
+from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.commits import EntryPath
+from marey_schemas.datasets.merges import EntryConflict, Resolution
+from marey_schemas.datasets.naming import MAIN, RefName, Version
+from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
+from marey_schemas.datasets.protection import CheckName
+from marey_schemas.kinds import Kind
+from marey_schemas.names import ItemId, Message
+
+MOST_TEXT = 10_000
+"""Greatest length of a description, a comment or the text of a review."""
+WITH_FRAMES = (Kind.CLIP, Kind.ANNOTATION)
+"""Kinds of entries that have frames on which somebody can comment."""
+
+Title = Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=MOST_TEXT)]
+Frame = Annotated[int, Field(ge=0, le=(1 << 31) - 1)]
+
+
+class ProposalCreate(Request):
+    """Request to propose that a version is merged into a branch."""
+
+    title: Title
+    description: str = Field("", max_length=MOST_TEXT)
+    source: Version = Field(
+        description="Version whose changes are proposed. A proposal of a branch includes its later commits."
+    )
+    target: RefName = Field(MAIN, description="Branch that gets the changes.")
+
+
+class CommentCreate(Request):
+    """Request to comment on a proposal, on one of its entries, or on frames of an entry."""
+
+    text: Text
+    path: EntryPath | None = Field(None, description="Path of the entry; null: the comment concerns the proposal.")
+    kind: Kind | None = Field(None, description="Kind of the entry.")
+    frames: tuple[Frame, Frame] | None = Field(
+        None, description="First frame, and the frame after the last one, of a clip or an annotation."
+    )
+
+    @model_validator(mode="after")
+    def _names_one_place(self) -> CommentCreate:
+        if (self.path is None) != (self.kind is None):
+            raise ValueError("name an entry by its path and its kind, or by neither")
+        if self.frames is not None:
+            if self.kind not in WITH_FRAMES:
+                raise ValueError("only clips and annotations have frames; name such an entry")
+            if self.frames[0] >= self.frames[1]:
+                raise ValueError("the second number of frames must be greater than the first")
+        return self
+
+
+class ReviewCreate(Request):
+    """Request to review the newest commit of a proposal."""
+
+    verdict: Verdict
+    text: str = Field("", max_length=MOST_TEXT)
+    commit: str | None = Field(
+        None, description="Commit that was reviewed; null: the newest one. Another commit than the newest is refused."
+    )
+
+
+class CheckReport(Request):
+    """Report of the state of a check of the newest commit of a proposal; it replaces the report before."""
+
+    name: CheckName
+    state: CheckState
+    commit: str | None = Field(
+        None, description="Commit that was checked; null: the newest one. Another commit than the newest is refused."
+    )
+    job: ItemId | None = Field(
+        None, description="Job of the project that checks; a check succeeds only if its job has succeeded."
+    )
+    link: Annotated[str, StringConstraints(max_length=2000, pattern=r"^https?://[^\s\x00-\x1f\x7f]+$")] | None = Field(
+        None, description="Address of a page about the check."
+    )
+    text: str = Field("", max_length=MOST_TEXT, description="Result in words.")
+
+
+class ProposalMerge(Request):
+    """Request to merge a proposal."""
+
+    message: Message = Field("", description="Message of the commit; empty: the number and title of the proposal.")
+    resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
+    when_green: bool = Field(
+        False, description="If something is missing, merge as soon as a review or a check adds the last missing thing."
+    )
+
+    @model_validator(mode="after")
+    def _can_wait(self) -> ProposalMerge:
+        if self.when_green and (self.resolutions or self.message):
+            raise ValueError("a merge that waits has neither resolutions nor a message; resolve conflicts in a commit")
+        return self
+
+
+class Proposal(Answer):
+    """A proposal to merge a version into a branch."""
+
+    number: int = Field(description="Number in the dataset, from 1.")
+    title: str
+    description: str
+    author: str
+    state: ProposalState
+    source: str = Field(description="Version whose changes are proposed, as the author named it.")
+    target: str = Field(description="Branch that gets the changes.")
+    head: str = Field(description="Digest of the proposed commit: the newest one, or the last one when it ended.")
+    target_commit: str | None = Field(
+        description="Digest of the newest commit of the target; after the end of the proposal, the one before its end."
+    )
+    merged: str | None = Field(description="Digest of the commit that the merge made.")
+    when_green: str | None = Field(
+        description="User on whose behalf the proposal is merged as soon as nothing is missing."
+    )
+    ended_by: str | None = Field(description="User who merged or closed the proposal.")
+    created_at: datetime
+    updated_at: datetime
+    ended_at: datetime | None
+    rev: int
+
+
+class Comment(Answer):
+    """A comment on a proposal."""
+
+    number: int = Field(description="Number in the proposal, from 1.")
+    author: str
+    text: str
+    path: str | None
+    kind: Kind | None
+    frames: tuple[int, int] | None
+    commit: str = Field(description="Digest of the newest proposed commit at the time of the comment.")
+    at: datetime
+
+
+class Review(Answer):
+    """A review of one commit of a proposal."""
+
+    number: int = Field(description="Number in the proposal, from 1.")
+    author: str
+    verdict: Verdict
+    text: str
+    commit: str = Field(description="Digest of the commit that was reviewed.")
+    stale: bool = Field(description="Whether the proposal has a later commit, for which an approval does not count.")
+    at: datetime
+
+
+class ProposalCheck(Answer):
+    """A check of one commit of a proposal."""
+
+    name: str
+    state: CheckState
+    commit: str = Field(description="Digest of the commit that was checked.")
+    job: str | None
+    link: str | None
+    text: str
+    reporter: str
+    at: datetime
+
+
+class Missing(Answer):
+    """Reason for which a proposal cannot be merged yet."""
+
+    code: str
+    detail: str
+
+
+class Mergeability(Answer):
+    """Result that the merge of a proposal would have now."""
+
+    missing: tuple[Missing, ...] = Field(description="Reasons for which it cannot be merged yet; empty: it is green.")
+    changes: int | None = Field(description="Number of entries that would change; null: it could not be computed.")
+    conflict_count: int | None = Field(description="Number of conflicts; null: it could not be computed.")
+    conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts, by path.")
+
+
+class ProposalDetail(Proposal):
+    """A proposal with its reviews, checks and mergeability."""
+
+    comments: int = Field(description="Number of comments.")
+    reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")
+    checks: tuple[ProposalCheck, ...] = Field(description="Checks of the newest proposed commit, by name.")
+    mergeability: Mergeability | None = Field(description="Null after the end of the proposal.")

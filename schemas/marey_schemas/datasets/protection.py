@@ -1,0 +1,53 @@
+"""Protection of branches in requests and answers."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field, StringConstraints, model_validator
+
+from marey_schemas.access import Role
+from marey_schemas.base import Request
+
+MOST_REQUIRED = 20
+"""Greatest number of approvals, and of checks, that a rule can require."""
+
+CheckName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
+"""Name of a check of a proposal, such as `evaluation`."""
+
+
+class ProtectionRule(Request):
+    """Rule of a branch: who may move it, and what a proposal needs before it is merged into the branch.
+
+    A branch with a rule cannot be deleted, and moves only to commits that follow its newest one.
+    """
+
+    role: Role = Field(Role.CONTRIBUTOR, description="Least role of a user who may move the branch.")
+    direct_commits: bool = Field(
+        False, description="Allow commits and merges without a proposal; impossible if approvals or checks are needed."
+    )
+    approvals: int = Field(
+        0, ge=0, le=MOST_REQUIRED, description="Number of other users than the author who must approve a proposal."
+    )
+    checks: tuple[CheckName, ...] = Field(
+        (), max_length=MOST_REQUIRED, description="Checks that must have succeeded for the proposed commit."
+    )
+    up_to_date: bool = Field(
+        False,
+        description="Whether a proposal must contain the newest commit of the branch, so that reviewers and checks "
+        "have seen exactly the version that the merge makes.",
+    )
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> ProtectionRule:
+        if self.role is Role.READER:
+            raise ValueError("readers cannot move a branch; the least role is contributor")
+        if self.direct_commits and (self.approvals or self.checks or self.up_to_date):
+            raise ValueError("direct commits would bypass the approvals and checks; allow them only without these")
+        return self
+
+
+class Protection(ProtectionRule):
+    """Rule of a protected branch, as shown with the branch."""
+
+    model_config = ConfigDict(extra="ignore")

@@ -1,0 +1,254 @@
+"""Merges of proposals: a read prepares the merge, and a short write checks what is required and records it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, func, select
+
+from marey_schemas.access import Role
+from marey_schemas.datasets.merges import MergeRequest
+from marey_schemas.datasets.proposal_states import ProposalState
+from marey_schemas.datasets.proposals import Mergeability, Missing, Proposal, ProposalDetail, ProposalMerge
+from marey_schemas.datasets.protection import Protection
+from marey_server.errors import ApiProblem, ConflictProblem, InvalidProblem
+from marey_server.store import projects
+from marey_server.store.datasets.committing import branch_moved
+from marey_server.store.datasets.merging import LARGE_MERGE, PreparedMerge, prepare_merge, record_merge
+from marey_server.store.datasets.naming import find_dataset, find_ref
+from marey_server.store.datasets.proposals.opening import end, find_proposal, lock_open, shown_proposal, touch
+from marey_server.store.datasets.proposals.requirements import checks_of, find_missing, shown_review, verdicts_of
+from marey_server.store.datasets.protection import Mover, require_move, rule_of
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import member, proposal_comment, user
+from marey_server.store.transaction import Transaction
+
+MOST_PREVIEWED = 10_000
+"""Greatest number of changed entries on a side of a merge whose result is computed when a proposal is read."""
+MOST_SHOWN_CONFLICTS = 100
+
+WAITING_MERGE = ProposalMerge()
+"""Merge that is recorded when a review or a check adds the last missing thing."""
+
+
+@dataclass(frozen=True)
+class PreparedAcceptance:
+    """Merge of a proposal that was computed, but not recorded, or the error because of which there is none."""
+
+    request: MergeRequest
+    merge: PreparedMerge | None
+    refusal: ApiProblem | None
+
+
+# -- preparing --------------------------------------------------------------------------------------------------------
+
+
+def prepare_acceptance(
+    tx: Transaction, project: str, name: str, number: int, request: ProposalMerge
+) -> PreparedAcceptance | None:
+    """Compute the merge of a proposal; return None if it has ended."""
+    found = find_dataset(tx, projects.require(tx, project), name)
+    row = find_proposal(tx, found.id, number)
+    return None if row.state != ProposalState.OPEN else _prepare(tx, project, name, row, request)
+
+
+def prepare_waiting(tx: Transaction, project: str, name: str, number: int) -> PreparedAcceptance | None:
+    """Compute the merge of a proposal that is to be merged as soon as nothing is missing; return None for others."""
+    found = find_dataset(tx, projects.require(tx, project), name)
+    row = find_proposal(tx, found.id, number)
+    return None if row.when_green_id is None else _prepare(tx, project, name, row, WAITING_MERGE)
+
+
+def _prepare(
+    tx: Transaction, project: str, name: str, row: Row[Any], request: ProposalMerge, most: int | None = None
+) -> PreparedAcceptance:
+    message = request.message or f"Merge proposal {row.number}: {row.title}"
+    merge = MergeRequest(into=row.target, version=row.head_now, message=message, resolutions=request.resolutions)
+    try:
+        return PreparedAcceptance(merge, prepare_merge(tx, project, name, merge, most=most), None)
+    except (ConflictProblem, InvalidProblem) as refusal:
+        return PreparedAcceptance(merge, None, refusal)
+
+
+# -- what is missing --------------------------------------------------------------------------------------------------
+
+
+def _missing(
+    tx: Transaction, project_row: ProjectRow, row: Row[Any], prepared: PreparedAcceptance
+) -> tuple[Missing, ...]:
+    """Return the reasons for which an open proposal cannot be merged yet."""
+    rule = _rule(tx, row)
+    return (*find_missing(tx, project_row.id, row, rule), *_obstacles(prepared, rule))
+
+
+def _rule(tx: Transaction, row: Row[Any]) -> Protection | None:
+    ref = find_ref(tx, row.dataset_id, row.target)
+    return None if ref is None else rule_of(ref)
+
+
+def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
+    """Return the reasons that lie in the two versions."""
+    if prepared.refusal is not None and prepared.refusal.error_code != LARGE_MERGE:
+        yield Missing(code=prepared.refusal.error_code, detail=prepared.refusal.detail)
+    if prepared.merge is None:
+        return
+    answer = prepared.merge.answer
+    if answer.conflict_count:
+        yield Missing(
+            code="merge-conflicts",
+            detail="Both sides have changed the same entries. Merge the target into the source and resolve the "
+            "conflicts there, or send resolutions with the merge.",
+        )
+    if rule is not None and rule.up_to_date and answer.base != answer.ours:
+        yield Missing(
+            code="not-up-to-date",
+            detail="The branch has commits that the proposal does not contain. Merge the branch into the source first.",
+        )
+
+
+def read_proposal(tx: Transaction, project: str, name: str, number: int) -> ProposalDetail:
+    """Return a proposal with its reviews, the checks of its newest commit, and the result that a merge would have."""
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    row = find_proposal(tx, found.id, number)
+    of_proposal = (proposal_comment.c.dataset_id == found.id, proposal_comment.c.proposal == number)
+    mergeability = None
+    if row.state == ProposalState.OPEN:
+        prepared = _prepare(tx, project, name, row, WAITING_MERGE, MOST_PREVIEWED)
+        mergeability = _shown(prepared.merge, _missing(tx, project_row, row, prepared))
+    return ProposalDetail(
+        **dict(shown_proposal(row)),
+        comments=tx.execute(select(func.count()).where(*of_proposal)).scalar_one(),
+        reviews=tuple(shown_review(one, row.head_now) for one in verdicts_of(tx, project_row.id, row)),
+        checks=tuple(checks_of(tx, row).values()),
+        mergeability=mergeability,
+    )
+
+
+def _shown(merge: PreparedMerge | None, missing: tuple[Missing, ...]) -> Mergeability:
+    if merge is None:
+        return Mergeability(missing=missing, changes=None, conflict_count=None, conflicts=())
+    answer = merge.answer
+    return Mergeability(
+        missing=missing, changes=answer.changes, conflict_count=answer.conflict_count,
+        conflicts=answer.conflicts[:MOST_SHOWN_CONFLICTS],
+    )  # fmt: skip
+
+
+# -- merging ----------------------------------------------------------------------------------------------------------
+
+
+def merge_proposal(
+    tx: Transaction, project: str, name: str, number: int, request: ProposalMerge, prepared: PreparedAcceptance | None
+) -> Proposal:
+    """Merge a proposal, or, with `when_green`, merge it later if something is missing.
+
+    Raises `ConflictProblem` if the proposal has ended, if something is missing, or if a branch has moved since the
+    merge was prepared, and what `require_move` raises.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    row = lock_open(tx, found.id, number)
+    mover = Mover(tx.principal.user_name or "", project_row.role, by_proposal=True)
+    _require_mover(tx, row, mover)
+    prepared = _require_current(row, prepared)
+    missing = _missing(tx, project_row, row, prepared)
+    if missing and request.when_green:
+        touch(tx, row, when_green_id=tx.principal.user_id)
+        tx.emit("proposal.waiting", found.id, project_id=project_row.id, number=number)
+    else:
+        _require_green(prepared, missing)
+        _record(tx, project, name, row, prepared, mover, tx.principal.user_id)
+    return shown_proposal(find_proposal(tx, found.id, number))
+
+
+def _require_mover(tx: Transaction, row: Row[Any], mover: Mover) -> None:
+    ref = find_ref(tx, row.dataset_id, row.target)
+    if ref is not None:
+        require_move(ref, mover)
+
+
+def _require_current(row: Row[Any], prepared: PreparedAcceptance | None) -> PreparedAcceptance:
+    """Raise `ConflictProblem` if a branch has moved since the merge was prepared."""
+    if prepared is None or prepared.request.version != row.head_now:
+        raise branch_moved(row.source, row.head_now)
+    if prepared.merge is not None and prepared.merge.answer.ours != row.target_now:
+        raise branch_moved(row.target, row.target_now)
+    return prepared
+
+
+def _require_green(prepared: PreparedAcceptance, missing: tuple[Missing, ...]) -> None:
+    if prepared.refusal is not None:
+        raise prepared.refusal
+    if missing and [one.code for one in missing] != ["merge-conflicts"]:
+        raise ConflictProblem(
+            f"The proposal cannot be merged yet. {' '.join(one.detail for one in missing)}",
+            code="proposal-not-green",
+            context={"missing": [one.model_dump(mode="json") for one in missing]},
+        )
+
+
+def _record(
+    tx: Transaction,
+    project: str,
+    name: str,
+    row: Row[Any],
+    prepared: PreparedAcceptance,
+    mover: Mover,
+    user_id: str | None,
+) -> None:
+    """Record the merge of a locked proposal, and end the proposal."""
+    assert prepared.merge is not None
+    answer = record_merge(tx, project, name, prepared.request, prepared.merge, mover)
+    assert answer.commit is not None
+    end(tx, row, ProposalState.MERGED, merged=answer.commit.digest, ended_id=user_id)
+    tx.emit(
+        "proposal.merged", row.dataset_id, project_id=projects.require(tx, project).id, number=row.number,
+        commit=answer.commit.digest, merged_by=mover.name,
+    )  # fmt: skip
+
+
+def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Proposal:
+    """Let a proposal wait for a request to merge it, although somebody has sent one with `when_green`."""
+    found = find_dataset(tx, projects.require(tx, project), name)
+    row = lock_open(tx, found.id, number)
+    if row.when_green_id is not None:
+        touch(tx, row, when_green_id=None)
+    return shown_proposal(find_proposal(tx, found.id, number))
+
+
+def merge_if_green(
+    tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
+) -> None:
+    """Merge a locked proposal that waits for this, if nothing is missing any more.
+
+    Nothing happens if the user who asked for the merge may no longer move the branch. Raises `ConflictProblem` if a
+    branch has moved since the merge was prepared.
+    """
+    if row.when_green_id is None:
+        return
+    project_row = projects.require(tx, project)
+    prepared = _require_current(row, prepared)
+    mover = _waiting_mover(tx, project_row, row)
+    if mover is None or _missing(tx, project_row, row, prepared):
+        return
+    _record(tx, project, name, row, prepared, mover, row.when_green_id)
+
+
+def _waiting_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Mover | None:
+    """Return the user who asked for the merge, None if that user may no longer move the branch."""
+    held = select(member.c.role).where(member.c.project_id == project_row.id, member.c.user_id == row.when_green_id)
+    role = tx.execute(held).scalar()
+    asked = tx.execute(select(user).where(user.c.id == row.when_green_id)).one()
+    if asked.administrator:
+        role = Role.OWNER
+    if role is None or asked.disabled:
+        return None
+    mover = Mover(asked.name, Role(role), by_proposal=True)
+    try:
+        _require_mover(tx, row, mover)
+    except ApiProblem:
+        return None
+    return mover

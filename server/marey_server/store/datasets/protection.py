@@ -1,0 +1,91 @@
+"""Protection of branches: decides whether a branch may be moved or deleted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Row, and_, or_, select
+
+from marey_schemas.access import Role
+from marey_schemas.datasets.proposal_states import ProposalState
+from marey_schemas.datasets.protection import Protection
+from marey_server.access import roles
+from marey_server.errors import ConflictProblem, ForbiddenProblem
+from marey_server.store.tables import dataset_ref, proposal
+from marey_server.store.transaction import Transaction
+
+CODE = "branch-protected"
+
+
+@dataclass(frozen=True)
+class Mover:
+    """User on whose behalf a branch moves, and whether a proposal that was accepted moves it."""
+
+    name: str
+    role: Role
+    by_proposal: bool = False
+
+
+def rule_of(ref: Row[Any]) -> Protection | None:
+    """Return the rule of a branch, None if it is not protected."""
+    return None if ref.protection is None else Protection.model_validate(ref.protection)
+
+
+def require_move(ref: Row[Any], mover: Mover) -> None:
+    """Raise an error if a branch may not move to a commit that follows its newest one.
+
+    Raises `ForbiddenProblem` if the role is too low, and `ConflictProblem` if only proposals move the branch.
+    """
+    rule = rule_of(ref)
+    if rule is None:
+        return
+    if not roles.includes(mover.role, rule.role):
+        raise ForbiddenProblem(
+            f"The branch {ref.name!r} is protected; moving it requires at least the role {rule.role.value}.", code=CODE
+        )
+    if not rule.direct_commits and not mover.by_proposal:
+        raise ConflictProblem(
+            f"The branch {ref.name!r} is protected. Commit to another branch, then open a proposal to merge it.",
+            code=CODE,
+        )
+
+
+def require_reset(ref: Row[Any]) -> None:
+    """Raise `ConflictProblem` if a branch may not move to a commit that does not follow its newest one."""
+    if ref.protection is not None:
+        raise ConflictProblem(
+            f"The branch {ref.name!r} is protected and cannot be reset; revert single commits instead.", code=CODE
+        )
+
+
+def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
+    """Raise `ConflictProblem` if a branch or a tag is protected, or if an open proposal is about it."""
+    if ref.protection is not None:
+        raise ConflictProblem(
+            f"The branch {ref.name!r} is protected; remove the protection before you delete it.", code=CODE
+        )
+    followed = and_(proposal.c.source == ref.name, proposal.c.head.is_(None))
+    about = select(proposal.c.number).where(
+        proposal.c.dataset_id == ref.dataset_id,
+        proposal.c.state == ProposalState.OPEN.value,
+        or_(followed, proposal.c.target == ref.name),
+    )
+    number = tx.execute(about.limit(1)).scalar()
+    if number is not None:
+        raise ConflictProblem(
+            f"The open proposal {number} is about the branch {ref.name!r}; merge or close the proposal first.",
+            code="proposal-open",
+            context={"proposal": number},
+        )
+
+
+def require_no_protected_branch(tx: Transaction, dataset_id: str) -> None:
+    """Raise `ConflictProblem` if a dataset has a protected branch."""
+    protected = select(dataset_ref).where(dataset_ref.c.dataset_id == dataset_id)
+    for ref in tx.execute(protected):
+        if ref.protection is not None:
+            raise ConflictProblem(
+                f"The branch {ref.name!r} is protected; remove the protection before you delete the dataset.",
+                code=CODE,
+            )

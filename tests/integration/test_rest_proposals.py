@@ -1,0 +1,384 @@
+"""Proposals over HTTP: protection, comments, reviews, checks and merges, with several users."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import update
+from tests.support.database_fixtures import BACKENDS, copied_sqlite, database_address, new_postgres_database
+from tests.support.furnished_house import MOTION
+from tests.support.rest_server import Server, running
+
+from marey_server.access.principal import SYSTEM
+from marey_server.store.database.connections import Database
+from marey_server.store.fsck import check_store
+from marey_server.store.tables import proposal
+from marey_server.store.transaction import Transaction
+
+LAB = "/projects/lab"
+GAITS = f"{LAB}/datasets/gaits"
+MAIN = f"{GAITS}/refs/main"
+PROPOSALS = f"{GAITS}/proposals"
+ANY = {"If-Match": "*"}
+on_sqlite = pytest.mark.parametrize("server", ["sqlite"], indirect=True)
+"""For rules that do not depend on the database."""
+
+
+def ok(response: httpx.Response, status: int = 200) -> Any:
+    assert response.status_code == status, response.text
+    return response.json()
+
+
+def refused(response: httpx.Response, status: int, code: str) -> Any:
+    assert (response.status_code, response.json().get("code")) == (status, code), response.text
+    return response.json()
+
+
+@dataclass(frozen=True)
+class Team:
+    """Clients of people with the roles of a project, of a stranger (eve), and items that commits can contain."""
+
+    olga: httpx.Client
+    mia: httpx.Client
+    ada: httpx.Client
+    ben: httpx.Client
+    rita: httpx.Client
+    eve: httpx.Client
+    items: tuple[str, ...]
+
+    def put(self, branch: str, path: str, item: int, **fields: Any) -> httpx.Response:
+        """Commit one entry to a branch."""
+        change = {"change": "put", "path": path, "item": self.items[item]}
+        return self.ada.post(f"{GAITS}/commits", json={"branch": branch, "message": path, "changes": [change]})
+
+    def propose(self, **fields: Any) -> int:
+        number: int = ok(self.ada.post(PROPOSALS, json={"title": "Trim", "source": "trial", **fields}), 201)["number"]
+        return number
+
+    def protect(self, **rule: Any) -> None:
+        ok(self.mia.put(f"{MAIN}/protection", json=rule, headers=ANY))
+
+    def missing(self, number: int) -> list[str]:
+        found = ok(self.rita.get(f"{PROPOSALS}/{number}"))["mergeability"]
+        return [one["code"] for one in found["missing"]]
+
+
+def skeleton(name: str) -> dict[str, Any]:
+    joints = [{"name": name, "parent": -1, "offset": [0, 1, 0]}]
+    return {"name": name, "parts": {"hierarchy": {"schema": "marey/skeleton@1", "joints": joints}}}
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The server of all tests over one kind of database; each test has a project `lab` of its own."""
+    folder = tmp_path_factory.mktemp("server")
+    with contextlib.ExitStack() as after:
+        if request.param == "sqlite":
+            url = copied_sqlite(request.getfixturevalue("sqlite_template"), folder)
+        else:
+            postgres = request.getfixturevalue("postgres_url")
+            url = database_address(after.enter_context(new_postgres_database(postgres, "proposals")))
+        database = Database(url)
+        after.callback(database.close)
+        yield after.enter_context(running(database, folder))
+
+
+@pytest.fixture(scope="module")
+def people(server: Server) -> dict[str, httpx.Client]:
+    """The people who use the server, by name."""
+    return {name: server.client(server.make_user(name)) for name in ("olga", "mia", "ada", "ben", "rita", "eve")}
+
+
+@pytest.fixture
+def team(people: dict[str, httpx.Client]) -> Iterator[Team]:
+    """The dataset `gaits`: one commit on `main`, another one on the branch `trial`."""
+    olga, ada = people["olga"], people["ada"]
+    ok(olga.post("/projects", json={"name": "lab"}), 201)
+    for name, role in (("mia", "maintainer"), ("ada", "contributor"), ("ben", "contributor"), ("rita", "reader")):
+        ok(olga.put(f"{LAB}/members/{name}", json={"role": role}))
+    items = tuple(ok(ada.post(f"{LAB}/skeletons", json=skeleton(name)), 201)["id"] for name in ("a", "b", "c"))
+    ok(ada.post(f"{LAB}/datasets", json={"name": "gaits"}), 201)
+    made = Team(**people, items=items)
+    ok(made.put("main", "a", 0), 201)
+    ok(ada.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
+    ok(made.put("trial", "b", 1), 201)
+    yield made
+    olga.delete(LAB, headers=ANY)
+
+
+def head(team: Team, branch: str) -> str:
+    commit: str = ok(team.rita.get(f"{GAITS}/refs/{branch}"))["commit"]
+    return commit
+
+
+def approve(client: httpx.Client, number: int, verdict: str = "approve", **fields: Any) -> Any:
+    return ok(client.post(f"{PROPOSALS}/{number}/reviews", json={"verdict": verdict, **fields}), 201)
+
+
+def check(client: httpx.Client, number: int, state: str, **fields: Any) -> httpx.Response:
+    return client.post(f"{PROPOSALS}/{number}/checks", json={"name": "evaluation", "state": state, **fields})
+
+
+def test_a_proposal_is_reviewed_checked_and_merged(team: Team, server: Server) -> None:
+    team.protect(approvals=1, checks=["evaluation"])
+    number = team.propose(description="why")
+    assert number == 1
+    assert team.missing(1) == ["approvals", "check-missing"]
+    early = refused(team.ada.post(f"{PROPOSALS}/1/merge", json={}), 409, "proposal-not-green")
+    assert [one["code"] for one in early["context"]["missing"]] == ["approvals", "check-missing"]
+    approve(team.ada, 1)
+    assert "approvals" in team.missing(1)
+    approve(team.ben, 1)
+    ok(check(team.ben, 1, "failed"))
+    assert team.missing(1) == ["check-failed"]
+    ok(check(team.ben, 1, "succeeded", link="https://example.org/1"))
+    shown = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (shown["mergeability"]["missing"], shown["mergeability"]["changes"]) == ([], 1)
+    before, proposed = head(team, "main"), head(team, "trial")
+    merged = ok(team.ada.post(f"{PROPOSALS}/1/merge", json={}))
+    assert (merged["state"], merged["merged"], merged["ended_by"]) == ("merged", head(team, "main"), "ada")
+    assert (merged["head"], merged["target_commit"]) == (proposed, before)
+    refused(team.ben.post(f"{PROPOSALS}/1/merge", json={}), 409, "proposal-merged")
+    refused(team.ada.post(f"{PROPOSALS}/1/close"), 409, "proposal-merged")
+    refused(team.ben.post(f"{PROPOSALS}/1/comments", json={"text": "late"}), 409, "proposal-merged")
+    after = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert ([one["author"] for one in after["reviews"]], after["mergeability"]) == (["ada", "ben"], None)
+    assert not list(check_store(server.database))
+
+
+def test_a_protected_branch_moves_by_proposals_alone(team: Team) -> None:
+    team.protect()
+    refused(team.put("main", "c", 2), 409, "branch-protected")
+    ok(team.put("trial", "c", 2), 201)
+    refused(team.mia.post(f"{GAITS}/merges", json={"version": "trial"}), 409, "branch-protected")
+    refused(team.mia.post(f"{GAITS}/cherry-picks", json={"version": "trial"}), 409, "branch-protected")
+    refused(team.mia.post(f"{GAITS}/reverts", json={"version": "main"}), 409, "branch-protected")
+    refused(team.mia.patch(MAIN, json={"at": "trial"}, headers=ANY), 409, "branch-protected")
+    refused(team.mia.delete(GAITS, headers=ANY), 409, "branch-protected")
+    assert ok(team.rita.get(MAIN))["protection"]["direct_commits"] is False
+    team.propose()
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={}))
+    assert head(team, "main") == head(team, "trial")
+    refused(team.ada.delete(f"{MAIN}/protection", headers=ANY), 403, "insufficient-role")
+    assert ok(team.mia.delete(f"{MAIN}/protection", headers=ANY))["protection"] is None
+    ok(team.ben.post(f"{GAITS}/reverts", json={"version": "main"}))
+
+
+@on_sqlite
+def test_a_rule_names_the_least_role_and_protects_from_deletion(team: Team) -> None:
+    trial = f"{GAITS}/refs/trial"
+    ok(team.mia.put(f"{trial}/protection", json={"role": "maintainer", "direct_commits": True}, headers=ANY))
+    refused(team.put("trial", "c", 2), 403, "branch-protected")
+    ok(team.mia.post(f"{GAITS}/reverts", json={"version": "trial", "into": "trial"}))
+    refused(team.mia.delete(trial, headers=ANY), 409, "branch-protected")
+    for wrong in ({"role": "reader"}, {"direct_commits": True, "approvals": 1}):
+        assert team.mia.put(f"{trial}/protection", json=wrong, headers=ANY).status_code == 422
+    ok(team.ada.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag"}), 201)
+    refused(team.mia.put(f"{GAITS}/refs/v1/protection", json={}, headers=ANY), 422, "is-tag")
+    refused(team.mia.put(f"{GAITS}/refs/v2/protection", json={}, headers=ANY), 404, "no-version")
+
+
+def test_a_later_commit_makes_approvals_and_checks_stale(team: Team) -> None:
+    team.protect(approvals=1, checks=["evaluation"])
+    team.propose()
+    approve(team.ben, 1)
+    ok(check(team.ben, 1, "succeeded"))
+    assert team.missing(1) == []
+    old = head(team, "trial")
+    ok(team.put("trial", "c", 2), 201)
+    assert team.missing(1) == ["approvals", "check-missing"]
+    assert [one["stale"] for one in ok(team.rita.get(f"{PROPOSALS}/1"))["reviews"]] == [True]
+    for late in (
+        team.ben.post(f"{PROPOSALS}/1/reviews", json={"verdict": "approve", "commit": old}),
+        check(team.ben, 1, "succeeded", commit=old),
+    ):
+        refused(late, 409, "proposal-moved")
+
+
+@on_sqlite
+def test_a_request_for_changes_holds_until_its_author_approves(team: Team) -> None:
+    team.propose()
+    approve(team.ben, 1, "request-changes", text="too short")
+    ok(team.put("trial", "c", 2), 201)
+    approve(team.ben, 1, "comment")
+    refused(team.ada.post(f"{PROPOSALS}/1/merge", json={}), 409, "proposal-not-green")
+    approve(team.ben, 1)
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={}))
+    assert len(ok(team.rita.get(f"{PROPOSALS}/1/reviews"))["items"]) == 3
+
+
+@on_sqlite
+def test_an_approval_counts_only_while_its_author_may_write(team: Team) -> None:
+    team.protect(approvals=1)
+    team.propose()
+    approve(team.ben, 1)
+    assert team.missing(1) == []
+    ok(team.olga.put(f"{LAB}/members/ben", json={"role": "reader"}))
+    assert team.missing(1) == ["approvals"]
+
+
+@on_sqlite
+def test_conflicts_are_listed_and_decided(team: Team) -> None:
+    ok(team.put("main", "b", 2), 201)
+    team.propose()
+    found = ok(team.rita.get(f"{PROPOSALS}/1"))["mergeability"]
+    assert ([one["code"] for one in found["missing"]], found["conflict_count"]) == (["merge-conflicts"], 1)
+    refused(team.ada.post(f"{PROPOSALS}/1/merge", json={}), 409, "merge-conflicts")
+    resolution = {"path": "b", "kind": "skeleton", "take": "theirs"}
+    merged = ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"resolutions": [resolution]}))
+    assert len(ok(team.rita.get(f"{GAITS}/commits/{merged['merged']}"))["parents"]) == 2
+
+
+@on_sqlite
+def test_an_up_to_date_proposal_contains_the_newest_commit(team: Team) -> None:
+    ok(team.put("main", "c", 2), 201)
+    team.protect(up_to_date=True)
+    team.propose()
+    assert team.missing(1) == ["not-up-to-date"]
+    ok(team.ada.post(f"{GAITS}/merges", json={"version": "main", "into": "trial"}))
+    assert team.missing(1) == []
+    merged = ok(team.ada.post(f"{PROPOSALS}/1/merge", json={}))
+    assert merged["merged"] == merged["head"]
+
+
+def test_a_proposal_is_merged_when_the_last_thing_arrives(team: Team, server: Server) -> None:
+    team.protect(approvals=1, checks=["evaluation"], role="maintainer")
+    team.propose()
+    refused(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}), 403, "branch-protected")
+    waiting = ok(team.mia.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    assert (waiting["state"], waiting["when_green"]) == ("open", "mia")
+    approve(team.ben, 1)
+    assert ok(team.ada.delete(f"{PROPOSALS}/1/merge"))["when_green"] is None
+    ok(team.mia.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    ok(check(team.ben, 1, "succeeded"))
+    merged = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (merged["state"], merged["ended_by"]) == ("merged", "mia")
+    assert ok(team.rita.get(MAIN))["commit"] == merged["merged"]
+    assert not list(check_store(server.database))
+
+
+@on_sqlite
+def test_comments_name_entries_and_frames(team: Team) -> None:
+    team.propose()
+    url = f"{PROPOSALS}/1/comments"
+    about = ok(team.ben.post(url, json={"text": "left foot", "path": "b", "kind": "skeleton"}), 201)
+    assert (about["number"], about["author"], about["commit"]) == (1, "ben", head(team, "trial"))
+    refused(team.ben.post(url, json={"text": "x", "path": "z", "kind": "skeleton"}), 404, "no-entry")
+    refused(team.ben.post(url, json={"text": "x", "path": "b", "kind": "clip", "frames": [3, 9]}), 404, "no-entry")
+    for wrong in (
+        {"path": "b"}, {"frames": [3, 9]}, {"path": "b", "kind": "skeleton", "frames": [3, 9]},
+        {"path": "b", "kind": "clip", "frames": [9, 3]}, {"text": "y" * 10_001},
+    ):  # fmt: skip
+        assert team.ben.post(url, json={"text": "x", **wrong}).status_code == 422
+    assert [one["text"] for one in ok(team.rita.get(url))["items"]] == ["left foot"]
+
+
+def test_lists_filter_by_state_and_numbers_count_up(team: Team) -> None:
+    assert [team.propose(), team.propose(source="trial~1"), team.propose()] == [1, 2, 3]
+    refused(team.ben.post(f"{PROPOSALS}/2/close"), 403, "not-author")
+    closed = ok(team.ada.post(f"{PROPOSALS}/2/close"))
+    assert (closed["state"], closed["head"]) == ("closed", head(team, "main"))
+    refused(team.mia.post(f"{PROPOSALS}/2/merge", json={}), 409, "proposal-closed")
+    assert [one["number"] for one in ok(team.rita.get(PROPOSALS))["items"]] == [3, 2, 1]
+    found = ok(team.rita.get(PROPOSALS, params={"state": "open", "limit": 1}))
+    assert [one["number"] for one in found["items"]] == [3]
+    rest = ok(team.rita.get(PROPOSALS, params={"state": "open", "cursor": found["next_cursor"]}))
+    assert [one["number"] for one in rest["items"]] == [1]
+    refused(team.rita.get(f"{PROPOSALS}/9"), 404, "no-proposal")
+
+
+def test_branches_of_open_proposals_stay(team: Team) -> None:
+    team.propose()
+    trial = f"{GAITS}/refs/trial"
+    refused(team.mia.delete(trial, headers=ANY), 409, "proposal-open")
+    ok(team.ada.post(f"{PROPOSALS}/1/close"))
+    proposed = head(team, "trial")
+    assert team.mia.delete(trial, headers=ANY).status_code == 204
+    assert ok(team.rita.get(f"{PROPOSALS}/1"))["head"] == proposed
+
+
+@on_sqlite
+def test_wrong_versions_and_full_lists_are_refused(team: Team, monkeypatch: pytest.MonkeyPatch) -> None:
+    def propose(**fields: Any) -> httpx.Response:
+        return team.ada.post(PROPOSALS, json={"title": "t", "source": "trial", **fields})
+
+    refused(propose(source="main"), 422, "same-branch")
+    refused(propose(source="nothing"), 404, "no-version")
+    refused(propose(target="nothing"), 404, "no-version")
+    assert propose(title="").status_code == 422
+    refused(team.rita.post(PROPOSALS, json={"title": "t", "source": "trial"}), 403, "insufficient-role")
+    monkeypatch.setattr("marey_server.store.datasets.proposals.opening.MOST_OPEN", 1)
+    monkeypatch.setattr("marey_server.store.datasets.proposals.discussing.MOST_OF_EACH", 1)
+    ok(propose(source="main~0", target="trial"), 201)
+    assert team.missing(1) == ["already-merged"]
+    refused(propose(), 409, "too-many-proposals")
+    for _ in range(2):
+        ok(check(team.ben, 1, "pending"))
+    refused(check(team.ben, 1, "pending", name="other"), 409, "long-proposal")
+
+
+@on_sqlite
+def test_a_check_by_a_job_succeeds_only_with_the_job(team: Team) -> None:
+    team.propose()
+    motion = {**MOTION, "skeleton": {"item": team.items[0], "revision": 1}, "joints": ["a"]}
+    clip = ok(team.ben.post(f"{LAB}/clips", json={"name": "w", "parts": {"motion": motion}}), 201)["id"]
+    job = {"kind": "export", "inputs": {"clips": [{"item": clip}]}}
+    unfinished = ok(team.ben.post(f"{LAB}/jobs", json=job), 202)["id"]
+    ok(check(team.ben, 1, "pending", job=unfinished))
+    refused(check(team.ben, 1, "succeeded", job=unfinished), 409, "job-not-succeeded")
+    refused(check(team.ben, 1, "pending", job="job_of_nobody"), 404, "no-job")
+
+
+def test_of_two_who_merge_or_close_at_once_one_wins(team: Team, server: Server) -> None:
+    team.propose()
+    requests = [partial(client.post, f"{PROPOSALS}/1/merge", json={}) for client in (team.ada, team.ben)]
+    requests += [partial(client.post, f"{PROPOSALS}/1/close") for client in (team.ada, team.mia)]
+    with ThreadPoolExecutor(4) as threads:
+        answers = [one.result() for one in [threads.submit(request) for request in requests]]
+    assert sorted(one.status_code for one in answers) == [200, 409, 409, 409]
+    (won,) = (one.json() for one in answers if one.status_code == 200)
+    lost = {one.json()["code"] for one in answers if one.status_code == 409}
+    assert lost <= {f"proposal-{won['state']}", "branch-moved"}
+    assert (head(team, "main") == head(team, "trial")) == (won["state"] == "merged")
+    assert not list(check_store(server.database))
+
+
+def test_a_repeated_request_gets_the_same_answer(team: Team) -> None:
+    team.protect(approvals=1)
+    for url, body in (
+        (PROPOSALS, {"title": "t", "source": "trial"}),
+        (f"{PROPOSALS}/1/comments", {"text": "x"}),
+        (f"{PROPOSALS}/1/reviews", {"verdict": "approve"}),
+        (f"{PROPOSALS}/1/merge", {}),
+    ):
+        client = team.ada if url == PROPOSALS else team.ben
+        answers = [client.post(url, json=body, headers={"Idempotency-Key": url}) for _ in range(2)]
+        assert answers[0].is_success
+        assert answers[0].json() == answers[1].json()
+    assert len(ok(team.rita.get(f"{PROPOSALS}/1/comments"))["items"]) == 1
+
+
+@on_sqlite
+def test_a_hidden_project_hides_its_proposals(team: Team) -> None:
+    team.propose()
+    for url in (PROPOSALS, f"{PROPOSALS}/1", f"{PROPOSALS}/1/comments", f"{PROPOSALS}/1/reviews", MAIN):
+        refused(team.eve.get(url), 404, "no-project")
+    refused(team.eve.post(f"{PROPOSALS}/1/merge", json={}), 404, "no-project")
+
+
+def test_damaged_proposals_are_found(team: Team, server: Server) -> None:
+    team.propose()
+
+    def damage(tx: Transaction) -> None:
+        tx.execute(update(proposal).where(proposal.c.head.is_(None)).values(source="gone"))
+
+    server.database.write(SYSTEM, damage)
+    assert {one.code for one in check_store(server.database)} == {"proposal-corrupt"}
+    server.database.write(SYSTEM, lambda tx: tx.execute(update(proposal).values(source="trial")))
