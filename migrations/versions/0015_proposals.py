@@ -33,6 +33,7 @@ def upgrade() -> None:
         sa.Column("target_commit", DIGEST, nullable=True),
         sa.Column("merged", DIGEST, nullable=True),
         sa.Column("when_green_id", ID, nullable=True),
+        sa.Column("when_green_head", DIGEST, nullable=True),
         sa.Column("ended_id", ID, nullable=True),
         sa.Column("created_us", sa.BigInteger(), nullable=False),
         sa.Column("updated_us", sa.BigInteger(), nullable=False),
@@ -48,7 +49,7 @@ def upgrade() -> None:
             sa.ForeignKeyConstraint(
                 ["dataset_id", column], COMMIT, name=f"fk_proposal_dataset_id_{column}_dataset_commit"
             )
-            for column in ("head", "target_commit", "merged")
+            for column in ("head", "target_commit", "merged", "when_green_head")
         ),
     )
     op.create_index("ix_proposal_state", "proposal", ["dataset_id", "state", "number"])

@@ -192,14 +192,22 @@ def test_a_later_commit_makes_approvals_and_checks_stale(team: Team) -> None:
     ok(check(team.ben, 1, "succeeded"))
     assert team.missing(1) == []
     old = head(team, "trial")
+    ok(team.mia.put(f"{MAIN}/protection", json={"approvals": 2, "checks": ["evaluation"]}, headers=ANY))
+    assert ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True, "commit": old}))["when_green"] == "ada"
+    ok(team.mia.put(f"{MAIN}/protection", json={"approvals": 1, "checks": ["evaluation"]}, headers=ANY))
     ok(team.put("trial", "c", 2), 201)
     assert team.missing(1) == ["approvals", "check-missing"]
     assert [one["stale"] for one in ok(team.rita.get(f"{PROPOSALS}/1"))["reviews"]] == [True]
     for late in (
         team.ben.post(f"{PROPOSALS}/1/reviews", json={"verdict": "approve", "commit": old}),
-        check(team.ben, 1, "succeeded", commit=old),
+        check(team.ben, 1, "succeeded", commit=old[7:15]),
+        team.ada.post(f"{PROPOSALS}/1/merge", json={"commit": old}),
     ):
         refused(late, 409, "proposal-moved")
+    approve(team.ben, 1, commit=head(team, "trial"))
+    ok(check(team.ben, 1, "succeeded"))
+    waiting = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (waiting["state"], waiting["when_green"], waiting["mergeability"]["missing"]) == ("open", None, [])
 
 
 @on_sqlite

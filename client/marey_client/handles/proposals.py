@@ -101,13 +101,21 @@ class ProposalHandle:
         request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
         return self.transport.post(ProposalCheck, f"{self.url}/checks", request)
 
-    def merge(self, *, message: str = "", resolutions: Sequence[Resolution] = (), when_green: bool = False) -> Proposal:
+    def merge(
+        self,
+        *,
+        message: str = "",
+        resolutions: Sequence[Resolution] = (),
+        when_green: bool = False,
+        commit: str | None = None,
+    ) -> Proposal:
         """Merge the proposal; with `when_green`, as soon as nothing is missing.
 
         Raises `Conflict` with the code `proposal-not-green` if something is missing, with the list `missing` in the
-        context, and `merge-conflicts` if `resolutions` do not decide all conflicts.
+        context; `merge-conflicts` if `resolutions` do not decide all conflicts; and `proposal-moved` if `commit` is
+        given and the newest commit is another one.
         """
-        request = ProposalMerge(message=message, resolutions=tuple(resolutions), when_green=when_green)
+        request = ProposalMerge(message=message, resolutions=tuple(resolutions), when_green=when_green, commit=commit)
         return self.transport.post(Proposal, f"{self.url}/merge", request)
 
     def withdraw_merge(self) -> Proposal:

@@ -64,7 +64,7 @@ class ReviewCreate(Request):
 
     verdict: Verdict
     text: str = Field("", max_length=MOST_TEXT)
-    commit: str | None = Field(
+    commit: Version | None = Field(
         None, description="Commit that was reviewed; null: the newest one. Another commit than the newest is refused."
     )
 
@@ -74,7 +74,7 @@ class CheckReport(Request):
 
     name: CheckName
     state: CheckState
-    commit: str | None = Field(
+    commit: Version | None = Field(
         None, description="Commit that was checked; null: the newest one. Another commit than the newest is refused."
     )
     job: ItemId | None = Field(
@@ -91,8 +91,13 @@ class ProposalMerge(Request):
 
     message: Message = Field("", description="Message of the commit; empty: the number and title of the proposal.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
+    commit: Version | None = Field(
+        None, description="Commit to merge; null: the newest one. Another commit than the newest is refused."
+    )
     when_green: bool = Field(
-        False, description="If something is missing, merge as soon as a review or a check adds the last missing thing."
+        False,
+        description="If something is missing, merge as soon as a review or a check adds the last missing thing. A "
+        "later commit of the proposal ends this.",
     )
 
     @model_validator(mode="after")

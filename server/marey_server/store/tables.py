@@ -579,6 +579,7 @@ proposal = Table(  # to merge a version into a branch
     Column("target_commit", DIGEST),  # null: that of the branch `target`, while the proposal is open
     Column("merged", DIGEST),
     Column("when_green_id", ID, ForeignKey("user.id")),  # user for whom it is merged when nothing is missing
+    Column("when_green_head", DIGEST),  # commit that this user has asked to merge
     Column("ended_id", ID, ForeignKey("user.id")),
     Column("created_us", Micros, nullable=False),
     Column("updated_us", Micros, nullable=False),
@@ -586,7 +587,7 @@ proposal = Table(  # to merge a version into a branch
     Column("rev", Integer, nullable=False, default=1),
     *(
         ForeignKeyConstraint(["dataset_id", column], ["dataset_commit.dataset_id", "dataset_commit.digest"])
-        for column in ("head", "target_commit", "merged")
+        for column in ("head", "target_commit", "merged", "when_green_head")
     ),
     Index("ix_proposal_state", "dataset_id", "state", "number"),
 )

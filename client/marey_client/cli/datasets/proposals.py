@@ -21,6 +21,13 @@ proposal = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Proposals to merge a version of a dataset into a branch."
 )
 
+CommitSeen = Annotated[
+    str | None,
+    typer.Option(
+        "--commit",
+        help="Commit that you have looked at; the command is refused if it is not the newest one of the proposal.",
+    ),
+]
 Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; marey proposal ls lists the numbers.")]
 
 
@@ -164,12 +171,13 @@ def review(
     number: Number,
     verdict: Annotated[Verdict, typer.Argument(help="Verdict on the newest commit.")],
     text: Annotated[str, typer.Option("--message", "-m", help="Reasons.")] = "",
+    commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:
     """Review the newest commit of a proposal. A later commit makes an approval stale."""
     at = parse(place)
     with connect(context) as marey:
-        made = at.on(marey).proposals.at(number).review(verdict, text)
+        made = at.on(marey).proposals.at(number).review(verdict, text, commit=commit)
     if as_json:
         return print_json(made)
     return print_message(f"recorded {made.verdict} for {short(made.commit)}")
@@ -185,12 +193,14 @@ def check(
     job: Annotated[str | None, typer.Option(help="Job that checks; a success needs a job that has succeeded.")] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
     text: Annotated[str, typer.Option("--message", "-m", help="Result in words.")] = "",
+    commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:
     """Report the state of a check of the newest commit of a proposal."""
     at = parse(place)
     with connect(context) as marey:
-        made = at.on(marey).proposals.at(number).report_check(name, state, text=text, job=job, link=link)
+        handle = at.on(marey).proposals.at(number)
+        made = handle.report_check(name, state, text=text, job=job, link=link, commit=commit)
     if as_json:
         return print_json(made)
     return print_message(f"the check {made.name} of {short(made.commit)} is {made.state}")
@@ -202,6 +212,7 @@ def merge(
     place: DatasetPlace,
     number: Number,
     message: CommitMessage = "",
+    commit: CommitSeen = None,
     ours: Ours = None,
     theirs: Theirs = None,
     base: Base = None,
@@ -219,7 +230,7 @@ def merge(
             found = handle.withdraw_merge()
         else:
             resolutions = resolutions_of(ours, theirs, base)
-            found = handle.merge(message=message, resolutions=resolutions, when_green=when_green)
+            found = handle.merge(message=message, resolutions=resolutions, when_green=when_green, commit=commit)
     return print_json(found) if as_json else print_message(_outcome(found))
 
 

@@ -120,14 +120,21 @@ def record_commit(
 
 def _move_branch(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
     """Move a branch to a commit that follows the newest one that the branch had when the move was prepared."""
-    ref = find_ref(tx, prepared.dataset_id, prepared.branch, lock=True)
-    if ref is None or ref.kind != RefKind.BRANCH or ref.digest != prepared.head:
-        raise branch_moved(prepared.branch, None if ref is None else ref.digest)
-    require_move(ref, mover)
-    moved = update(dataset_ref).where(
-        dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch
+    moved = (
+        update(dataset_ref)
+        .where(
+            dataset_ref.c.dataset_id == prepared.dataset_id,
+            dataset_ref.c.name == prepared.branch,
+            dataset_ref.c.kind == RefKind.BRANCH.value,
+            dataset_ref.c.digest.is_not_distinct_from(prepared.head),
+        )
+        .values(digest=digest, updated_us=tx.now_us, rev=dataset_ref.c.rev + 1)
     )
-    tx.execute(moved.values(digest=digest, updated_us=tx.now_us, rev=dataset_ref.c.rev + 1))
+    ref = tx.execute(moved.returning(*dataset_ref.c)).first()
+    if ref is None:
+        current = find_ref(tx, prepared.dataset_id, prepared.branch)
+        raise branch_moved(prepared.branch, None if current is None else current.digest)
+    require_move(ref, mover)
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:

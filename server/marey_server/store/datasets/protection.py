@@ -82,10 +82,11 @@ def require_deletable(tx: Transaction, ref: Row[Any]) -> None:
 
 def require_no_protected_branch(tx: Transaction, dataset_id: str) -> None:
     """Raise `ConflictProblem` if a dataset has a protected branch."""
-    protected = select(dataset_ref).where(dataset_ref.c.dataset_id == dataset_id)
-    for ref in tx.execute(protected):
-        if ref.protection is not None:
-            raise ConflictProblem(
-                f"The branch {ref.name!r} is protected; remove the protection before you delete the dataset.",
-                code=CODE,
-            )
+    protected = select(dataset_ref.c.name).where(
+        dataset_ref.c.dataset_id == dataset_id, dataset_ref.c.protection.is_not(None)
+    )
+    name = tx.execute(protected.limit(1)).scalar()
+    if name is not None:
+        raise ConflictProblem(
+            f"The branch {name!r} is protected; remove the protection before you delete the dataset.", code=CODE
+        )

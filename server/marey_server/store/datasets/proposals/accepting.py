@@ -13,12 +13,21 @@ from marey_schemas.datasets.merges import MergeRequest
 from marey_schemas.datasets.proposal_states import ProposalState
 from marey_schemas.datasets.proposals import Mergeability, Missing, Proposal, ProposalDetail, ProposalMerge
 from marey_schemas.datasets.protection import Protection
+from marey_server.access import roles
 from marey_server.errors import ApiProblem, ConflictProblem, InvalidProblem
 from marey_server.store import projects
 from marey_server.store.datasets.committing import branch_moved
 from marey_server.store.datasets.merging import LARGE_MERGE, PreparedMerge, prepare_merge, record_merge
 from marey_server.store.datasets.naming import find_dataset, find_ref
-from marey_server.store.datasets.proposals.opening import end, find_proposal, lock_open, shown_proposal, touch
+from marey_server.store.datasets.proposals.opening import (
+    end,
+    find_proposal,
+    is_waiting,
+    lock_open,
+    require_newest,
+    shown_proposal,
+    touch,
+)
 from marey_server.store.datasets.proposals.requirements import checks_of, find_missing, shown_review, verdicts_of
 from marey_server.store.datasets.protection import Mover, require_move, rule_of
 from marey_server.store.projects import ProjectRow
@@ -58,7 +67,7 @@ def prepare_waiting(tx: Transaction, project: str, name: str, number: int) -> Pr
     """Compute the merge of a proposal that is to be merged as soon as nothing is missing; return None for others."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = find_proposal(tx, found.id, number)
-    return None if row.when_green_id is None else _prepare(tx, project, name, row, WAITING_MERGE)
+    return _prepare(tx, project, name, row, WAITING_MERGE) if is_waiting(row) else None
 
 
 def _prepare(
@@ -76,16 +85,18 @@ def _prepare(
 
 
 def _missing(
-    tx: Transaction, project_row: ProjectRow, row: Row[Any], prepared: PreparedAcceptance
+    tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any], prepared: PreparedAcceptance
 ) -> tuple[Missing, ...]:
     """Return the reasons for which an open proposal cannot be merged yet."""
-    rule = _rule(tx, row)
+    rule = rule_of(target)
     return (*find_missing(tx, project_row.id, row, rule), *_obstacles(prepared, rule))
 
 
-def _rule(tx: Transaction, row: Row[Any]) -> Protection | None:
-    ref = find_ref(tx, row.dataset_id, row.target)
-    return None if ref is None else rule_of(ref)
+def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
+    """Return the row of the branch into which an open proposal is merged; with `lock`, its rule stays as it is."""
+    ref = find_ref(tx, row.dataset_id, row.target, lock=lock)
+    assert ref is not None, "branches of open proposals are not deleted"
+    return ref
 
 
 def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
@@ -117,7 +128,7 @@ def read_proposal(tx: Transaction, project: str, name: str, number: int) -> Prop
     mergeability = None
     if row.state == ProposalState.OPEN:
         prepared = _prepare(tx, project, name, row, WAITING_MERGE, MOST_PREVIEWED)
-        mergeability = _shown(prepared.merge, _missing(tx, project_row, row, prepared))
+        mergeability = _shown(prepared.merge, _missing(tx, project_row, row, _target(tx, row), prepared))
     return ProposalDetail(
         **dict(shown_proposal(row)),
         comments=tx.execute(select(func.count()).where(*of_proposal)).scalar_one(),
@@ -151,23 +162,19 @@ def merge_proposal(
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
+    require_newest(tx, row, request.commit)
+    target = _target(tx, row, lock=True)
     mover = Mover(tx.principal.user_name or "", project_row.role, by_proposal=True)
-    _require_mover(tx, row, mover)
+    require_move(target, mover)
     prepared = _require_current(row, prepared)
-    missing = _missing(tx, project_row, row, prepared)
+    missing = _missing(tx, project_row, row, target, prepared)
     if missing and request.when_green:
-        touch(tx, row, when_green_id=tx.principal.user_id)
+        touch(tx, row, when_green_id=tx.principal.user_id, when_green_head=row.head_now)
         tx.emit("proposal.waiting", found.id, project_id=project_row.id, number=number)
     else:
         _require_green(prepared, missing)
         _record(tx, project, name, row, prepared, mover, tx.principal.user_id)
     return shown_proposal(find_proposal(tx, found.id, number))
-
-
-def _require_mover(tx: Transaction, row: Row[Any], mover: Mover) -> None:
-    ref = find_ref(tx, row.dataset_id, row.target)
-    if ref is not None:
-        require_move(ref, mover)
 
 
 def _require_current(row: Row[Any], prepared: PreparedAcceptance | None) -> PreparedAcceptance:
@@ -214,8 +221,8 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
     """Let a proposal wait for a request to merge it, although somebody has sent one with `when_green`."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = lock_open(tx, found.id, number)
-    if row.when_green_id is not None:
-        touch(tx, row, when_green_id=None)
+    if is_waiting(row):
+        touch(tx, row, when_green_id=None, when_green_head=None)
     return shown_proposal(find_proposal(tx, found.id, number))
 
 
@@ -227,28 +234,29 @@ def merge_if_green(
     Nothing happens if the user who asked for the merge may no longer move the branch. Raises `ConflictProblem` if a
     branch has moved since the merge was prepared.
     """
-    if row.when_green_id is None:
+    if not is_waiting(row):
         return
     project_row = projects.require(tx, project)
-    prepared = _require_current(row, prepared)
-    mover = _waiting_mover(tx, project_row, row)
-    if mover is None or _missing(tx, project_row, row, prepared):
+    target = _target(tx, row, lock=True)
+    mover = _waiting_mover(tx, project_row, row, target)
+    rule = rule_of(target)
+    if mover is None or any(find_missing(tx, project_row.id, row, rule)):
         return
-    _record(tx, project, name, row, prepared, mover, row.when_green_id)
+    prepared = _require_current(row, prepared)
+    if not any(_obstacles(prepared, rule)):
+        _record(tx, project, name, row, prepared, mover, row.when_green_id)
 
 
-def _waiting_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any]) -> Mover | None:
+def _waiting_mover(tx: Transaction, project_row: ProjectRow, row: Row[Any], target: Row[Any]) -> Mover | None:
     """Return the user who asked for the merge, None if that user may no longer move the branch."""
     held = select(member.c.role).where(member.c.project_id == project_row.id, member.c.user_id == row.when_green_id)
     role = tx.execute(held).scalar()
     asked = tx.execute(select(user).where(user.c.id == row.when_green_id)).one()
-    if asked.administrator:
-        role = Role.OWNER
-    if role is None or asked.disabled:
+    mover = Mover(asked.name, Role.OWNER if asked.administrator else Role(role or Role.READER), by_proposal=True)
+    if asked.disabled or not roles.includes(mover.role, Role.CONTRIBUTOR):
         return None
-    mover = Mover(asked.name, Role(role), by_proposal=True)
     try:
-        _require_mover(tx, row, mover)
+        require_move(target, mover)
     except ApiProblem:
         return None
     return mover

@@ -54,6 +54,16 @@ def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
     return row
 
 
+def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
+    """Raise `ConflictProblem` if a version is named that is not the newest commit of the proposal."""
+    if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
+        raise ConflictProblem(
+            "The newest commit of the proposal is another one than the one that you name; look at it first.",
+            code="proposal-moved",
+            context={"commit": row.head_now},
+        )
+
+
 def is_proposal(dataset_id: str, number: int) -> tuple[ColumnElement[bool], ...]:
     """Return the conditions for the row of a proposal."""
     return proposal.c.dataset_id == dataset_id, proposal.c.number == number
@@ -82,12 +92,18 @@ def _rows(dataset_id: str) -> Select[Any]:
     )
 
 
+def is_waiting(row: Row[Any]) -> bool:
+    """Return whether a proposal is to be merged when nothing is missing; a later commit ends this."""
+    return row.when_green_id is not None and row.when_green_head == row.head_now
+
+
 def shown_proposal(row: Row[Any]) -> Proposal:
     """Return a proposal as a document."""
     return Proposal(
         number=row.number, title=row.title, description=row.description, author=row.author_name,
         state=ProposalState(row.state), source=row.source, target=row.target, head=row.head_now,
-        target_commit=row.target_now, merged=row.merged, when_green=row.waiting_name, ended_by=row.ending_name,
+        target_commit=row.target_now, merged=row.merged, when_green=row.waiting_name if is_waiting(row) else None,
+        ended_by=row.ending_name,
         created_at=datetime_of(row.created_us), updated_at=datetime_of(row.updated_us),
         ended_at=None if row.ended_us is None else datetime_of(row.ended_us), rev=row.rev,
     )  # fmt: skip
@@ -152,7 +168,7 @@ def end(tx: Transaction, row: Row[Any], state: ProposalState, **values: Any) -> 
     """Give a proposal its last state, and keep the commits that it is about from now on."""
     touch(
         tx, row, state=state.value, head=row.head_now, target_commit=row.target_now, when_green_id=None,
-        ended_us=tx.now_us, **values,
+        when_green_head=None, ended_us=tx.now_us, **values,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from marey_server.store import listing, projects
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.proposals.accepting import PreparedAcceptance, merge_if_green
 from marey_server.store.datasets.proposals.discussing import next_number
-from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, touch
+from marey_server.store.datasets.proposals.opening import find_proposal, lock_open, require_newest, touch
 from marey_server.store.datasets.proposals.requirements import checks_of, select_reviews, shown_review
 from marey_server.store.tables import job, proposal_check, proposal_review
 from marey_server.store.transaction import Transaction
@@ -31,7 +31,7 @@ def add_review(
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
-    _require_newest(row, request.commit)
+    require_newest(tx, row, request.commit)
     values = {
         "dataset_id": found.id, "proposal": number, "number": next_number(tx, proposal_review, row, "reviews"),
         "author_id": tx.principal.user_id, "verdict": request.verdict.value, "text": request.text,
@@ -46,15 +46,6 @@ def add_review(
     merge_if_green(tx, project, name, row, waiting)
     made = tx.execute(select_reviews(row).where(proposal_review.c.number == values["number"])).one()
     return shown_review(made, row.head_now)
-
-
-def _require_newest(row: Row[Any], commit: str | None) -> None:
-    if commit is not None and commit != row.head_now:
-        raise ConflictProblem(
-            "The proposal has another newest commit than the one that you name; read it again.",
-            code="proposal-moved",
-            context={"commit": row.head_now},
-        )
 
 
 def list_reviews(tx: Transaction, project: str, name: str, number: int, *, cursor: str | None, limit: int) -> Page:
@@ -77,7 +68,7 @@ def report_check(
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
-    _require_newest(row, request.commit)
+    require_newest(tx, row, request.commit)
     if request.job is not None:
         _require_job(tx, project_row.id, request.job, request.state)
     _store_check(tx, row, request)
