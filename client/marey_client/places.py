@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias, TypeVar
 
+from marey_client.handles.datasets import Datasets
 from marey_client.items import ItemHandle, Items
 from marey_schemas.items import Item
-from marey_schemas.jobs import CollectionInput, ItemInput
+from marey_schemas.jobs import CollectionInput, DatasetInput, ExistingInput, ItemInput
 
 Handle = TypeVar("Handle", bound=ItemHandle)
 
-Place: TypeAlias = str | CollectionInput | ItemInput | Handle
+Place: TypeAlias = str | ExistingInput | Handle
 """Folder given by its path, item given by its handle, or an input of jobs."""
 
 Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
-def as_inputs(places: Places[Handle]) -> tuple[CollectionInput | ItemInput, ...]:
+def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
     """Return one or several folders or items as inputs of jobs; a handle means the revision that was read."""
     return tuple(map(_as_input, _as_list(places)))
 
@@ -30,16 +31,29 @@ def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None =
         elif isinstance(place, ItemInput):
             item = items.get(place.item).item
             yield item if place.revision is None else item.model_copy(update={"revision": place.revision})
+        elif isinstance(place, DatasetInput):
+            yield from _entries_at(items, place)
         else:
             folder = place.strip("/") if isinstance(place, str) else place.collection
             yield from (one.item for one in items.list(collection=folder, sort=sort))
 
 
 def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
-    return [places] if isinstance(places, str | CollectionInput | ItemInput | ItemHandle) else list(places)
+    return [places] if isinstance(places, str | ExistingInput | ItemHandle) else list(places)
 
 
-def _as_input(place: Place[Handle]) -> CollectionInput | ItemInput:
+def _entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[Item]:
+    """Yield the items of the entries of a version; the server refuses entries without an item when a job names them."""
+    dataset = Datasets(items.transport, items.project).at(place.dataset)
+    folder = dataset.read().collection
+    present = {} if folder is None else {one.id: one.item for one in items.list(collection=folder)}
+    for entry in dataset.entries(place.version, path=place.path):
+        if entry.kind is items.kind and entry.item is not None:
+            item = present.get(entry.item) or items.get(entry.item).item
+            yield item.model_copy(update={"revision": entry.revision})
+
+
+def _as_input(place: Place[Handle]) -> ExistingInput:
     if isinstance(place, str):
         return CollectionInput(collection=place.strip("/"))
     return place.as_input() if isinstance(place, ItemHandle) else place

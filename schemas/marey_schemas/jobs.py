@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.naming import MAIN, DatasetName, Version
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
 
@@ -82,6 +83,18 @@ class CollectionInput(Request):
     collection: CollectionPath
 
 
+class DatasetInput(Request):
+    """All entries of the input's kind in a version of a dataset, at the revisions that have their content.
+
+    The version is resolved at submission, so that later commits do not change the inputs. Entries with the same content
+    are one input.
+    """
+
+    dataset: DatasetName
+    version: Version = MAIN
+    path: CollectionPath = Field("", description="Entry, or folder whose entries are taken; empty: all entries.")
+
+
 class JobOutputsInput(Request):
     """All outputs of another job of the project that have the input's kind, pinned when that job has succeeded.
 
@@ -91,7 +104,10 @@ class JobOutputsInput(Request):
     job: str = Field(min_length=1, max_length=40)
 
 
-JobInput = ItemInput | CollectionInput | JobOutputsInput
+ExistingInput = ItemInput | CollectionInput | DatasetInput
+"""Input of a job that exists when the job is submitted."""
+
+JobInput = ExistingInput | JobOutputsInput
 """Input of a job, in any of its forms."""
 
 

@@ -6,11 +6,11 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, ImportParams, ModelParams, TreeParams
-from marey_schemas.jobs import CollectionInput, ItemInput
+from marey_schemas.jobs import ExistingInput, ItemInput
 from marey_schemas.names import CollectionPath, ItemName
 from marey_schemas.pipelines import PipelineCreate, PipelineStep
 
-Inputs = tuple[ItemInput | CollectionInput, ...]
+Inputs = tuple[ExistingInput, ...]
 
 
 class ModelPlan(Request):

@@ -49,6 +49,8 @@ class PinnedInput(Answer):
         None, description="For results of another job: their collection, relative to that job's `into`."
     )
 
+    commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
+
     @property
     def folder(self) -> str:
         """The path below the job's `into` for results with the same relative folder as this input."""

@@ -14,7 +14,7 @@ from marey_schemas.access import Role
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
-from marey_server.store.tables import dataset_commit, tree_chunk
+from marey_server.store.tables import dataset_commit, revision, tree_chunk
 from marey_server.store.transaction import Transaction
 
 LAB = "/projects/lab"
@@ -41,6 +41,16 @@ def skeleton(name: str, joint: str = "Hips", *, folder: str = "gaits", mapped: b
 
 def hierarchy(joint: str) -> dict[str, Any]:
     return {"schema": "marey/skeleton@1", "joints": [{"name": joint, "parent": -1, "offset": [0, 1, 0]}]}
+
+
+def clip(used: str, place: float) -> dict[str, Any]:
+    """The parts of a clip with one frame."""
+    motion = {
+        "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"],
+        "skeleton": {"item": used, "revision": 1},
+        "poses": {"dtype": "<f4", "shape": [1, 7], "data": [[place, 1, 0, 1, 0, 0, 0]]},
+    }  # fmt: skip
+    return {"motion": motion}
 
 
 @pytest.fixture
@@ -119,16 +129,40 @@ def test_references_are_named_by_content(owner: httpx.Client) -> None:
     trees = []
     for folder in ("one", "two"):
         used = ok(owner.post(f"{LAB}/skeletons", json=skeleton("rig", folder=folder)), 201)["id"]
-        motion = {
-            "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"],
-            "skeleton": {"item": used, "revision": 1},
-            "poses": {"dtype": "<f4", "shape": [1, 7], "data": [[0, 1, 0, 1, 0, 0, 0]]},
-        }  # fmt: skip
-        clip = {"name": "walk", "collection": folder, "parts": {"motion": motion}}
-        ok(owner.post(f"{LAB}/clips", json=clip), 201)
+        ok(owner.post(f"{LAB}/clips", json={"name": "walk", "collection": folder, "parts": clip(used, 0)}), 201)
         ok(owner.post(f"{LAB}/datasets", json={"name": folder, "collection": folder}), 201)
         trees.append(ok(owner.post(f"{LAB}/datasets/{folder}/commits", json={"message": "m"}), 201)["tree"])
     assert trees[0] == trees[1]
+
+
+def test_jobs_read_the_entries_of_a_version(owner: httpx.Client, database: Database) -> None:
+    used = ok(owner.post(f"{LAB}/skeletons", json=skeleton("rig", folder="takes")), 201)["id"]
+    made = ok(owner.post(f"{LAB}/clips", json={"name": "walk", "collection": "takes/raw", "parts": clip(used, 0)}), 201)
+    ok(owner.post(f"{LAB}/datasets", json={"name": "takes", "collection": "takes"}), 201)
+    url, tag = f"{LAB}/datasets/takes", {"name": "v1", "kind": "tag"}
+    first = ok(owner.post(f"{url}/commits", json={"message": "m"}), 201)["digest"]
+    ok(owner.post(f"{url}/refs", json=tag), 201)
+    place = f"{LAB}/clips/{made['id']}"
+    ok(owner.put(f"{place}/parts/motion", json=clip(used, 1)["motion"], headers={"If-Match": "*"}))
+    ok(owner.patch(place, json={"name": "run"}, headers={"If-Match": "*"}))
+    second = ok(owner.post(f"{url}/commits", json={"message": "m"}), 201)["digest"]
+
+    def submit(status: int = 202, **version: str) -> Any:
+        body = {"kind": "export", "inputs": {"clips": {"dataset": "takes", **version}}}
+        return ok(owner.post(f"{LAB}/jobs", json=body), status)
+
+    pinned = {"item": made["id"], "kind": "clip", "collection": "takes/raw"}
+    assert submit(version="v1")["inputs"]["clips"] == [{**pinned, "name": "walk", "revision": 1, "commit": first}]
+    assert submit(path="raw/run")["inputs"]["clips"] == [{**pinned, "name": "run", "revision": 2, "commit": second}]
+    for version, code, pointer in (
+        ({"version": "v2"}, "no-version", "/inputs/clips"),
+        ({"dataset": "none"}, "no-dataset", "/inputs/clips"),
+        ({"path": "raw/walk"}, "empty-version", "/inputs/clips/path"),
+    ):
+        (error,) = submit(422, **version)["errors"]
+        assert (error["code"], error["pointer"]) == (code, pointer)
+    database.write(SYSTEM, lambda tx: tx.execute(update(revision).values(content=None)))
+    assert submit(422)["errors"][0]["code"] == "no-content"
 
 
 def test_a_repeated_commit_is_made_once(owner: httpx.Client, gaits: Callable[..., Any]) -> None:

@@ -71,7 +71,7 @@ def evaluate(
         raise WrongUsage(
             "--out writes the result of the job, but --no-wait does not wait for it; leave out one of them"
         )
-    folder, _, last = addresses[0].path.rpartition("/")
+    folder, last = _place_beside(addresses[0].path)
     if loop:
         params.setdefault("database", {}).setdefault("end_policy", "loop")
     params.setdefault("name", f"{last}-eval" if last else "evaluation")
@@ -98,6 +98,13 @@ def evaluate(
         _print_evaluation(found, as_json)
     if out is not None:
         print_message(f"report: {out}")
+
+
+def _place_beside(path: str) -> tuple[str, str]:
+    """Return the folder and the name after which results are named; `@` and what follows it is part of the name."""
+    named, at, version = path.partition("@")
+    folder, _, last = named.rpartition("/")
+    return folder, f"{last}{at}{version}".replace("@", "-").replace("/", "-")
 
 
 def report(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.handles.findings import Findings
     from marey_client.marey import Marey
-    from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
+    from marey_schemas.jobs import ExistingInput, JobCreate
 
 WEIGHT = {"objective": "--weight"}
 COMPARE = OptionsOf("marey_schemas.job_params:CompareParams")
@@ -173,9 +173,7 @@ def _found(
     return None if ended is None else Findings(marey.transport, ended)
 
 
-def _places(
-    marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | None
-) -> list[CollectionInput | ItemInput]:
+def _places(marey: Marey, handle: EvaluationHandle, candidates: Sequence[str] | None) -> list[ExistingInput]:
     addresses = [Address.parse(place) for place in candidates or ()]
     for address in addresses:
         if address.project != handle.project:

@@ -73,7 +73,8 @@ def submit_job(
         list[str] | None,
         typer.Option(
             "--input",
-            help="Input as name=folder, name=folder/item, or name=ID of a job whose outputs are used; may be repeated.",
+            help="Input as name=folder, name=folder/item[@revision], name=dataset@version[/folder], or name=ID of a "
+            "job whose outputs are used; may be repeated.",
         ),
     ] = None,
     params: Annotated[
@@ -126,7 +127,7 @@ def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
 
     if address.has_id and address.name.startswith("job_"):
         return JobOutputsInput(job=address.name)
-    if not spec.many:
+    if not spec.many and "@" not in address.path:
         return ItemInput(item=require_item(marey, address, [spec.kind]).id)
     return input_at(marey, address, spec.kind, pinned=False)
 
@@ -162,9 +163,17 @@ def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> 
     if as_json:
         return print_json({**found.model_dump(mode="json"), "attempts": attempts})
     shown = found.model_dump(mode="json", exclude={"rev", "inputs"}, exclude_none=True)
+    if commits := _commits_of(found):
+        shown["from commits"] = ", ".join(commits)
     print_pairs((name, json.dumps(value) if isinstance(value, dict) else value) for name, value in shown.items())
     rows = [(one.fence, one.worker, one.started_at, one.ended_at, one.outcome, one.detail) for one in attempts]
     return print_table(("fence", "worker", "started", "ended", "outcome", "detail"), rows)
+
+
+def _commits_of(found: Job) -> list[str]:
+    """Return the commits of datasets from which the inputs of a job were taken."""
+    pins = (pin for many in found.inputs.values() for pin in many if isinstance(pin, dict))
+    return sorted({pin["commit"] for pin in pins if pin.get("commit")})
 
 
 @job.command("log")

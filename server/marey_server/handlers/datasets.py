@@ -260,7 +260,7 @@ class EntriesQuery(PageQuery):
     """Query of a list of entries."""
 
     version: Version = Field(MAIN, description="Version whose entries are listed.")
-    path: CollectionPath = Field("", description="Folder below which entries are listed; empty: all entries.")
+    path: CollectionPath = Field("", description="Entry, or folder whose entries are listed; empty: all entries.")
 
 
 class DatasetEntries(Resource):

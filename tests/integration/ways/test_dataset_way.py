@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable
@@ -86,6 +87,10 @@ def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project:
     walker.commit("Ours", "main", "ours")
     assert "nothing is recorded" in run("dataset", "merge", "lab/gaits@trial", status=1).stderr
     walker.follow()
+    (exported,) = walker.follow()
+    assert json.loads(exported)["clips"] == 2
+    (job,) = json.loads(run("job", "ls", "lab", "--json").stdout)
+    assert gaits.at("v1").digest in run("job", "show", job["id"]).stdout
     run("dataset", "checkout", "lab/gaits")
     assert [walker.clip(name).info().comment for name in ("walk", "turn")] == ["ours", "theirs"]
     run("dataset", "checkout", "lab/gaits@trial")

@@ -2,7 +2,14 @@
 
 from marey_server.store.datasets.checkout import check_out
 from marey_server.store.datasets.committing import PreparedCommit, prepare_commit, record_commit
-from marey_server.store.datasets.history import compare_versions, list_commits, list_entries, read_commit, read_origins
+from marey_server.store.datasets.history import (
+    compare_versions,
+    entries_of_kind,
+    list_commits,
+    list_entries,
+    read_commit,
+    read_origins,
+)
 from marey_server.store.datasets.merging import PreparedMerge, prepare_merge, prepare_pick, record_merge
 from marey_server.store.datasets.naming import (
     create_dataset,
@@ -26,6 +33,7 @@ __all__ = [
     "create_ref",
     "delete_dataset",
     "delete_ref",
+    "entries_of_kind",
     "list_commits",
     "list_datasets",
     "list_entries",

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import chain, islice
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import Row, literal, select
 
@@ -19,11 +19,13 @@ from marey_server.errors import BadRequestProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.naming import find_dataset, first_parents, resolve
+from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset_commit, item, revision
 from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.origins import PATH, TAGS, find_origins
 from marey_versions.records import DatasetEntry, entry_of, key_of, path_and_kind
+from marey_versions.tree.chunks import Value
 from marey_versions.tree.difference import Changed, difference
 from marey_versions.tree.reading import ChunkReader, Tree
 
@@ -186,18 +188,58 @@ def _read(tx: Transaction, dataset_id: str, digest: str) -> _ReadCommit:
 def list_entries(
     tx: Transaction, project: str, name: str, version: str, *, path: str, cursor: str | None, limit: int
 ) -> Page:
-    """List the entries of a version by path, all or those below a folder."""
+    """List the entries of a version by path: all, or those at a path and below it."""
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     commit = _commit(tx, row.id, resolve(tx, row.id, version))
     order = listing.parse_order("key", {"key": literal("")}, unique="key")
     identity = ["entries", row.id, commit.digest, path]
     after = "" if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
-    tree = Tree(StoredChunks(tx), commit.tree)
-    found = list(islice(tree.entries(after=after, prefix=f"{path}/" if path else ""), limit + 1))
+    found = list(islice(_entries_at(tx, commit.tree, path, after=after), limit + 1))
     entries = [entry_of(*one) for one in found[:limit]]
     following = listing.make_cursor(tx, order, identity, [entries[-1].key]) if len(found) > limit else None
     return Page(items=_shown_entries(tx, project_row.id, entries), next_cursor=following)
+
+
+def _entries_at(tx: Transaction, tree: str, path: str, *, after: str = "") -> Iterator[tuple[str, Value]]:
+    stored = Tree(StoredChunks(tx), tree)
+    return chain.from_iterable(stored.entries(after=after, prefix=prefix) for prefix in _prefixes_of(path))
+
+
+class EntryRevision(NamedTuple):
+    """Entry of a version, and a revision of the project with its content."""
+
+    entry: DatasetEntry
+    item: str
+    number: int
+
+
+class VersionEntries(NamedTuple):
+    """Entries of one kind in a version of a dataset."""
+
+    commit: str
+    folder: str
+    """Path of the dataset's folder, empty if it has none."""
+    found: tuple[EntryRevision, ...]
+    missing: tuple[DatasetEntry, ...]
+    """Entries whose content no revision of the project has."""
+
+
+def entries_of_kind(
+    tx: Transaction, project_row: ProjectRow, name: str, version: str, kind: Kind, *, path: str, most: int
+) -> VersionEntries:
+    """Return the entries of a kind in a version, at a path and below it, by path; at most `most` of them."""
+    row = find_dataset(tx, project_row, name)
+    commit = resolve(tx, row.id, version)
+    entries = (entry_of(*one) for one in _entries_at(tx, tree_of(tx, row.id, commit), path))
+    chosen = list(islice((one for one in entries if one.kind == kind.value), most))
+    held = revisions_with(tx, project_row.id, {one.content for one in chosen})
+    return VersionEntries(
+        commit,
+        row.path or "",
+        tuple(EntryRevision(one, *held[one.content]) for one in chosen if one.content in held),
+        tuple(one for one in chosen if one.content not in held),
+    )
 
 
 def _shown_entries(tx: Transaction, project_id: str, entries: Sequence[DatasetEntry]) -> tuple[Entry, ...]:

@@ -8,9 +8,19 @@ from typing import Any, NamedTuple
 from sqlalchemy import ColumnElement, bindparam, func, or_, select
 
 from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import CollectionInput, InputSpec, ItemInput, JobCreate, JobInput, JobOutputsInput
+from marey_schemas.jobs import (
+    CollectionInput,
+    DatasetInput,
+    InputSpec,
+    ItemInput,
+    JobCreate,
+    JobInput,
+    JobOutputsInput,
+)
 from marey_schemas.problems import FieldError
-from marey_server.errors import InvalidProblem
+from marey_schemas.wording import counted
+from marey_server.errors import InvalidProblem, NotFoundProblem
+from marey_server.store import datasets
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import collection, item
@@ -130,6 +140,10 @@ def _pin_input(
         if isinstance(choice, JobOutputsInput):
             made[choice.job] = {"job": choice.job}
             continue
+        if isinstance(choice, DatasetInput):
+            for entry in _entries_of(tx, project, spec, choice, place, errors):
+                pins.setdefault((entry["item"], entry["revision"]), entry)
+            continue
         if isinstance(choice, CollectionInput):
             found = _items_below(tx, project, spec, choice.collection)
             if not found:
@@ -175,6 +189,34 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
         statement = statement.where(_within(path))
     rows = tx.execute(statement.order_by(collection.c.path, item.c.name, item.c.id), {"project_id": project.id})
     return [FoundItem(row.id, row.kind, row.name, row.head, row.path) for row in rows]
+
+
+def _entries_of(
+    tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
+) -> Iterator[Pin]:
+    """Pin the entries of a version, with the names and folders that they have in it."""
+    try:
+        version = datasets.entries_of_kind(
+            tx, project, choice.dataset, choice.version, spec.kind, path=choice.path, most=MOST_INPUTS + 1
+        )
+    except (NotFoundProblem, InvalidProblem) as error:
+        errors.append(_error(place, error.error_code, error.detail))
+        return
+    if version.missing:
+        detail = (
+            f"{counted(len(version.missing), 'entry')} of the version cannot be read, because the project has no item "
+            f"with this content, the first at {version.missing[0].path!r}."
+        )
+        errors.append(_error(place, "no-content", detail))
+    elif not version.found:
+        detail = f"The version has no {spec.kind.value} at {choice.path!r} or below it."
+        errors.append(_error(f"{place}/path", "empty-version", detail))
+    for one in version.found:
+        folder, _, name = f"{version.folder}/{one.entry.path}".strip("/").rpartition("/")
+        yield {
+            "item": one.item, "revision": one.number, "kind": spec.kind.value, "name": name, "collection": folder,
+            "commit": version.commit,
+        }  # fmt: skip
 
 
 def _within(path: str) -> ColumnElement[bool]:
