@@ -19,7 +19,7 @@ from tests.support.rest_server import Server, running
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
-from marey_server.store.tables import proposal
+from marey_server.store.tables import job, proposal
 from marey_server.store.transaction import Transaction
 
 LAB = "/projects/lab"
@@ -333,15 +333,22 @@ def test_wrong_versions_and_full_lists_are_refused(team: Team, monkeypatch: pyte
 
 
 @on_sqlite
-def test_a_check_by_a_job_succeeds_only_with_the_job(team: Team) -> None:
-    team.propose()
+def test_a_check_by_a_job_succeeds_only_with_a_job_that_read_the_commit(team: Team, server: Server) -> None:
     motion = {**MOTION, "skeleton": {"item": team.items[0], "revision": 1}, "joints": ["a"]}
     clip = ok(team.ben.post(f"{LAB}/clips", json={"name": "w", "parts": {"motion": motion}}), 201)["id"]
-    job = {"kind": "export", "inputs": {"clips": [{"item": clip}]}}
-    unfinished = ok(team.ben.post(f"{LAB}/jobs", json=job), 202)["id"]
-    ok(check(team.ben, 1, "pending", job=unfinished))
-    refused(check(team.ben, 1, "succeeded", job=unfinished), 409, "job-not-succeeded")
+    change = {"change": "put", "path": "walk", "item": clip}
+    ok(team.ada.post(f"{GAITS}/commits", json={"branch": "trial", "message": "m", "changes": [change]}), 201)
+    team.propose()
+    wanted = {"kind": "export", "inputs": {"clips": [{"dataset": "gaits", "version": "trial"}]}}
+    made = ok(team.ben.post(f"{LAB}/jobs", json=wanted), 202)["id"]
+    ok(check(team.ben, 1, "pending", job=made))
+    refused(check(team.ben, 1, "succeeded", job=made), 409, "job-not-succeeded")
     refused(check(team.ben, 1, "pending", job="job_of_nobody"), 404, "no-job")
+    done = update(job).where(job.c.id == made).values(state="succeeded")
+    server.database.write(SYSTEM, lambda tx: tx.execute(done))
+    ok(check(team.ben, 1, "succeeded", job=made))
+    ok(team.put("trial", "c", 2), 201)
+    refused(check(team.ben, 1, "succeeded", job=made), 409, "job-of-another-commit")
 
 
 def test_of_two_who_merge_or_close_at_once_one_wins(team: Team, server: Server) -> None:

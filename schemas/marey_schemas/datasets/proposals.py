@@ -78,7 +78,9 @@ class CheckReport(Request):
         None, description="Commit that was checked; null: the newest one. Another commit than the newest is refused."
     )
     job: ItemId | None = Field(
-        None, description="Job of the project that checks; a check succeeds only if its job has succeeded."
+        None,
+        description="Job of the project that checks; a success is refused unless this job has succeeded, and has read "
+        "the newest commit if its inputs are versions of datasets.",
     )
     link: Annotated[str, StringConstraints(max_length=2000, pattern=r"^https?://[^\s\x00-\x1f\x7f]+$")] | None = Field(
         None, description="Address of a page about the check."
@@ -181,8 +183,11 @@ class Mergeability(Answer):
     """Result that the merge of a proposal would have now."""
 
     missing: tuple[Missing, ...] = Field(description="Reasons for which it cannot be merged yet; empty: it is green.")
-    changes: int | None = Field(description="Number of entries that would change; null: it could not be computed.")
-    conflict_count: int | None = Field(description="Number of conflicts; null: it could not be computed.")
+    changes: int | None = Field(
+        description="Number of entries that would change; null: it was not computed, because a side has changed too "
+        "many entries, or because the merge is impossible."
+    )
+    conflict_count: int | None = Field(description="Number of conflicts; null: it was not computed.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts, by path.")
 
 

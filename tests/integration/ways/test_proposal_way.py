@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable
@@ -61,8 +62,10 @@ def test_the_commands_of_the_page_work_in_their_order(
     follow([commit])
     follow(next(blocks).splitlines(), MAREY_TOKEN=token)
     (shown,) = follow(["marey proposal show lab/gaits 1"])
-    assert "ben-of-the-proposal on raw/walk (clip) frames 0 to 1: The left foot slides here" in shown
-    assert "check evaluation: succeeded Coverage 84 %" in shown
+    assert "raw/walk (clip), frames 0:2 The left foot slides here" in shown
+    assert "check evaluation succeeded Coverage 84 %" in shown
+    (printed,) = json.loads(run("proposal", "show", "lab/gaits", "1", "--json").stdout)["comments"]
+    assert printed["frames"] == [0, 2]
     merged, _ = follow(next(blocks).splitlines())
     assert "merged; main is at" in merged
     assert project.datasets.at("gaits").proposals.at(1).read().state == "merged"

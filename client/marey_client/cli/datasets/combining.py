@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,7 +14,7 @@ from marey_client.cli.output import print_json, print_message, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from marey_client.handles.datasets import DatasetHandle, PickOptions
     from marey_schemas.datasets.merges import MergeAnswer, Resolution
@@ -130,22 +131,33 @@ def _combine(
     context: typer.Context, at: NamedVersion, into: str, as_json: bool, change: Callable[[DatasetHandle], MergeAnswer]
 ) -> None:
     """Send a change of a branch and print its result; exit with 1 if there are conflicts."""
+    with connect(context) as marey, conflicts_printed(into=into, as_json=as_json):
+        found = change(at.on(marey))
+    _print(found, into, as_json=as_json)
+    if found.conflict_count:
+        raise typer.Exit(1)
+
+
+@contextmanager
+def conflicts_printed(*, into: str, as_json: bool) -> Iterator[None]:
+    """Print the conflicts because of which the server refuses a merge in the block, and exit with 1."""
     from marey_client.errors import Conflict
     from marey_schemas.datasets.merges import MergeAnswer
 
-    with connect(context) as marey:
-        try:
-            found = change(at.on(marey))
-        except Conflict as error:
-            if error.code != "merge-conflicts":
-                raise
-            found = MergeAnswer.model_validate(error.context)
+    try:
+        yield
+    except Conflict as error:
+        if error.code != "merge-conflicts":
+            raise
+        _print(MergeAnswer.model_validate(error.context), into, as_json=as_json)
+        raise typer.Exit(1) from None
+
+
+def _print(found: MergeAnswer, into: str, *, as_json: bool) -> None:
     if as_json:
         print_json(found)
     else:
         _print_result(found, into)
-    if found.conflict_count:
-        raise typer.Exit(1)
 
 
 def resolutions_of(

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.datasets.combining import Base, CommitMessage, Into, Ours, Theirs, resolutions_of
+from marey_client.cli.datasets.combining import (
+    Base,
+    CommitMessage,
+    Into,
+    Ours,
+    Theirs,
+    conflicts_printed,
+    resolutions_of,
+)
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
@@ -15,12 +23,15 @@ from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Ve
 from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
-    from marey_schemas.datasets.proposals import Proposal, ProposalDetail
+    from marey_schemas.datasets.proposals import Comment, Proposal, ProposalDetail
 
 proposal = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Proposals to merge a version of a dataset into a branch."
 )
 
+BranchPlace = Annotated[
+    str, typer.Argument(metavar="PROJECT/DATASET[@BRANCH]", help="Branch, such as lab/gaits@main. Default: @main.")
+]
 CommitSeen = Annotated[
     str | None,
     typer.Option(
@@ -87,15 +98,24 @@ def show(context: typer.Context, place: DatasetPlace, number: Number, as_json: A
     if as_json:
         return print_json({"proposal": found, "comments": comments})
     print_pairs(_pairs(found))
-    for review in found.reviews:
-        print_message(f"{review.author}: {review.verdict}{' (of an earlier commit)' if review.stale else ''}")
-    for check in found.checks:
-        print_message(f"check {check.name}: {check.state} {check.text}".rstrip())
-    for comment in comments:
-        frames = "" if comment.frames is None else f" frames {comment.frames[0]} to {comment.frames[1] - 1}"
-        where = "" if comment.path is None else f" on {comment.path} ({comment.kind}){frames}"
-        print_message(f"{comment.author}{where}: {comment.text}")
+    if found.reviews or found.checks or comments:
+        print_table(("who", "about", "what"), [*_verdicts(found), *map(_comment_row, comments)])
     return None
+
+
+def _verdicts(found: ProposalDetail) -> list[tuple[str, str, str]]:
+    """Return the rows of reviews and checks."""
+    reviews = [
+        (one.author, f"{short(one.commit)}{', an earlier commit' if one.stale else ''}", f"{one.verdict} {one.text}")
+        for one in found.reviews
+    ]
+    checks = [(one.reporter, f"check {one.name}", f"{one.state} {one.text}") for one in found.checks]
+    return [(who, about, what.rstrip()) for who, about, what in (*reviews, *checks)]
+
+
+def _comment_row(one: Comment) -> tuple[str, str, str]:
+    where = "" if one.path is None else f"{one.path} ({one.kind})"
+    return one.author, where if one.frames is None else f"{where}, frames {one.frames[0]}:{one.frames[1]}", one.text
 
 
 def _pairs(found: ProposalDetail) -> list[tuple[str, object]]:
@@ -222,7 +242,11 @@ def merge(
     withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw an earlier --when-green.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a proposal into its target. The command lists what is missing if it cannot be merged."""
+    """Merge a proposal into its target. The command lists what is missing if it cannot be merged.
+
+    If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
+    --ours, --theirs or --base, or resolved by a commit to the source. In that case, the exit status is 1.
+    """
     at = parse(place)
     with connect(context) as marey:
         handle = at.on(marey).proposals.at(number)
@@ -230,7 +254,8 @@ def merge(
             found = handle.withdraw_merge()
         else:
             resolutions = resolutions_of(ours, theirs, base)
-            found = handle.merge(message=message, resolutions=resolutions, when_green=when_green, commit=commit)
+            with conflicts_printed(into="the target", as_json=as_json):
+                found = handle.merge(message=message, resolutions=resolutions, when_green=when_green, commit=commit)
     return print_json(found) if as_json else print_message(_outcome(found))
 
 
@@ -256,7 +281,7 @@ def close(context: typer.Context, place: DatasetPlace, number: Number, as_json: 
 
 def protect(
     context: typer.Context,
-    place: VersionPlace,
+    place: BranchPlace,
     role: Annotated[
         str, typer.Option(help="Least role of a user who may move the branch: contributor, maintainer or owner.")
     ] = "contributor",
@@ -287,7 +312,7 @@ def protect(
     return print_json(found) if as_json else print_message(f"the branch {found.name} is protected")
 
 
-def unprotect(context: typer.Context, place: VersionPlace, as_json: AsJson = False) -> None:
+def unprotect(context: typer.Context, place: BranchPlace, as_json: AsJson = False) -> None:
     """Remove the protection of a branch."""
     at = parse(place, version=True)
     with connect(context) as marey:

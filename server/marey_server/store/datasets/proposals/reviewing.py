@@ -62,15 +62,15 @@ def report_check(
 ) -> ProposalCheck:
     """Record the state of a check of the newest commit, and merge the proposal if it waits for nothing else.
 
-    Raises `ConflictProblem` if the proposal has ended, if its newest commit is another one, or if a job that has not
-    succeeded is to be the proof of a success, and `NotFoundProblem` if the project has no such job.
+    Raises `ConflictProblem` if the proposal has ended, if its newest commit is another one, or if a success is reported
+    of a job that has not succeeded or has read other versions, and `NotFoundProblem` if the project has no such job.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
     row = lock_open(tx, found.id, number)
     require_newest(tx, row, request.commit)
     if request.job is not None:
-        _require_job(tx, project_row.id, request.job, request.state)
+        _require_job(tx, project_row.id, request.job, request.state, row.head_now)
     _store_check(tx, row, request)
     touch(tx, row)
     tx.emit(
@@ -81,16 +81,25 @@ def report_check(
     return checks_of(tx, row)[request.name]
 
 
-def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckState) -> None:
-    held = select(job.c.state).where(job.c.id == job_id, job.c.project_id == project_id)
-    found = tx.execute(held).scalar()
+def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckState, head: str) -> None:
+    held = select(job.c.state, job.c.inputs).where(job.c.id == job_id, job.c.project_id == project_id)
+    found = tx.execute(held).first()
     if found is None:
         raise NotFoundProblem(f"The project has no job {job_id!r}.", code="no-job")
-    if state is CheckState.SUCCEEDED and found != JobState.SUCCEEDED:
+    if state is not CheckState.SUCCEEDED:
+        return
+    if found.state != JobState.SUCCEEDED:
         raise ConflictProblem(
-            f"The job {job_id} has the state {found}; the check succeeds only if its job has succeeded.",
+            f"The job {job_id} has the state {found.state}; the check succeeds only if its job has succeeded.",
             code="job-not-succeeded",
-            context={"state": found},
+            context={"state": found.state},
+        )
+    read = {pin["commit"] for pins in found.inputs.values() for pin in pins if "commit" in pin}
+    if read and head not in read:
+        raise ConflictProblem(
+            f"The job {job_id} has read other versions than the newest commit of the proposal.",
+            code="job-of-another-commit",
+            context={"commits": sorted(read)},
         )
 
 
