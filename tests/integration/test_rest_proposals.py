@@ -18,6 +18,7 @@ from tests.support.rest_server import Server, running
 
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
+from marey_server.store.datasets import proposals
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import job, proposal
 from marey_server.store.transaction import Transaction
@@ -182,6 +183,8 @@ def test_a_rule_names_the_least_role_and_protects_from_deletion(team: Team) -> N
         assert team.mia.put(f"{trial}/protection", json=wrong, headers=ANY).status_code == 422
     ok(team.ada.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag"}), 201)
     refused(team.mia.put(f"{GAITS}/refs/v1/protection", json={}, headers=ANY), 422, "is-tag")
+    ok(team.ada.post(f"{LAB}/datasets", json={"name": "empty"}), 201)
+    refused(team.mia.put(f"{LAB}/datasets/empty/refs/main/protection", json={}, headers=ANY), 422, "no-commits")
     refused(team.mia.put(f"{GAITS}/refs/v2/protection", json={}, headers=ANY), 404, "no-version")
 
 
@@ -230,6 +233,7 @@ def test_an_approval_counts_only_while_its_author_may_write(team: Team) -> None:
     assert team.missing(1) == []
     ok(team.olga.put(f"{LAB}/members/ben", json={"role": "reader"}))
     assert team.missing(1) == ["approvals"]
+    assert [one["author"] for one in ok(team.rita.get(f"{PROPOSALS}/1"))["reviews"]] == ["ben"]
 
 
 @on_sqlite
@@ -270,6 +274,28 @@ def test_a_proposal_is_merged_when_the_last_thing_arrives(team: Team, server: Se
     assert (merged["state"], merged["ended_by"]) == ("merged", "mia")
     assert ok(team.rita.get(MAIN))["commit"] == merged["merged"]
     assert not list(check_store(server.database))
+
+
+@on_sqlite
+def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
+    team: Team, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    team.propose()
+    approve(team.ben, 1, "request-changes")
+    ok(team.ada.post(f"{PROPOSALS}/1/merge", json={"when_green": True}))
+    prepare, earlier = proposals.prepare_waiting, list[Any]()
+
+    def prepare_late(*arguments: Any) -> Any:
+        """Return at the second call what the first one returned, as if the branch had moved after it."""
+        earlier.append(prepare(*arguments))
+        return earlier[0 if len(earlier) == 2 else -1]
+
+    monkeypatch.setattr(proposals, "prepare_waiting", prepare_late)
+    approve(team.ben, 1, "comment")
+    ok(team.put("main", "c", 2), 201)
+    approve(team.ben, 1)
+    merged = ok(team.rita.get(f"{PROPOSALS}/1"))
+    assert (merged["state"], len(earlier)) == ("merged", 3)
 
 
 @on_sqlite

@@ -297,7 +297,10 @@ def protect(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Protect a branch: it can be neither deleted nor reset, and moves only as the options allow."""
+    """Protect a branch: it can be neither deleted nor reset, and moves only as the options allow.
+
+    The options replace the rule that the branch may have.
+    """
     from marey_schemas.datasets.protection import ProtectionRule
 
     at = parse(place, version=True)

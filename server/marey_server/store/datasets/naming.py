@@ -228,7 +228,10 @@ def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_r
 def protect_branch(
     tx: Transaction, project: str, name: str, branch: str, rule: ProtectionRule | None, *, expected_rev: ExpectedRev
 ) -> Ref:
-    """Set the rule of a branch; None removes it. Raises `InvalidProblem` for a tag."""
+    """Set the rule of a branch; None removes it.
+
+    Raises `InvalidProblem` for a tag, and for a branch without commits, into which nothing can be merged.
+    """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     lock_refs(tx, row.id)
@@ -238,6 +241,8 @@ def protect_branch(
     changed = change_row(tx, dataset_ref, which, values, expected_rev=expected_rev, absent=_no_version(branch))
     if changed.kind != RefKind.BRANCH:
         raise is_tag(branch)
+    if changed.digest is None:
+        raise InvalidProblem(f"The branch {branch!r} has no commits yet; commit to it first.", code="no-commits")
     kind = "branch.protected" if rule is not None else "branch.unprotected"
     tx.emit(kind, row.id, project_id=project_row.id, branch=branch)
     return _shown_ref(changed)

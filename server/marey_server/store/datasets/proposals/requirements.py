@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from sqlalchemy import Row, Select, and_, or_, select
+from sqlalchemy import Row, Select, and_, func, or_, select
 
 from marey_schemas.datasets.proposal_states import CheckState, Verdict
 from marey_schemas.datasets.proposals import Missing, ProposalCheck, Review
@@ -35,13 +35,18 @@ def shown_review(one: Row[Any], head: str) -> Review:
 
 
 def verdicts_of(tx: Transaction, project_id: str, row: Row[Any]) -> list[Row[Any]]:
-    """Return the newest approval or request for changes of each reviewer who may still write in the project."""
+    """Return the newest approval or request for changes of each reviewer; `counts` is whether the reviewer may write
+    in the project.
+    """
     mine = and_(member.c.project_id == project_id, member.c.user_id == proposal_review.c.author_id)
-    may_write = or_(member.c.role.in_(WRITERS), user.c.administrator)
+    may_write = and_(
+        user.c.disabled.is_(False), or_(user.c.administrator, func.coalesce(member.c.role, "").in_(WRITERS))
+    )
     statement = (
         select_reviews(row)
+        .add_columns(may_write.label("counts"))
         .outerjoin(member, mine)
-        .where(proposal_review.c.verdict != Verdict.COMMENT.value, user.c.disabled.is_(False), may_write)
+        .where(proposal_review.c.verdict != Verdict.COMMENT.value)
         .order_by(proposal_review.c.number)
     )
     newest = {one.author_id: one for one in tx.execute(statement)}
@@ -68,7 +73,7 @@ def checks_of(tx: Transaction, row: Row[Any]) -> dict[str, ProposalCheck]:
 
 def find_missing(tx: Transaction, project_id: str, row: Row[Any], rule: Protection | None) -> Iterator[Missing]:
     """Return the approvals and checks that a proposal still needs, and the requests for changes that hold it up."""
-    verdicts = verdicts_of(tx, project_id, row)
+    verdicts = [one for one in verdicts_of(tx, project_id, row) if one.counts]
     for one in verdicts:
         if one.verdict == Verdict.REQUEST_CHANGES:
             yield Missing(code="changes-requested", detail=f"{one.name} requests changes and has not approved since.")
