@@ -12,7 +12,7 @@ from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.documents.differences import Difference, DifferenceRequest
-from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Page, Revision, Staleness
+from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, Page, Revision, Staleness
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 
@@ -71,6 +71,15 @@ class ItemHandle:
         response = self.transport.send("PATCH", self.url, content=as_json(change), headers=self._if_match())
         return self._renewed(read_model(Item, response))
 
+    def revert(self, revision: int, *, message: str = "") -> Item:
+        """Create a revision with the content of an earlier one; name, folder and tags stay.
+
+        Raises `PreconditionFailed` if the item was changed since it was read.
+        """
+        body = as_json(ItemRevert(revision=revision, message=message))
+        response = self.transport.send("POST", f"{self.url}/revert", content=body, headers=self._if_match())
+        return self._renewed(read_model(Item, response))
+
     def delete(self) -> None:
         """Delete the item; `restore` restores it."""
         self.transport.send("DELETE", self.url, headers=self._if_match())
@@ -122,10 +131,11 @@ class ItemHandle:
         folder: str | Path,
         *,
         format: str = "original",  # noqa: A002
+        revision: int | None = None,
         beside: TakenPaths | None = None,
         **options: str | None,
     ) -> Path:
-        """Write the item to `folder` as a file of `format`; return its path.
+        """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
         Exports of several items with the same `beside` do not replace each other's files.
         """
@@ -133,7 +143,7 @@ class ItemHandle:
             self.transport,
             f"{self.url}/export",
             folder,
-            params={"format": format, **options},
+            params={"format": format, "revision": revision, **options},
             name=f"{self.name}.{format}",
             beside=beside,
         )

@@ -7,6 +7,7 @@ from typing import TypeAlias, TypeVar
 
 from marey_client.handles.datasets import Datasets
 from marey_client.items import ItemHandle, Items
+from marey_schemas.datasets.commits import Entry
 from marey_schemas.items import Item
 from marey_schemas.jobs import CollectionInput, DatasetInput, ExistingInput, ItemInput
 
@@ -32,7 +33,8 @@ def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None =
             item = items.get(place.item).item
             yield item if place.revision is None else item.model_copy(update={"revision": place.revision})
         elif isinstance(place, DatasetInput):
-            yield from _entries_at(items, place)
+            for entry, item in entries_at(items, place):
+                yield item.model_copy(update={"revision": entry.revision})
         else:
             folder = place.strip("/") if isinstance(place, str) else place.collection
             yield from (one.item for one in items.list(collection=folder, sort=sort))
@@ -42,15 +44,14 @@ def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
     return [places] if isinstance(places, str | ExistingInput | ItemHandle) else list(places)
 
 
-def _entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[Item]:
-    """Yield the items of the entries of a version; the server refuses entries without an item when a job names them."""
+def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entry, Item]]:
+    """Yield the entries of a version, each with its item; entries without an item in the project are left out."""
     dataset = Datasets(items.transport, items.project).at(place.dataset)
     folder = dataset.read().collection
     present = {} if folder is None else {one.id: one.item for one in items.list(collection=folder)}
     for entry in dataset.entries(place.version, path=place.path):
         if entry.kind is items.kind and entry.item is not None:
-            item = present.get(entry.item) or items.get(entry.item).item
-            yield item.model_copy(update={"revision": entry.revision})
+            yield entry, present.get(entry.item) or items.get(entry.item).item
 
 
 def _as_input(place: Place[Handle]) -> ExistingInput:

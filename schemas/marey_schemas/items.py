@@ -54,6 +54,13 @@ class ItemChange(Request):
     tags: tuple[Tag, ...] | None = Field(None, max_length=64)
 
 
+class ItemRevert(Request):
+    """Request to give an item the content of an earlier revision."""
+
+    revision: int = Field(ge=1, le=(1 << 31) - 1)
+    message: Message = Field("", description="Message of the new revision; empty: a sentence that names the old one.")
+
+
 class PartSummary(Answer):
     """Part of an item: one document."""
 

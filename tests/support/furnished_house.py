@@ -62,6 +62,7 @@ BODIES = {
     "CheckoutRequest": {"version": "spare", "discard": True},
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
+    "ItemRevert": {"revision": 1},
     "Document": {"schema": "marey/clip-info@1", "comment": CANARY},
     "JobCreate": {"kind": "no-such-kind"},
     "JobBatch": {"jobs": [{"kind": "no-such-kind"}]},

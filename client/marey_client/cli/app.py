@@ -13,7 +13,6 @@ from marey_client.cli import (
     clip_jobs,
     edits,
     evaluations,
-    files,
     improvements,
     jobs,
     models,
@@ -27,6 +26,7 @@ from marey_client.cli import (
 )
 from marey_client.cli.datasets import proposals, versions
 from marey_client.cli.difference import diff
+from marey_client.cli.files import downloading, listing, uploading
 from marey_client.cli.invocation import Invocation
 
 app = typer.Typer(
@@ -71,7 +71,9 @@ for register in (
     accounts,
     tokens,
     projects,
-    files,
+    uploading,
+    listing,
+    downloading,
     organise,
     diff,
     versions,

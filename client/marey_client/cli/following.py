@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item
-from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.addresses import Address
+from marey_client.cli.failures import Refused
 from marey_client.cli.output import Advance, print_json, print_message, print_refused, progress
+from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.schema_options import OptionsOf
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.jobs import ExistingInput, Job
     from marey_schemas.kinds import Kind
-
-_REVISION = re.compile(r"(.+)@([1-9][0-9]{0,8})")
-_VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
 
 JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("priority", "cache"))
 SEEDED_JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("seed", "priority", "cache"))
@@ -45,33 +42,15 @@ def clips_at(marey: Marey, address: Address) -> ExistingInput:
 def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ExistingInput:
     """Return the input of a job at an address: an item, its revision after `@`, a version of a dataset, or a folder.
 
-    `pinned` fixes the revision of an item that is named without one. Names may contain `@`, so an item or a folder with
-    exactly this name comes first.
+    `pinned` fixes the revision of an item that is named without one.
     """
     from marey_schemas.jobs import CollectionInput, ItemInput
 
-    found = find_item(marey, address, [kind])
+    found = find_revision(marey, address, [kind])
     if found is not None:
-        return found.as_input() if pinned else ItemInput(item=found.id)
-    if "@" in address.path and marey.project(address.project).collections.at(address.path) is None:
-        return _versioned(marey, address, kind)
-    return CollectionInput(collection=address.path)
-
-
-def _versioned(marey: Marey, address: Address, kind: Kind) -> ExistingInput:
-    from marey_schemas.jobs import DatasetInput, ItemInput
-
-    if revision := _REVISION.fullmatch(address.path):
-        found = find_item(marey, Address(address.project, revision[1]), [kind])
-        if found is not None:
-            return ItemInput(item=found.id, revision=int(revision[2]))
-    version = _VERSION.fullmatch(address.path)
-    if version is None:
-        raise WrongUsage(
-            f"{address} names no revision and no version; write project/folder/name@2 for a revision of an item, and "
-            "project/dataset@v1 or project/dataset@v1/folder for a version of a dataset"
-        )
-    return DatasetInput(dataset=version[1], version=version[2], path=version[3] or "")
+        item, revision = found
+        return ItemInput(item=item.id, revision=revision or (item.item.revision if pinned else None))
+    return find_version(marey, address) or CollectionInput(collection=address.path)
 
 
 def follow(

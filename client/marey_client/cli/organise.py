@@ -1,4 +1,4 @@
-"""Commands `mv`, `rm`, `restore` and `tag`, which organise a project. Removed items can be restored."""
+"""Commands `mv`, `rm`, `restore`, `revert` and `tag`, which organise a project. Removed items can be restored."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from marey_client.cli.addresses import FOLDER, Address, Thing, require_apart, th
 from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_message
+from marey_client.cli.revisions import require_revision
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ KindOf = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    for command in (mv, rm, restore, tag):
+    for command in (mv, rm, restore, revert, tag):
         app.command()(command)
 
 
@@ -110,6 +111,28 @@ def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json
             return restored
 
         _do_each(things, bring_back, "restored", as_json)
+
+
+def revert(
+    context: typer.Context,
+    place: Annotated[str, typer.Argument(help="Item and earlier revision: project/folder/name@revision.")],
+    message: Annotated[str, typer.Option("--message", "-m", help="Message of the new revision.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Create a revision of an item with the content of an earlier one. Name, folder and tags stay."""
+    from marey_schemas.kinds import Kind
+
+    with connect(context) as marey:
+        item, revision = require_revision(marey, Address.parse(place), list(Kind))
+        if revision is None:
+            raise WrongUsage(f"{place} names no revision; write project/folder/name@2 for the second one")
+        before = item.item.revision
+        made = item.revert(revision, message=message)
+    if as_json:
+        return print_json(made)
+    if made.revision == before:
+        return print_message(f"{made.path} has the content of revision {revision} already")
+    return print_message(f"{made.path}: revision {made.revision} has the content of revision {revision}")
 
 
 def tag(

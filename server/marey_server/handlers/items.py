@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.items import Item, ItemChange, ItemCreate, Lineage, Revision, Staleness
+from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, Revision, Staleness
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
@@ -150,6 +150,19 @@ class ItemRestoration(Resource):
         return await self.answer(items.restore_item, project, kind_of(kind), item)
 
 
+class ItemReversion(Resource):
+    """Return of an item to an earlier revision."""
+
+    path = "/projects/{project}/{kind}/{item}/revert"
+    tag = "ItemsOfKind"
+
+    @writes(access=Access.CONTRIBUTOR, body=ItemRevert, answer=Item, precondition="required", etag=True)
+    async def post(self, project: str, kind: str, item: str, body: ItemRevert) -> Rendered:
+        """Create a revision with the content of an earlier one; name, folder and tags stay."""
+        expected_rev = self.precondition.expected_rev
+        return await self.answer(items.revert_item, project, kind_of(kind), item, body, expected_rev=expected_rev)
+
+
 class Revisions(Resource):
     """The history of an item."""
 
@@ -210,6 +223,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     ItemsOfKind,
     ItemResource,
     ItemRestoration,
+    ItemReversion,
     Revisions,
     RevisionResource,
     LineageResource,

@@ -87,8 +87,9 @@ def test_the_commands_of_the_page_work_in_their_order(run: CommandLine, project:
     walker.commit("Ours", "main", "ours")
     assert "nothing is recorded" in run("dataset", "merge", "lab/gaits@trial", status=1).stderr
     walker.follow()
-    (exported,) = walker.follow()
+    exported, _ = walker.follow()
     assert json.loads(exported)["clips"] == 2
+    assert sorted(path.name for path in (run.folder / "gaits-v1" / "raw").iterdir()) == ["turn.bvh", "walk.bvh"]
     (job,) = json.loads(run("job", "ls", "lab", "--json").stdout)
     assert gaits.at("v1").digest in run("job", "show", job["id"]).stdout
     run("dataset", "checkout", "lab/gaits")

@@ -48,6 +48,22 @@ def test_the_commands_of_the_page_compare_revisions_and_draw_them(run: CommandLi
     assert b"<svg" in (run.folder / "walk.svg").read_bytes()
 
 
+def test_earlier_revisions_are_shown_downloaded_and_returned_to(run: CommandLine, clip: ClipHandle) -> None:
+    page = PAGE.with_name("keep-a-project-in-order.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"## Earlier revisions\n\n```sh\n(.*?)```", page, re.DOTALL)
+    outputs = [run(*shlex.split(line, comments=True)[1:]) for line in block.splitlines()]
+    assert "trimmed" in outputs[0].stdout
+    assert "revision 1" in re.sub(r"[^\w]+", " ", outputs[1].stdout)
+    assert outputs[-1].stderr == "raw/walk: revision 4 has the content of revision 1\n"
+    assert len(clip.motion().poses) == len(clip.motion(revision=1).poses) == len(clip.motion(revision=2).poses) + 12
+    assert "already" in run("revert", "lab/raw/walk@1").stderr
+    assert json.loads(run("show", "lab/raw/walk@2", "--json").stdout)["message"] == "trimmed"
+    assert "write project/folder/name@2" in run("revert", "lab/raw/walk", status=2).stderr
+    assert "no revision 9" in run("show", "lab/raw/walk@9", status=1).stderr
+    assert "there is no item" in run("show", "lab/raw/walk@x", status=2).stderr
+    assert "names no item, no revision" in run("download", "lab/raw/walk@x", status=2).stderr
+
+
 def test_the_difference_is_printed_as_json_and_returned_by_the_sdk(run: CommandLine, clip: ClipHandle) -> None:
     printed = json.loads(run("diff", "lab/raw/walk@2", "--threshold-deg", "5", "--json").stdout)
     found = clip.difference(1, 2, threshold_deg=5)

@@ -20,12 +20,14 @@ import typer
 from tests.support.command_line import run_here
 from tests.support.scripted_server import ScriptedServer, problem
 
-from marey_client.cli import files, projects, tokens, with_global_options_first
+from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
 from marey_client.cli.failures import Refused, WrongUsage, sentence
-from marey_client.cli.files import _items_in, _print_entries
+from marey_client.cli.files import uploading
+from marey_client.cli.files.listing import _items_in
+from marey_client.cli.files.uploading import _print_entries
 from marey_client.cli.following import follow, print_ended
 from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import _done
@@ -358,10 +360,10 @@ def test_a_project_that_is_not_there_is_told_before_any_byte_is_sent(
     script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "walk.bvh").write_text("x")
-    monkeypatch.setattr(files, "connect", lambda context: script.marey())
+    monkeypatch.setattr(uploading, "connect", lambda context: script.marey())
     script.answers = [problem(404, "no-project")]
     with pytest.raises(NotFound):
-        files.upload(NO_OPTIONS, [tmp_path], "nowhere", {})
+        uploading.upload(NO_OPTIONS, [tmp_path], "nowhere", {})
     assert [request.method for request in script.requests] == ["GET"]
 
 
@@ -434,10 +436,10 @@ def test_who_interrupts_an_upload_is_told_how_to_go_on(
     def interrupt(_request: httpx.Request) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "connect", lambda context: script.marey())
+    monkeypatch.setattr(uploading, "connect", lambda context: script.marey())
     script.answers = [httpx.Response(200, json=PROJECT), interrupt]
     with pytest.raises(KeyboardInterrupt):
-        files.upload(NO_OPTIONS, [tmp_path], "lab", {})
+        uploading.upload(NO_OPTIONS, [tmp_path], "lab", {})
     assert "repeating the command sends only the missing ones" in capsys.readouterr().err
 
 

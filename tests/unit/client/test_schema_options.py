@@ -15,7 +15,7 @@ from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import ALIGN, CUT
 from marey_client.cli.evaluations import EVALUATE
 from marey_client.cli.failures import WrongUsage
-from marey_client.cli.files import UPLOAD
+from marey_client.cli.files.uploading import UPLOAD
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.job_params import AlignParams, EvaluateParams
 from marey_schemas.jobs import JobKind

@@ -12,7 +12,7 @@ from tests.support.store_fixtures import Lab, declared, motion_tree, skeleton_tr
 
 from marey_motion.arrays import AnyFloats
 from marey_schemas.encoding.arrays import EncodedArray
-from marey_schemas.items import CollectionChange, CollectionCreate, Item, ItemChange, ItemCreate
+from marey_schemas.items import CollectionChange, CollectionCreate, Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import Kind
 from marey_server.errors import (
     ConflictProblem,
@@ -24,6 +24,7 @@ from marey_server.errors import (
 )
 from marey_server.store import collections, items, projects
 from marey_server.store.database.connections import Database
+from marey_server.store.fsck import check_store
 from marey_server.store.transaction import Transaction
 
 
@@ -320,6 +321,24 @@ def test_a_deleted_item_is_gone_until_it_is_restored(lab: Lab, rig: Item) -> Non
     assert [one.id for one in bin_] == [clip.id]
     back = lab.write(items.restore_item, "lab", Kind.CLIP, clip.id)
     assert (back.id, back.name, back.revision, back.rev) == (clip.id, "walk", 1, 3)
+
+
+def test_an_item_returns_to_an_earlier_revision_by_a_new_one(lab: Lab, rig: Item) -> None:
+    clip = lab.add_clip(rig, "walk", info={"subject": "first"})
+    second = put_info(lab, clip, clip.rev, subject="second")
+
+    def revert(number: int, rev: int | None = None) -> Item:
+        return lab.write(items.revert_item, "lab", Kind.CLIP, clip.id, ItemRevert(revision=number), expected_rev=rev)
+
+    with pytest.raises(PreconditionFailedProblem):
+        revert(1, clip.rev)
+    with pytest.raises(NotFoundProblem, match="no revision 3"):
+        revert(3)
+    back = revert(1, second.rev)
+    assert (back.revision, back.parts) == (3, clip.parts)
+    assert lab.read(items.read_revision, "lab", Kind.CLIP, clip.id, 3).message == "Revert to revision 1"
+    assert revert(3).revision == 3
+    assert list(check_store(lab.database)) == []
 
 
 def test_restoring_needs_the_name(lab: Lab, rig: Item) -> None:

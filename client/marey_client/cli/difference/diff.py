@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.addresses import Address, require_item
+from marey_client.cli.addresses import Address
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_message
+from marey_client.cli.revisions import require_revision
 from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
 
 if TYPE_CHECKING:
-    from marey_client.items import ItemHandle
-    from marey_client.marey import Marey
     from marey_schemas.documents.differences import Difference
 
-_REVISION = re.compile(r"(.+)@([0-9]{1,10})")
 PICTURES = ("svg", "png")
 
 
@@ -47,12 +44,14 @@ def diff(
     """Show how two revisions of an item differ: frames, joints, path, segments, fields."""
     if picture is not None and picture.suffix.lower().lstrip(".") not in PICTURES:
         raise WrongUsage(f"{picture} must end in .svg or .png")
+    from marey_schemas.kinds import Kind
+
     with connect(context) as marey:
-        first, first_revision = _revision_at(marey, before)
+        first, first_revision = require_revision(marey, Address.parse(before), list(Kind))
         if after is None:
             found = first.difference(after=first_revision, plot=picture is not None, **params)
         else:
-            second, second_revision = _revision_at(marey, after)
+            second, second_revision = require_revision(marey, Address.parse(after), list(Kind))
             if first.item.kind is not second.item.kind:
                 raise WrongUsage(
                     f"only items of one kind can be compared; the kind of {before} is {first.item.kind}, and that of "
@@ -81,12 +80,3 @@ def _draw(difference: Difference, picture: Path) -> None:
         return print_message("there is nothing to draw; only changed motions and annotations have a picture")
     picture.write_bytes(embedded.draw_difference(difference, picture.suffix.lower().lstrip(".")))
     return print_message(f"wrote {picture}")
-
-
-def _revision_at(marey: Marey, text: str) -> tuple[ItemHandle, int | None]:
-    """Return the item at an address, and the revision after its `@`, if one is given."""
-    from marey_schemas.kinds import Kind
-
-    named = _REVISION.fullmatch(text)
-    place, revision = (named[1], int(named[2])) if named else (text, None)
-    return require_item(marey, Address.parse(place), list(Kind)), revision

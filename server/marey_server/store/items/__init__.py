@@ -13,6 +13,7 @@ from marey_server.store.items.changing import (
     prepare_parts,
     put_part,
     restore_item,
+    revert_item,
     set_parts,
 )
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
@@ -61,5 +62,6 @@ __all__ = [
     "read_revision",
     "read_staleness",
     "restore_item",
+    "revert_item",
     "set_parts",
 ]

@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import delete, insert
 
-from marey_schemas.items import Item, ItemChange, ItemCreate
+from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.problems import FieldError
 from marey_server.errors import ConflictProblem, InvalidProblem
@@ -15,6 +15,7 @@ from marey_server.store import collections, documents, projects, quotas
 from marey_server.store.database.violations import taken
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items.drafts import Draft
+from marey_server.store.items.history import no_revision
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import find_item, no_item, shown_items
 from marey_server.store.items.references import ReferenceCheck
@@ -126,6 +127,25 @@ def set_parts(
     quotas.hold(tx, project_row.id, {found.creator_id: Held(stored_bytes=added)})
     shown = _shown(tx, project_row, kind, item_id)
     emit_item(tx, "item.revised", project_row, shown, revision=shown.revision, job=None)
+
+
+def revert_item(
+    tx: Transaction, project: str, kind: Kind, item_id: str, request: ItemRevert, *, expected_rev: ExpectedRev
+) -> Item:
+    """Create a revision with the content of an earlier one; if the content is unchanged, no revision is created.
+
+    Raises `NotFoundProblem` if there is no such revision, and `PreconditionFailedProblem` if the item is no longer at
+    `expected_rev`.
+    """
+    project_row = projects.require(tx, project)
+    found = find_item(tx, project_row, kind, item_id)
+    if not is_expected(found.rev, expected_rev):
+        raise moved_on(found.rev)
+    parts = read_part_digests(tx, [(item_id, request.revision)])[item_id, request.revision]
+    if not parts:
+        raise no_revision(item_id, request.revision)
+    set_parts(tx, project_row, kind, item_id, parts, request.message or f"Revert to revision {request.revision}")
+    return _shown(tx, project_row, kind, item_id)
 
 
 def change_item(

@@ -49,8 +49,13 @@ def _revision_rows() -> Select[Any]:
 def _find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
     row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
     if row is None:
-        raise NotFoundProblem(f"The item {item_id!r} has no revision {number}.", code="no-revision")
+        raise no_revision(item_id, number)
     return row
+
+
+def no_revision(item_id: str, number: int) -> NotFoundProblem:
+    """Return the error for a revision that does not exist."""
+    return NotFoundProblem(f"The item {item_id!r} has no revision {number}.", code="no-revision")
 
 
 def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:

@@ -1,109 +1,31 @@
-"""Commands `upload`, `ls`, `show` and `download`."""
+"""Commands `ls` and `show`."""
 
 from __future__ import annotations
 
-from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, kind_named, require_item
-from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.addresses import Address, find_item, kind_named
+from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table, progress
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_schemas.formats import EXPORT_FORMATS
-from marey_schemas.wording import counted, one_of
+from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.revisions import require_revision
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
-    from marey_schemas.imports import ImportEntry
+    from marey_schemas.items import Revision
     from marey_schemas.kinds import Kind
-
-UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
-DOWNLOADS_AT_ONCE = 4
-NEW_REVISION = "new revision"
-OUTCOMES = ("created", NEW_REVISION, "unchanged", "companion", "failed")  # in the order of the summary
-
-WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    add_command(app, upload, options=UPLOAD)
-    for command in (ls, show, download):
+    for command in (ls, show):
         app.command()(command)
-
-
-def upload(
-    context: typer.Context,
-    places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
-    project: Annotated[str, typer.Option(help="The project that receives the files.")],
-    options: Chosen,
-    left_handed: Annotated[
-        bool, typer.Option("--left-handed", help="The same as --handedness left: the files have left-handed axes.")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Import motion files. Refused files are listed with a reason.
-
-    Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
-    """
-    from marey_client.imports import find_files, left_out_text
-    from marey_schemas.options.imports import ImportOptions
-
-    if left_handed:
-        options["handedness"] = "left"
-    found = find_files(places)
-    if found.left_out:
-        print_message(left_out_text(found.left_out))
-    with connect(context) as marey:
-        to = marey.project(project)
-        to.read()  # a missing project is an error before any bytes are sent
-        try:
-            with progress() as advance:
-                entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
-        except KeyboardInterrupt:
-            print_message(
-                "interrupted; imported files stay imported, and repeating the command sends only the missing ones"
-            )
-            raise
-    if as_json:
-        print_json(entries)
-    else:
-        _print_entries(entries)
-    if any(entry.status == "failed" for entry in entries):
-        raise Refused
-
-
-def _print_entries(entries: Sequence[ImportEntry]) -> None:
-    from marey_client.imports import refusal_text
-
-    found: dict[str, list[str]] = {}
-    for entry in entries:
-        if entry.error is not None:
-            print_message(refusal_text(entry))
-        for warning in entry.warnings:
-            found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
-    for code, texts in found.items():
-        others = len(texts) - WARNINGS_SHOWN
-        more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
-        for text in [*texts[:WARNINGS_SHOWN], *more]:
-            print_message(f"warning {code}: {text}")
-    counts = Counter(_outcome(entry) for entry in entries)
-    frames = sum(entry.frames or 0 for entry in entries)
-    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
-    typer.echo(f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}")
-
-
-def _outcome(entry: ImportEntry) -> str:
-    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
-    return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status
 
 
 def ls(
@@ -213,7 +135,7 @@ def _items_in(
 
 def show(
     context: typer.Context,
-    place: Annotated[str, typer.Argument(help="The item: project/folder/name, or project/id.")],
+    place: Annotated[str, typer.Argument(help="The item: project/folder/name[@revision], or project/id[@revision].")],
     part: Annotated[str | None, typer.Option(help="Print only the document of this part, as JSON.")] = None,
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
@@ -222,13 +144,15 @@ def show(
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:
-        item = require_item(marey, Address.parse(place), list(Kind))
+        item, revision = require_revision(marey, Address.parse(place), list(Kind))
         if part is not None:
             from marey_schemas.encoding.codecs import encode_tree
 
-            return typer.echo(encode_tree(item.part(part), "application/json"))
+            return typer.echo(encode_tree(item.part(part, revision=revision), "application/json"))
         if history:
             return _show_history(item, as_json)
+        if revision is not None:
+            return _show_revision(item, item.revision(revision), as_json)
         if as_json:
             return print_json(item.item)
         return print_pairs(_described(marey, item))
@@ -260,6 +184,16 @@ def _described(marey: Marey, item: ItemHandle) -> Iterator[tuple[str, object]]:
             yield f"warning {check.code}", f"{check.message}{frames}{joints}"
 
 
+def _show_revision(item: ItemHandle, found: Revision, as_json: bool) -> None:
+    if as_json:
+        return print_json(found)
+    parts = [
+        (f"part {name}", f"{one.size_bytes} bytes, {one.schema_}, {one.document}") for name, one in found.parts.items()
+    ]
+    described = found.model_dump(mode="json", exclude={"parts"}).items()
+    return print_pairs([("name", item.path), *described, *parts])
+
+
 def _show_history(item: ItemHandle, as_json: bool) -> None:
     revisions, lineage, staleness = list(item.revisions()), item.lineage(), item.staleness()
     if as_json:
@@ -273,86 +207,3 @@ def _show_history(item: ItemHandle, as_json: bool) -> None:
     for edge in staleness.because:
         typer.echo(f"stale: {edge.kind} {edge.name} has newer revisions than {edge.revision}")
     return None
-
-
-def download(
-    context: typer.Context,
-    place: Annotated[str, typer.Argument(help="A clip, or a folder of clips: project/folder[/name].")],
-    format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
-    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
-    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
-    restored: Annotated[
-        bool, typer.Option(help="Export aligned clips with the time and place of their source clips.")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Write clips to files: one clip, or all clips in a folder and below, or its aligned clips if it has no others.
-
-    An existing file is replaced; if several clips would have the same file name, the later ones get a number.
-    """
-    if format not in EXPORT_FORMATS:
-        raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
-    address = Address.parse(place)
-    with connect(context) as marey:
-        clips, base = _clips_at(marey, address)
-        options = {"format": format, "unit": unit}
-        written, refused = _download_all(clips, base, output, options | {"time": "source"} if restored else options)
-    if as_json:
-        print_json({"files": [str(path) for path in written], "refused": refused})
-    else:
-        typer.echo(f"wrote {counted(len(written), 'file')} to {output}")
-        for name, reason in refused.items():
-            print_message(f"{name}: {reason}")
-    if refused:
-        raise Refused
-
-
-def _clips_at(marey: Marey, address: Address) -> tuple[list[ItemHandle], str]:
-    """Return the items at an address, and the folder that their file paths are relative to."""
-    from marey_schemas.kinds import Kind
-
-    project = marey.project(address.project)
-    clip = find_item(marey, address, [Kind.CLIP, Kind.PROCESSED])
-    below: list[ItemHandle] = []
-    if clip is None:
-        below += project.clips.list(collection=address.path)
-    if clip is None and not below:
-        below += project.processed.list(collection=address.path)
-    others = [Kind.SKELETON, Kind.MODEL, Kind.GRAPH, Kind.ANNOTATION]
-    single = clip or (None if below else find_item(marey, address, others))
-    if single is not None:
-        return [single], single.item.collection
-    if not below:
-        raise WrongUsage(f"there is no clip at {address}; `marey ls {address.project}` lists the project")
-    return below, address.path
-
-
-def _download_all(
-    clips: Sequence[ItemHandle], base: str, output: Path, options: Mapping[str, Any]
-) -> tuple[list[Path], dict[str, str]]:
-    from marey_client.cli.failures import sentence
-    from marey_client.downloads import TakenPaths, safe_file_name
-    from marey_client.errors import RequestFailed
-
-    written: list[Path] = []
-    refused: dict[str, str] = {}
-    paths = TakenPaths()
-
-    def one(clip: ItemHandle) -> Path | str:
-        below = clip.item.collection.removeprefix(base).strip("/")
-        try:
-            folder = output.joinpath(*(safe_file_name(name) for name in below.split("/") if name))
-            return clip.export(folder, beside=paths, **options)
-        except RequestFailed as error:
-            if error.status >= 500 or error.status == 401:
-                raise
-            return sentence(error)
-
-    with ThreadPoolExecutor(DOWNLOADS_AT_ONCE) as pool, progress() as advance:
-        for clip, outcome in zip(clips, pool.map(one, clips), strict=True):
-            if isinstance(outcome, Path):
-                written.append(outcome)
-            else:
-                refused[clip.path] = outcome
-            advance("downloading", len(written) + len(refused), len(clips))
-    return written, refused

@@ -1,0 +1,1 @@
+"""Commands about files and items: `upload`, `ls`, `show` and `download`."""

@@ -1,0 +1,147 @@
+"""Command `download`."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from marey_client.cli.addresses import Address
+from marey_client.cli.failures import Refused, WrongUsage
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_message, progress
+from marey_client.cli.revisions import find_revision, find_version
+from marey_schemas.formats import EXPORT_FORMATS
+from marey_schemas.wording import counted, one_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from marey_client.items import ItemHandle
+    from marey_client.marey import Marey
+    from marey_client.project import ProjectHandle
+    from marey_schemas.jobs import DatasetInput
+
+
+DOWNLOADS_AT_ONCE = 4
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command of this module."""
+    app.command()(download)
+
+
+def download(
+    context: typer.Context,
+    place: Annotated[
+        str,
+        typer.Argument(
+            help="A clip, a folder of clips, or a version of a dataset: project/folder[/name[@revision]], "
+            "project/dataset@version[/folder]."
+        ),
+    ],
+    format: Annotated[str, typer.Option(help=f"{one_of(EXPORT_FORMATS)}.")] = "original",  # noqa: A002
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
+    unit: Annotated[str | None, typer.Option(help="Unit of length of BVH files: cm or m.")] = None,
+    restored: Annotated[
+        bool, typer.Option(help="Export aligned clips with the time and place of their source clips.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write clips to files: one clip, or all clips in a folder and below, or its aligned clips if it has no others.
+
+    After `@`, name a revision of the clip, or a version of the dataset.
+
+    An existing file is replaced; if several clips would have the same file name, the later ones get a number.
+    """
+    if format not in EXPORT_FORMATS:
+        raise WrongUsage(f"{format!r} is not a format; the formats are {', '.join(EXPORT_FORMATS)}")
+    address = Address.parse(place)
+    with connect(context) as marey:
+        options = {"format": format, "unit": unit} | ({"time": "source"} if restored else {})
+        written, refused = _download_all(_exported_at(marey, address), output, options)
+    if as_json:
+        print_json({"files": [str(path) for path in written], "refused": refused})
+    else:
+        typer.echo(f"wrote {counted(len(written), 'file')} to {output}")
+        for name, reason in refused.items():
+            print_message(f"{name}: {reason}")
+    if refused:
+        raise Refused
+
+
+class _Exported(NamedTuple):
+    """Revision of an item that is written to a file; None means the newest revision."""
+
+    item: ItemHandle
+    revision: int | None
+    folder: str
+    """Folder of the file, relative to the output."""
+    name: str
+
+
+def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
+    """Return what an address names: an item, the clips in a folder and below, or those of a version."""
+    from marey_schemas.kinds import Kind
+
+    project = marey.project(address.project)
+    single = find_revision(marey, address, [Kind.CLIP, Kind.PROCESSED])
+    version = None if single is not None else find_version(marey, address)
+    if version is not None:
+        return _entries_of(project, version)
+    below: list[ItemHandle] = [] if single is not None else list(project.clips.list(collection=address.path))
+    if single is None and not below:
+        below += project.processed.list(collection=address.path)
+    if single is None and not below:
+        single = find_revision(marey, address, [Kind.SKELETON, Kind.MODEL, Kind.GRAPH, Kind.ANNOTATION])
+    if single is not None:
+        return [_Exported(*single, "", single[0].name)]
+    if not below:
+        raise WrongUsage(f"there is no clip at {address}; `marey ls {address.project}` lists the project")
+    return [_Exported(one, None, one.item.collection.removeprefix(address.path).strip("/"), one.name) for one in below]
+
+
+def _entries_of(project: ProjectHandle, version: DatasetInput) -> list[_Exported]:
+    from marey_client.handles.clips import ClipHandle
+    from marey_client.places import entries_at
+
+    found: list[_Exported] = []
+    for entry, item in entries_at(project.clips, version):
+        folder, _, name = entry.path.removeprefix(version.path).strip("/").rpartition("/")
+        handle = ClipHandle(project.transport, project.name, item)
+        found.append(_Exported(handle, entry.revision, folder, name or item.name))
+    if not found:
+        raise WrongUsage(f"{version.dataset}@{version.version} has no clip at {version.path or 'any path'}")
+    return found
+
+
+def _download_all(
+    chosen: Sequence[_Exported], output: Path, options: Mapping[str, Any]
+) -> tuple[list[Path], dict[str, str]]:
+    from marey_client.cli.failures import sentence
+    from marey_client.downloads import TakenPaths, safe_file_name
+    from marey_client.errors import RequestFailed
+
+    written: list[Path] = []
+    refused: dict[str, str] = {}
+    paths = TakenPaths()
+
+    def write(one: _Exported) -> Path | str:
+        try:
+            folder = output.joinpath(*(safe_file_name(name) for name in one.folder.split("/") if name))
+            return one.item.export(folder, revision=one.revision, beside=paths, **options)
+        except RequestFailed as error:
+            if error.status >= 500 or error.status == 401:
+                raise
+            return sentence(error)
+
+    with ThreadPoolExecutor(DOWNLOADS_AT_ONCE) as pool, progress() as advance:
+        for one, outcome in zip(chosen, pool.map(write, chosen), strict=True):
+            if isinstance(outcome, Path):
+                written.append(outcome)
+            else:
+                refused[f"{one.folder}/{one.name}".strip("/")] = outcome
+            advance("downloading", len(written) + len(refused), len(chosen))
+    return written, refused

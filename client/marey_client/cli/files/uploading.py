@@ -1,0 +1,98 @@
+"""Command `upload`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.failures import Refused
+from marey_client.cli.invocation import AsJson, connect
+from marey_client.cli.output import print_json, print_message, progress
+from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from marey_schemas.imports import ImportEntry
+
+
+UPLOAD = OptionsOf("marey_schemas.options.imports:ImportOptions", short={"frame_rate_hz": "--fps"})
+NEW_REVISION = "new revision"
+OUTCOMES = ("created", NEW_REVISION, "unchanged", "companion", "failed")  # in the order of the summary
+
+WARNINGS_SHOWN = 2  # of each code: a folder of thousands shows what it has, not everything it has
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command of this module."""
+    add_command(app, upload, options=UPLOAD)
+
+
+def upload(
+    context: typer.Context,
+    places: Annotated[list[Path], typer.Argument(help="Motion files, or folders of them.")],
+    project: Annotated[str, typer.Option(help="The project that receives the files.")],
+    options: Chosen,
+    left_handed: Annotated[
+        bool, typer.Option("--left-handed", help="The same as --handedness left: the files have left-handed axes.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Import motion files. Refused files are listed with a reason.
+
+    Importing the same file again changes nothing; a changed file of the same name becomes a new revision of its clip.
+    """
+    from marey_client.imports import find_files, left_out_text
+    from marey_schemas.options.imports import ImportOptions
+
+    if left_handed:
+        options["handedness"] = "left"
+    found = find_files(places)
+    if found.left_out:
+        print_message(left_out_text(found.left_out))
+    with connect(context) as marey:
+        to = marey.project(project)
+        to.read()  # a missing project is an error before any bytes are sent
+        try:
+            with progress() as advance:
+                entries = to.imports.upload(found.files, ImportOptions.model_validate(options), notice=advance)
+        except KeyboardInterrupt:
+            print_message(
+                "interrupted; imported files stay imported, and repeating the command sends only the missing ones"
+            )
+            raise
+    if as_json:
+        print_json(entries)
+    else:
+        _print_entries(entries)
+    if any(entry.status == "failed" for entry in entries):
+        raise Refused
+
+
+def _print_entries(entries: Sequence[ImportEntry]) -> None:
+    from marey_client.imports import refusal_text
+
+    found: dict[str, list[str]] = {}
+    for entry in entries:
+        if entry.error is not None:
+            print_message(refusal_text(entry))
+        for warning in entry.warnings:
+            found.setdefault(warning.code, []).append(f"{entry.name}: {warning.message}")
+    for code, texts in found.items():
+        others = len(texts) - WARNINGS_SHOWN
+        more = [f"and {counted(others, 'more file')}; --json shows all"] if others > 0 else []
+        for text in [*texts[:WARNINGS_SHOWN], *more]:
+            print_message(f"warning {code}: {text}")
+    counts = Counter(_outcome(entry) for entry in entries)
+    frames = sum(entry.frames or 0 for entry in entries)
+    outcomes = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
+    typer.echo(f"{counted(len(entries), 'file')}: {outcomes}; {counted(frames, 'frame')}")
+
+
+def _outcome(entry: ImportEntry) -> str:
+    """Return the word for the result of an import: `new revision` if an item of this name existed before."""
+    return NEW_REVISION if entry.status == "created" and (entry.revision or 1) > 1 else entry.status

@@ -1,0 +1,57 @@
+"""Addresses with `@`: revisions of items, as in `lab/raw/walk@2`, and versions of datasets, as in `lab/gaits@v1/raw`.
+
+Names may contain `@`, so an item or a folder whose name is the whole text comes first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from marey_client.cli.addresses import Address, find_item, require_item
+from marey_client.cli.failures import WrongUsage
+
+if TYPE_CHECKING:
+    from marey_client.items import ItemHandle
+    from marey_client.marey import Marey
+    from marey_schemas.jobs import DatasetInput
+    from marey_schemas.kinds import Kind
+
+_REVISION = re.compile(r"(.+)@([1-9][0-9]{0,8})")
+_VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
+
+
+def require_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[Any, int | None]:
+    """Return the item at an address, and the revision after its `@`, if one is given. Raises `WrongUsage`."""
+    found = find_revision(marey, address, kinds)
+    return found if found is not None else (require_item(marey, address, kinds), None)
+
+
+def find_revision(marey: Marey, address: Address, kinds: Sequence[Kind]) -> tuple[ItemHandle, int | None] | None:
+    """Return the item at an address, and the revision after its `@`, if one is given; None if there is no item."""
+    found = find_item(marey, address, kinds)
+    if found is not None:
+        return found, None
+    named = _REVISION.fullmatch(address.path)
+    if named is None or (found := find_item(marey, Address(address.project, named[1]), kinds)) is None:
+        return None
+    return found, int(named[2])
+
+
+def find_version(marey: Marey, address: Address) -> DatasetInput | None:
+    """Return the version of a dataset, or the folder in it, at an address; None if it names no version.
+
+    Raises `WrongUsage` if the address has `@`, but names neither a version nor a folder.
+    """
+    from marey_schemas.jobs import DatasetInput
+
+    if "@" not in address.path or marey.project(address.project).collections.at(address.path) is not None:
+        return None
+    version = _VERSION.fullmatch(address.path)
+    if version is None:
+        raise WrongUsage(
+            f"{address} names no item, no revision and no version; write project/folder/name@2 for a revision of an "
+            "item, and project/dataset@v1 or project/dataset@v1/folder for a version of a dataset"
+        )
+    return DatasetInput(dataset=version[1], version=version[2], path=version[3] or "")
