@@ -59,9 +59,9 @@ def _of_sides(before: bool, after: bool) -> ChangeKind:
 def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
     """Return the differing entries of two versions by path, with removed and added entries paired as moved.
 
-    A removed and an added entry of one kind are the same, moved, if all their parts are equal, or else if one part is.
-    Where several would fit, they are paired in the order of their paths. An entry of which all parts changed counts as
-    removed and added if either has a partner with equal parts, as when two entries exchanged their names.
+    A removed and an added entry of the same kind are paired if all their parts are equal, or else if one part is equal.
+    If there are several possible pairs, the order of the paths decides. An entry of which all parts changed counts as
+    removed and added if another entry has the old or the new parts, as when two entries exchanged their names.
     """
     compared = [
         ComparedEntry(*(None if value is None else entry_of(one.key, value) for value in (one.before, one.after)))
@@ -74,7 +74,7 @@ def compare_entries(changes: Iterable[Changed]) -> list[ComparedEntry]:
 
 
 def _split(compared: Iterable[ComparedEntry]) -> Iterator[ComparedEntry]:
-    """Return entries of which all parts changed as removed and added, and the other entries as they are."""
+    """Split each entry of which all parts changed into a removed and an added one; yield the others unchanged."""
     for one in compared:
         if one.before and one.after and one.parts.keys() == one.before.parts.keys() | one.after.parts.keys():
             yield ComparedEntry(one.before, None)
@@ -84,7 +84,7 @@ def _split(compared: Iterable[ComparedEntry]) -> Iterator[ComparedEntry]:
 
 
 def _rejoined(compared: Sequence[ComparedEntry]) -> list[ComparedEntry]:
-    """Join a removed and an added entry of the same path and kind."""
+    """Join a removed and an added entry of the same path and kind to a changed one."""
     added = {one.after.key: one.after for one in compared if one.before is None and one.after is not None}
     removed = {one.before.key for one in compared if one.after is None and one.before is not None}
     joined: list[ComparedEntry] = []

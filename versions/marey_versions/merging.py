@@ -75,7 +75,7 @@ def merge_entries(
 
 
 class _Decided(NamedTuple):
-    """Outcome for one entry: the entry of our side, and what takes its place."""
+    """Outcome for one entry: the entry of our side, and the merged entry that replaces it."""
 
     base: DatasetEntry | None
     ours: DatasetEntry | None
@@ -83,7 +83,7 @@ class _Decided(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """Whether the merged entry comes to a place where our side does not have it."""
+        """Whether the merged entry gets a path or kind that it does not have on our side."""
         return self.merged is not None and (self.ours is None or self.ours.key != self.merged.key)
 
 
@@ -121,7 +121,7 @@ def _apply(
 ) -> None:
     """Add the changes of our tree; entries that come to an occupied place are conflicts.
 
-    `occupied` are the entries that our side has changed, by the key of their present place.
+    `occupied` contains the entries that our side has changed, by their present keys.
     """
     for one in decided:
         if one.ours is not None and (one.moves or one.merged is None):
@@ -162,7 +162,7 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
 def _combined(
     base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None, choice: Side = Side.OURS
 ) -> DatasetEntry | None:
-    """Return the entry with the changes of both sides; where they exclude each other, with those of `choice`."""
+    """Return the entry with the changes of both sides; where these exclude each other, `choice` decides."""
     if ours is None or theirs is None:
         return None
     of_base: Mapping[str, str] = {} if base is None else base.parts

@@ -18,7 +18,7 @@ from marey_versions.tree.chunks import Value, digest_of
 COMMIT_SCHEMA = "marey/commit@1"
 
 _SEPARATOR = "\t"
-"""Character between the path and the kind in a key; paths cannot contain it, and it sorts before all that they can."""
+"""Character between path and kind in a key. Paths cannot contain it, and it sorts before every character of a path."""
 
 
 class RevisionKey(NamedTuple):
@@ -84,7 +84,7 @@ def references_in(body: Any) -> Iterator[RevisionKey]:
 def document_content(body: Any, content_of: Callable[[RevisionKey], str | None]) -> str:
     """Return the content digest of a stored document with references.
 
-    `content_of` gives the content digest of a revision; a reference for which it gives None stays as it is.
+    `content_of` returns the content digest of a revision. If it returns None, the reference remains unchanged.
     """
     portable = _replaced(body, content_of)
     return digest_of(_canonical(portable))
@@ -133,7 +133,7 @@ class CommitRecord:
     tree: str
     """Digest of the root of the tree of entries."""
     parents: tuple[str, ...]
-    """Digests of the commits that it follows: none for the first one, two for a merge."""
+    """Digests of the commits before this one: none for the first commit, two for a merge."""
     author: str
     """Name of the user on the server where the commit was made."""
     message: str

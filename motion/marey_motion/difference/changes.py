@@ -19,9 +19,9 @@ NOISE_CM = 0.01
 JOINED_S = 0.1
 """Distance, in seconds, below which two ranges of frames are joined into one."""
 POINT_M = 0.01
-"""Extent up to which a path has no direction that a turn could be measured by."""
+"""Extent of a path, in metres, up to which it counts as a point, whose turn cannot be measured."""
 UNEXPLAINED = 0.1
-"""Greatest share of a path's change that a movement of the whole path may leave."""
+"""Greatest share of the mean change of a path that may remain if a movement of the whole path is to explain it."""
 MOST_SPANS = 100
 """Maximum number of ranges listed for a joint; if there are more, ranges farther apart are joined, too."""
 

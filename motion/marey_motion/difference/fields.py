@@ -23,7 +23,7 @@ class ChangedValue(NamedTuple):
     ----------
     pointer : str    JSON pointer of the value
     change : str    "added", "removed" or "changed"
-    before, after : JSON values    None if the value was added or removed
+    before, after : JSON values    `before` is None if the value was added, `after` if it was removed
     """
 
     pointer: str
@@ -74,7 +74,7 @@ def _changed_members(before: Mapping[str, Any], after: Mapping[str, Any], pointe
 
 
 def _is_nothing(value: Any) -> bool:
-    """Return whether a value says as much as an absent one."""
+    """Return whether a value is null, an empty list or an empty object, which equal an absent value."""
     return value is None or (isinstance(value, Mapping | list | tuple) and not value)
 
 

@@ -16,14 +16,14 @@ WINDOWS = 12
 """Number of windows of the clip before that are searched in the whole clip after."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
-"""Factor of the least squared distance up to which the second-best place of a window is a candidate, too."""
+"""Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
-"""Greatest pace that is searched; 1 divided by it is the least."""
+"""Greatest pace that is tried, in frames after per frame before; the least is 1 / `GREATEST_PACE`."""
 PACES = 97
 DECIMATED = 2048
-"""Frames of the longer clip that are used to search paces."""
+"""Approximate number of frames of the longer clip that are used to search paces."""
 PACE_WINDOW = 96
 PACE_WINDOWS = 3
 CHANNELS = 8
@@ -100,7 +100,7 @@ def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size:
 
 
 def likely_pace(before: Poses, after: Poses) -> float:
-    """Estimate at which pace a clip was sampled from another one, of which it may be a part.
+    """Estimate the pace at which the clip after was resampled from the clip before, or from a part of it.
 
     Windows of the clip after are stretched to many paces, and each is compared with every place of the clip before.
 
@@ -136,7 +136,7 @@ def likely_pace(before: Poses, after: Poses) -> float:
 
 
 def _stretched(window: Floats, count: int) -> Floats:
-    """Sample a window at `count` places by straight lines."""
+    """Resample a window to `count` frames by linear interpolation."""
     places = np.linspace(0.0, len(window) - 1.0, count)
     left = np.minimum(places.astype(np.int64), len(window) - 2)
     share = (places - left)[:, None]
@@ -161,7 +161,7 @@ def _body_hashes(poses: Poses) -> NDArray[np.uint64]:
 
 
 def _one_sided(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return rotations as rows (F, 4·J) with a sign of each quaternion that depends on the rotation alone."""
+    """Return rotations as rows (F, 4·J); each quaternion gets the sign with which its w is not negative."""
     signs = np.where(rotations[..., :1] < 0.0, np.float32(-1.0), np.float32(1.0))
     return np.asarray(rotations * signs, dtype=np.float32).reshape(len(rotations), -1)
 

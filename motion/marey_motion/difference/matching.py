@@ -21,11 +21,11 @@ UNMATCHED = 0.25
 NEW_RUN = 1.0
 """Cost of a change of the lag inside the clips."""
 AT_AN_END = 0.995
-"""Cost of frames that are removed or inserted at an end; if all places cost the same, they are at an end."""
+"""Cost of removing or inserting frames at an end; less than `NEW_RUN`, so that an end is preferred to other places."""
 WELL_MATCHED = 0.02
 """Cost up to which a frame counts as matched well, so that no further candidates are searched."""
 MOST_ROUNDS = 64
-"""Most changes of the lag that are considered."""
+"""Maximum number of rounds of the search; the cheapest path with k changes of the lag needs at most k rounds."""
 SHORTEST_REPLACEMENT = 10
 """Minimum number of consecutive, entirely different frames that are reported as removed and inserted."""
 

@@ -17,14 +17,14 @@ SAME_PACE = 1e-9
 WELL_EXPLAINED = 0.98
 """Share of the shorter clip's frames; if more are matched well, no other pace is tried."""
 MUCH_BETTER = 0.5
-"""Share of the cost at the best pace so far below which the cost at another pace must be for it to be chosen."""
+"""Another pace is chosen only if its cost is less than this share of the cost at the best pace so far."""
 SIMILAR_ENOUGH = 0.1
-"""Share of the greatest possible cost up to which no pace is searched, unless there are `MANY_RUNS`."""
+"""Cost, as a share of the greatest one, up to which no pace is searched, unless there are `MANY_RUNS` or more runs."""
 MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8
 SLOPES, FRAMES_APART = 20, 64
-"""Slopes are measured over the number of frames divided by the first number, or over the second number of frames."""
+"""Slopes are measured over 1 / `SLOPES` of all frames, and, in turn, over `FRAMES_APART` frames."""
 FARTHEST_OFFSET = 2.0
 """Maximum offset, in frames, that is estimated from velocities."""
 ROUNDED_FRAMES = 0.02
@@ -154,7 +154,7 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 
 
 def _rounded(start: float, step: float, count: int) -> Pace:
-    """Return the pace of a line; slope and start become simple numbers if they differ from these by rounding only."""
+    """Return the pace of a line; slope and start are replaced by simple numbers that differ only by rounding."""
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))
     if abs(simple - pace) * count <= ROUNDED_FRAMES * pace:
@@ -166,7 +166,7 @@ def _rounded(start: float, step: float, count: int) -> Pace:
 
 
 def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) -> tuple[float, float]:
-    """Return start and slope of a straight line through most values, which jump where frames were removed."""
+    """Fit a straight line to values that jump where frames were removed; return its start and slope."""
     apart = max(1, min(apart, len(places) - 1))
     slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
     start = float(np.median(values - slope * places))
@@ -200,7 +200,7 @@ def _run_count(timing: Timing) -> int:
 
 
 def _share(timing: Timing, after: Poses) -> float:
-    """Return the cost of a matching, from 0 to 1, apart from the frames that remain because one clip is longer."""
+    """Return the cost of a matching, from 0 to 1, without the frames by which one clip is longer."""
     counts = timing.before.frame_count, after.frame_count
     return (timing.matching.total - UNMATCHED * abs(counts[0] - counts[1])) / (2.0 * UNMATCHED * min(counts))
 

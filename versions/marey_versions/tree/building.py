@@ -45,18 +45,18 @@ class Splitter(Generic[T]):
 
     @property
     def is_between_chunks(self) -> bool:
-        """Whether the last one added ended a chunk, or none was added."""
+        """Whether the last key added ended a chunk, or no key was added yet."""
         return not self._open
 
     def add(self, key: str, one: T) -> tuple[T, ...] | None:
-        """Add one; return the chunk that it ends, or None."""
+        """Add a key with its value; return the chunk that it ends, or None."""
         self._open.append(one)
         if len(self._open) == 1 or (len(self._open) < self._most and not self._is_end(key)):
             return None
         return self._take()
 
     def finish(self) -> Iterator[tuple[T, ...]]:
-        """Return the last chunk, which nothing ended, if there is one."""
+        """Return the last chunk, which no key ended, or None if there is no such chunk."""
         if self._open:
             yield self._take()
 
@@ -70,7 +70,7 @@ class Splitter(Generic[T]):
 
 
 class ChunkWriter:
-    """Collects new chunks, and stores those that the new tree consists of."""
+    """Collects new chunks, and stores those that belong to the new tree."""
 
     def __init__(self, store: ChunkStore) -> None:
         self.reader = ChunkReader(store)

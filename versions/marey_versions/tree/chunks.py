@@ -109,7 +109,7 @@ def decode(digest: str, data: bytes) -> Chunk:
 
 
 def decode_trusted(digest: str, data: bytes) -> Chunk:
-    """Return the chunk with these bytes, which a store holds that has checked the digest when it stored them."""
+    """Return the chunk with these bytes, read from a store that checked the digest when it stored them."""
     try:
         content = orjson.loads(data)
         level = content["level"]

@@ -73,7 +73,7 @@ class KeyRange(NamedTuple):
 def _compare(
     reader: ChunkReader, level: int, before: Sequence[Child], after: Sequence[Child], within: KeyRange
 ) -> Iterator[Changed]:
-    """Return the differences, within a range of keys, of two rows of chunks of one level."""
+    """Return the differences, within a range of keys, between the chunks of one level in two trees."""
     shared = {child.digest for child in before} & {child.digest for child in after}
     before, after = ([child for child in side if child.digest not in shared] for side in (before, after))
     if level == 0:
@@ -85,7 +85,7 @@ def _compare(
 
 
 def _parts(before: Sequence[Child], after: Sequence[Child], within: KeyRange) -> Iterator[KeyRange]:
-    """Split a range of keys so that each part concerns few chunks of the longer row."""
+    """Split a range of keys so that each part contains few chunks of the tree that has more of them."""
     longer = max(before, after, key=len)
     start = within.after
     for place in range(COMPARED_TOGETHER - 1, len(longer) - 1, COMPARED_TOGETHER):

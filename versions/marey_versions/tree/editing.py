@@ -94,7 +94,7 @@ class _ChunksOfLevel:
         top = reader.one(root)
         self._root = Child(top.last_key, root, top.count)
         self._path: list[tuple[Branch, int]] = []
-        """Branches from the root down to the level above, with the place of the child that the path goes on with."""
+        """Branches from the root down to the level above, each with the index of the child that is next on the path."""
 
     def seek(self, key: str) -> None:
         """Go to the chunk in which `key` is or would be."""

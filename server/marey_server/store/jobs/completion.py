@@ -178,7 +178,7 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 
 def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
-    """End a job as cancelled if its cancellation was acknowledged before the worker had finished.
+    """End a job as cancelled if its cancellation was requested before its worker completed it.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job.
     """

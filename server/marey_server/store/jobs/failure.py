@@ -48,7 +48,7 @@ class AttemptOutcome:
     rest_us: int | None = None
     failure: dict[str, Any] | None = None
     counts_as: Literal["attempt", "interruption", "unstarted"] = "attempt"
-    """Limit that it counts against: `max_attempts`, or one of those in the policy."""
+    """Limit against which the attempt counts: `max_attempts`, or a limit of the policy."""
 
 
 def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, poisoned: bool) -> AttemptOutcome:

@@ -73,7 +73,7 @@ _MAY_WRITE = or_(
 AUTHOR_MAY_RUN: ColumnElement[bool] = or_(
     job.c.author_id.is_(None), exists().where(user.c.id == job.c.author_id, user.c.disabled.is_(False), _MAY_WRITE)
 )
-"""The condition that the author of a job still has the role with which jobs are submitted; the server needs none."""
+"""The condition that the author of a job still has a role that may submit jobs, or that the job has no author."""
 
 
 def require_attempt(principal: Principal, job_id: str, fence: int) -> None:

@@ -29,7 +29,7 @@ from marey_server.store.transaction import IN_LIST, Transaction
 MOST_INPUTS = 100_000
 
 Pin = dict[str, Any]
-"""Stored input: the fields of `PinnedInput`, or `{job}` until that job has produced it."""
+"""Stored input: the fields of `PinnedInput`, or, before the input exists, `job`: the id of the job that produces it."""
 
 PinnedInputs = dict[str, list[Pin]]
 

@@ -121,7 +121,7 @@ class _Made(NamedTuple):
     pins: list[Pin]
 
     def below(self, one: Pin) -> str:
-        """Return the path of an output relative to that collection, or its whole path if it was moved elsewhere."""
+        """Return the path of an output relative to `into`, or its whole path if it was moved elsewhere."""
         path: str = one["collection"]
         return f"{path}/".removeprefix(f"{self.into}/").rstrip("/") if self.into else path
 
@@ -159,7 +159,7 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
 def _resolved(
     tx: Transaction, project_id: str, name: str, spec: InputSpec, entry: dict[str, Any], made: dict[str, _Made]
 ) -> list[Pin]:
-    """Return the pins of one entry of an input: the entry itself, or the outputs of the job it names.
+    """Return the pins of one entry of an input: the entry itself, or the outputs of the job that the entry names.
 
     Raises `LateInputError` if a required input has no outputs.
     """

@@ -108,7 +108,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """If a job has several tasks, make it a gathering job and return the tasks; they start when it does."""
+    """If a job has several tasks, make it a gathering job and return the tasks, which start when this job starts."""
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []

@@ -165,7 +165,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel tasks that have not started after another task failed, if a worker would combine the results."""
+    """After a task has failed, cancel the tasks that have not started, if a worker would combine the results."""
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)

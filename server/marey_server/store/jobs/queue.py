@@ -108,9 +108,9 @@ _CLAIMED_BEFORE = Prepared(
 
 
 def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list[Lease]:
-    """Renew and return the leases of an earlier claim of the same name; empty if there was none.
+    """Renew and return the leases of an earlier claim with the same `claim_id`; empty if there was none.
 
-    Two claims of the same name at the same time run one after the other. Raises `LeaseLostProblem`.
+    Two concurrent claims with the same `claim_id` run one after the other. Raises `LeaseLostProblem`.
     """
     token_id = tx.principal.token_id
     tx.lock(f"claim {token_id} {claim_id}")
@@ -272,7 +272,7 @@ _CLAIM_STATEMENTS = {
 
 
 def _require_worker(caller: Principal) -> list[str]:
-    """Return the scopes that let the caller work for all projects, or for the named ones."""
+    """Return the caller's `work` scopes, for all or for named projects. Raises `ForbiddenProblem` if there are none."""
     scopes = [scope for scope in caller.scopes if scope.partition("!")[0] == "work"]
     if not scopes or caller.kind not in ("user", "system"):
         raise ForbiddenProblem("Claiming jobs needs a user's token with the scope `work`.", code="insufficient-scope")

@@ -32,7 +32,7 @@ _pins: LruCache[str, Pins] = LruCache(
 _named: LruCache[str, frozenset[str]] = LruCache(
     max_bytes=_REMEMBERED_BYTES, size_of=lambda named: _ENTRY_BYTES * (1 + len(named))
 )
-"""Both are kept by job: neither its pins nor revisions ever change."""
+"""Like `_pins`, cached by the id of a job and always current, because neither its pins nor revisions change."""
 
 
 class Pins(NamedTuple):
@@ -43,7 +43,7 @@ class Pins(NamedTuple):
 
 
 def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
-    """Return the items of the project that the caller may not read; none if the caller is not an attempt."""
+    """Return those of the wanted items that the caller may not read; none if the caller is not an attempt."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)
@@ -52,7 +52,7 @@ def unreachable_items(tx: Transaction, wanted: Iterable[str]) -> set[str]:
 
 
 def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[PinnedPlace]:
-    """Return the revisions of the project that the caller may not read."""
+    """Return those of the wanted revisions that the caller may not read; none if the caller is not an attempt."""
     if tx.principal.kind != "attempt":
         return set()
     pins = _pins_of(tx)

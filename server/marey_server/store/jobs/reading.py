@@ -33,7 +33,7 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
 }
 
 UNNAMED_WORKER = "a worker"
-"""Stands for the name of a worker, which is often that of its host, for callers who may not know it."""
+"""Text shown instead of a worker's name, which is often the name of its host, to callers who may not know it."""
 
 UNFINISHED = tuple(state.value for state in JobState if not state.terminal)
 
@@ -82,7 +82,7 @@ def list_jobs(
 
 
 def list_attempts(tx: Transaction, job_id: str) -> Page:
-    """Return the attempts of a job in the order of their start; names of workers are for contributors."""
+    """Return the attempts of a job in the order of their start; only contributors see the names of workers."""
     _, project = find_job(tx, job_id)
     named = roles.includes(project.role, Role.CONTRIBUTOR)
     rows = tx.execute(select(attempt).where(attempt.c.job_id == job_id).order_by(attempt.c.fence))

@@ -114,7 +114,7 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 
 
 def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
-    """Return the job whose result each of `candidates` (`id, project_id, cache_key, cache_mode`) can share.
+    """Find, for each of `candidates` (`id, project_id, cache_key, cache_mode`), the job whose result it can share.
 
     Candidates without such a job are omitted. Of several identical candidates, the first computes the result and the
     others share it. Submissions to one project that use the cache decide one after another; the jobs with the results

@@ -59,7 +59,7 @@ def _same_name(named: list[Pin]) -> tuple[str, str] | None:
 def _over_another_input(
     kind: KindDeclaration, params: Any, pins: Mapping[str, list[Pin]], into: str
 ) -> tuple[str, str] | None:
-    """Return the conflict if a result would become a revision of another input of the same job."""
+    """Return the conflict if the result of one input would replace another input of the same job."""
     named = pins.get(kind.named_after or "", [])
     if kind.in_place is not None and getattr(params, kind.in_place):
         return None

@@ -197,7 +197,7 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """Return the dependencies of each job and the newest retry of each; a job with a shared result is no dependency."""
+    """Return, for each job, its dependencies with their newest retries, but not the job whose result it shares."""
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
     for row in _select_in(tx, statement, job_dependency.c.job_id, rows):

@@ -29,7 +29,7 @@ from marey_server.store.transaction import IN_LIST, Transaction
 MOST_STAGED = 20_000
 
 StagedDraft = dict[str, Any]
-"""Stored draft: kind, item_name, collection below `into`, tags, reuse, sources, parts by digest."""
+"""Stored draft: an object with kind, name, collection below `into`, tags, reuse, sources, and digests of the parts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,7 @@ def staged_drafts(
 
 
 def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Protect the documents that an earlier job staged from garbage collection; return whether all still exist."""
+    """Renew the age of documents that an earlier job staged, so that they are not deleted; return whether all exist."""
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
     for start in range(0, len(wanted), IN_LIST):

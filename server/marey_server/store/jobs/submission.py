@@ -178,7 +178,7 @@ def _lock_upstream(
 
 
 def lock_jobs(tx: Transaction, project: ProjectRow, ids: Iterable[str]) -> dict[str, Upstream]:
-    """Return the given jobs that exist in the project, locked so that none ends before this transaction does."""
+    """Lock the given jobs that exist in the project, so that none ends during this transaction, and return them."""
     wanted = sorted(set(ids))
     found: dict[str, Upstream] = {}
     for start in range(0, len(wanted), IN_LIST):
