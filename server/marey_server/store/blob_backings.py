@@ -36,7 +36,7 @@ class BlobBacking(Protocol):
         ...
 
     def release(self, connection: Connection, digest: str) -> None:
-        """Free the bytes of a blob whose row this transaction deletes; it may still be rolled back."""
+        """Free the bytes of a blob whose row this transaction deletes; the transaction may still be rolled back."""
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:

@@ -99,8 +99,8 @@ def put_blob(
 ) -> str:
     """Store bytes that the caller uploaded, and allow the caller to refer to them by their digest.
 
-    The bytes are for `project_id`; without it, for the projects of the caller's token. Raises `InvalidProblem` if their
-    digest is not `expected`.
+    The bytes can be used in `project_id`; without it, in the projects of the caller's token. Raises `InvalidProblem` if
+    their digest is not `expected`.
     """
     require_sender(tx.principal)
     places = places_of_sender(tx) if project_id is None else (project_id,)
@@ -128,7 +128,7 @@ def require_sender(principal: Principal) -> None:
 
 
 EVERY_PROJECT = ""
-"""Place of bytes that a token without binding sent: its user may use them in every project."""
+"""Stands for all projects, in place of a project id, for bytes sent with a token that is not limited to projects."""
 
 
 def places_of_sender(tx: Transaction) -> tuple[str, ...]:

@@ -22,9 +22,9 @@ PAST = frozenset(
 )  # fmt: skip
 """Columns of moments that have passed; none may lie in the future."""
 WAITING = frozenset({"expires_us", "lease_expires_us", "run_at_us", "until_us"})
-"""Columns of moments to wait for. Leases and leaders are renewed, and jobs and sign-ins go on, when a server starts."""
+"""Columns of times to wait for. If they are set to now, leases are renewed, and waiting jobs and sign-ins go on."""
 MOVED = {token.c.expires_us: token.c.created_us, job.c.deadline_us: job.c.started_us}
-"""Columns of moments that keep their distance from another column of the row if that one lies in the future."""
+"""Columns of ends, each with the column of the start: if the start lies in the future, both move by the same time."""
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def list_collections(
 def _find(
     tx: Transaction, project_row: ProjectRow, collection_id: str, state: ColumnElement[bool], *, lock: bool = False
 ) -> Row[Any]:
-    """Return the row of a collection, locked for this write with `lock`. Raises `NotFoundProblem`."""
+    """Return the row of a collection; with `lock`, it is locked for this write. Raises `NotFoundProblem`."""
     statement = select(collection).where(
         collection.c.id == collection_id, collection.c.project_id == project_row.id, state
     )

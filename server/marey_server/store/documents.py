@@ -103,7 +103,7 @@ def decoded_tree(content: PreparedDocument) -> Tree:
 
 
 def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Return `content` as a document prepared for `schema`; unchanged if it is one already."""
+    """Return `content` as a document prepared for `schema`; a prepared document is returned unchanged."""
     if not isinstance(content, PreparedDocument):
         return prepare_document(content, schema=schema)
     if schema not in (None, OPEN_SCHEMA, content.schema):
@@ -152,9 +152,9 @@ _LEAVES = (str, float, int, bool, type(None))
 
 
 def _members(tree: Any) -> list[tuple[str, Any]]:
-    """List the members of a tree with their JSON Pointers, containers before their members.
+    """List the members of a tree with their JSON Pointers, an object or list before its own members.
 
-    Numbers and text in lists are left out: they are neither references nor named.
+    Numbers and text in lists are left out, because they have no names and are not references.
     """
     found: list[tuple[str, Any]] = []
 
@@ -216,7 +216,7 @@ def store_document(tx: Transaction, content: Any, *, schema: str | None = None) 
 def store_documents(tx: Transaction, contents: Iterable[PreparedDocument]) -> dict[str, int]:
     """Store documents as `store_document` does, all with the same few statements.
 
-    Returns for how many bytes the new ones count, by digest.
+    Returns, by digest, the bytes for which each new document counts in quotas.
     """
     by_digest = {one.digest: one for one in contents}
     file_sizes = _require_files(tx, by_digest.values())
@@ -306,7 +306,7 @@ _STORED_BYTES = Prepared(
 
 
 def stored_bytes_of(tx: Transaction, digests: Iterable[str]) -> dict[str, int]:
-    """Return how many bytes stored documents count for, by digest: text, arrays, and the files that they name."""
+    """Return, by digest, the bytes for which documents count in quotas: text, arrays, and the files that they name."""
     wanted = sorted(set(digests))
     return {
         row.digest: row.stored_bytes

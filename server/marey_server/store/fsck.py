@@ -66,7 +66,7 @@ def check_store(
 ) -> Iterator[StoreDefect]:
     """Yield all defects as they are found; call `progress(check, count)` after each page.
 
-    With `repair`, counters of items and bytes that are wrong are then corrected; they are yielded nevertheless.
+    With `repair`, wrong counters of items and bytes are yielded as defects, too, and then corrected.
     """
     yield from database.read(SYSTEM, _check_file)
     passes: tuple[tuple[str, Table, Callable[[Transaction, Row[Any]], list[StoreDefect]]], ...] = (

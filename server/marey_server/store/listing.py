@@ -33,7 +33,7 @@ class Order:
 
     text: str
     columns: tuple[tuple[ColumnElement[Any], bool], ...]
-    """Each column with whether its order is descending."""
+    """Columns of the order, each with True if its order is descending."""
 
     def clauses(self) -> list[UnaryExpression[Any]]:
         """Return the clauses of ORDER BY."""

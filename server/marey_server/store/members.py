@@ -48,7 +48,7 @@ def put_member(
     expected_rev: ExpectedRev = None,
     absent: bool = False,
 ) -> Member:
-    """Add a member, or change the member's role. `absent`: refuse if the user is a member already.
+    """Add a member, or change the member's role. With `absent`, a user who is a member already is refused.
 
     Raises `NotFoundProblem` if there is no such user, and `ConflictProblem` if the project would lose its last owner.
     """

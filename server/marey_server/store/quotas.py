@@ -126,7 +126,7 @@ _ADD = Prepared(
 
 
 def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, Held]:
-    """Return what items hold, given as rows of `creator_id` and `stored_bytes`, by their creators."""
+    """Return the number of items and bytes of each creator, from rows of items with `creator_id` and `stored_bytes`."""
     held: dict[str | None, Held] = {}
     for row in rows:
         held[row.creator_id] = held.get(row.creator_id, Held()) + Held(1, row.stored_bytes)
@@ -134,7 +134,7 @@ def by_creator(rows: Iterable[Row[Any]]) -> dict[str | None, Held]:
 
 
 def hold(tx: Transaction, project_id: str, more: Mapping[str | None, Held]) -> None:
-    """Add to what a project and the creators of its items hold.
+    """Add items and bytes to the counters of a project and of the creators of these items.
 
     The counters are locked until the transaction ends, so that no concurrent writes exceed a quota together. Raises
     `QuotaExceededProblem`; the caller must then roll back.
@@ -164,7 +164,7 @@ def limit_of(tx: Transaction, of: str, name: str, limits: Mapping[str, int]) -> 
 
 
 def release(tx: Transaction, project_id: str, less: Mapping[str | None, Held]) -> None:
-    """Take from what a project and the creators of its items hold."""
+    """Subtract items and bytes from the counters of a project and of the creators of these items."""
     total = sum(less.values(), Held())
     for owner_id, held in ((project_id, total), *sorted((one, less[one]) for one in less if one is not None)):
         if held != Held():
@@ -224,19 +224,19 @@ _SUMS = (func.count().label("items"), func.coalesce(func.sum(item.c.stored_bytes
 
 
 def count_held(tx: Transaction, owner: Column[str], owner_id: str) -> Held:
-    """Return what a project or a user holds, counted item by item; `owner` is the column of items that names it."""
+    """Count the items and bytes of a project or a user, item by item; `owner` is the column of items that names it."""
     row = tx.execute(select(*_SUMS).where(owner == owner_id, item.c.deleted_us.is_(None))).one()
     return Held(row.items, int(row.stored_bytes))
 
 
 def read_held(tx: Transaction, owner_id: str) -> Held:
-    """Return what the counters say that a project or a user holds."""
+    """Return the number of items and bytes of a project or a user from the counters."""
     row = tx.execute(select(holding.c["items"], holding.c.stored_bytes).where(holding.c.owner_id == owner_id)).first()
     return Held() if row is None else Held(row.items, row.stored_bytes)
 
 
 def recount(tx: Transaction) -> None:
-    """Set all counters to what is stored. Other writes of items wait until the end."""
+    """Count all items and bytes, and set the counters. Other writes of items wait until the end."""
     if tx.is_postgres:
         tx.execute(text("LOCK TABLE item IN SHARE ROW EXCLUSIVE MODE"))
     tx.execute(update(item).where(item.c.stored_bytes != BYTES_OF_ITEM).values(stored_bytes=BYTES_OF_ITEM))

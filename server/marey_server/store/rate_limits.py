@@ -31,12 +31,12 @@ class RateLimit:
     interval_us: int
 
     def latest_us(self, now_us: int) -> int:
-        """Return the latest time in the row at which another event is allowed now."""
+        """Return the latest time that the row may contain if another event is to be allowed now."""
         return now_us + (self.burst - 1) * self.interval_us
 
 
 def key_of(*parts: str) -> str:
-    """Return the key of a limit from its name and the names that it is for."""
+    """Return the key of a limit, a hash of its name and of the names or addresses to which it applies."""
     return hashlib.sha256(canonical_json(list(parts))).hexdigest()
 
 

@@ -121,8 +121,9 @@ task = job.alias("task")
 
 
 def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
-    """Return the next jobs that ended long ago, whose tasks and which themselves created no revision, and on which no
-    other job depends.
+    """Return the next jobs that can be deleted.
+
+    They ended long ago, neither they nor their tasks created a revision, and no other job depends on them.
     """
     tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))

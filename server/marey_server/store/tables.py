@@ -263,7 +263,7 @@ lineage = Table(
 )
 
 UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
-"""Condition of `ix_job_unfinished`, in the words that let SQLite use this index."""
+"""Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
 
 ONE_RUNS_PER_KEY = "uq_job_concurrency"
 """Index that refuses a second running job of a concurrency key; a concurrent claim that violates it picks again."""

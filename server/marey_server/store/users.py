@@ -54,7 +54,7 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user, to administrators and to the user. Raises `NotFoundProblem`."""
+    """Return a user; only administrators and this user may read it. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -64,7 +64,7 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
-    """Return the number of items and bytes that count for a user, and the limits, to the user or an administrator."""
+    """Return a user's number of items and bytes, with the limits; only administrators and this user may read them."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
         raise ForbiddenProblem("The token does not allow reading in all projects.", code="insufficient-scope")
     return quotas.show_quotas(tx, "user", find_user(tx, name).id)
@@ -77,7 +77,7 @@ def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUs
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """Return all users by name, to administrators."""
+    """Return all users by name; for administrators."""
     require_administrator(tx.principal)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
     rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
@@ -124,7 +124,7 @@ def change_user(
 
 
 def _require_changes(principal: Principal, name: str, request: UserChange) -> bool:
-    """Return whether users change themselves. Raises `ForbiddenProblem` if the principal may not make the changes."""
+    """Return whether the principal is the user to be changed. Raises `ForbiddenProblem` if a change is not allowed."""
     itself = principal.kind == "user" and principal.user_name == name
     if not itself:
         require_administrator(principal, hidden=_no_user(name))

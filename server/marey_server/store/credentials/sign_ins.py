@@ -22,7 +22,7 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""How many times as many tries an address has for all accounts, and all unknown addresses at once for an account."""
+"""Factor by which the limit of an address, and that of an account from unknown addresses, exceed `per_minute`."""
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
 LimitScope = Literal["account-at-address", "address", "account"]

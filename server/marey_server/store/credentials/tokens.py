@@ -69,8 +69,9 @@ _ATTEMPT_TOKEN = Prepared(
 
 
 class TokenFilter(NamedTuple):
-    """Filter of a list of tokens: those of the caller, of a user or of all users; with a prefix; tokens that end within
-    a given time.
+    """Filter of a list of tokens: by user (by default the caller), by prefix, and by end.
+
+    `everybody` selects the tokens of all users, `ends_within_s` those that end within this number of seconds.
     """
 
     user: str | None = None
@@ -259,7 +260,7 @@ def list_tokens(
 
 
 def _id_of(tx: Transaction, name: str) -> str:
-    """Return the id of a user, for administrators."""
+    """Return the id of a user. Raises `NotFoundProblem` if there is none, or the caller is not an administrator."""
     unknown = NotFoundProblem(f"There is no user {name!r} that you may see.", code="no-user")
     require_administrator(tx.principal, hidden=unknown)
     found = tx.execute(select(user.c.id).where(user.c.name == name)).scalar()
@@ -271,9 +272,9 @@ def _id_of(tx: Transaction, name: str) -> str:
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
-    With `with_created`, also revoke the tokens that were created with it, its successors, its predecessors, and so on
-    recursively. Without it, the tokens that were created with the revoked one are recorded as created with the token
-    that created the revoked one, and its successor as that of its predecessor. A token may always revoke itself.
+    With `with_created`, also revoke the tokens that were created with this token, its successors and predecessors, and
+    in turn those connected with these. Otherwise, tokens created with this token are recorded as created with the token
+    that created it, and its successor becomes that of its predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:

@@ -13,9 +13,9 @@ from sqlalchemy import Connection, insert, select, text, update
 from marey_server.store.tables import server_state
 
 FAR_AHEAD_DAYS = 366
-"""A clock that is further ahead of the stored mark is assumed to be wrong until somebody confirms it."""
+"""Days that a clock may be ahead of the stored time; if it is further ahead, somebody must confirm that it is right."""
 NOTABLY_AHEAD_S = 60
-"""A database that is further ahead of its machine is named in the log."""
+"""Seconds that the stored time may be ahead of the machine's clock without a message in the log."""
 DAY_US = 86400 * 1_000_000
 _HIGH_WATER = "clock_high_water_us"
 _SAVE_EVERY_US = 1_000_000
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class ClockFarAhead(Exception):
-    """The clock of this machine is far ahead of the time at which the database was last used."""
+    """Error of a machine whose clock is far ahead of the time at which the database was last used."""
 
 
 class Clock(Protocol):
@@ -88,8 +88,7 @@ def stored_high_water_us(connection: Connection) -> int:
 def save_high_water(connection: Connection, now_us: int) -> int:
     """Store a time after `now_us`, so that no restart uses an earlier time, whatever the wall clock says.
 
-    The stored time is a second ahead, so that it need not be written more often. It is returned: nothing needs to be
-    saved until then.
+    The stored time is a second ahead, and is returned. Until that time, no other needs to be stored.
     """
     stored = stored_high_water_us(connection)
     if now_us < stored:

@@ -107,7 +107,7 @@ class Database:
 
     @property
     def is_behind(self) -> bool:
-        """Whether writes of many bytes should wait until the database has caught up with earlier ones."""
+        """Whether writes of many bytes should wait until the database has processed earlier writes."""
         return self._log is not None and self._log.is_long
 
     @property
@@ -224,7 +224,7 @@ class Database:
         return lane.submit(client, self.write, principal, function)
 
     async def notifications(self, channel: str) -> AsyncGenerator[None]:
-        """Yield after each notification of a channel of Postgres, and once before them, when it is listened to.
+        """Yield once when listening to a channel of Postgres has begun, and then after each notification.
 
         Raises `UnavailableProblem` if the connection, which is outside of the pool, breaks.
         """

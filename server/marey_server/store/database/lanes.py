@@ -37,7 +37,7 @@ class Client:
 
 
 SERVER = Client("server")
-"""The server itself, for its housekeeping."""
+"""Client in whose name the server runs calls of its own, such as housekeeping."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,7 +91,7 @@ class _Form:
     """Names of the members of each list parameter."""
     converts: Mapping[str, Convert]
     order: tuple[str, ...] | None
-    """The names in the order of the text; None where the driver takes them by name."""
+    """Names of the parameters in the order of the text; None if the driver takes parameters by name."""
     to_row: Convert | None
 
     def values(self, parameters: Parameters) -> Any:

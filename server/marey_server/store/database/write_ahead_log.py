@@ -34,9 +34,9 @@ TOO_LONG_BYTES = 64 * 2**20
 """Length of the log above which the writing thread waits longer for readers in order to restart the log."""
 PATIENCE_MS = 10
 LONG_PATIENCE_MS = 250
-"""The same for a log that is too long: longer than most reads, shorter than a backup."""
+"""Milliseconds to wait for readers if the log is too long: longer than most reads, shorter than a backup."""
 PAUSES = 20
-"""Number of times as long as the patience that pass before the next try, if readers prevented a restart of the log."""
+"""Pause after readers prevented a restart of the log, as a multiple of the time for which they were waited for."""
 
 
 class WriteAheadLog:
@@ -85,7 +85,7 @@ class WriteAheadLog:
             return 0
 
     def _copy(self) -> None:
-        """Copy the log until only what was written in a short time is left, or until readers prevent more."""
+        """Copy the log in passes, until one copies at most `LITTLE_BYTES`."""
         try:
             copied_before = self._copied_bytes
             self._copied_bytes = self._copy_once()
@@ -95,7 +95,7 @@ class WriteAheadLog:
             self._copying = self.is_long = False
 
     def _copy_once(self) -> int:
-        """Copy what no reader still needs in the log; return how many bytes of the log are copied now."""
+        """Copy as much of the log as its readers allow; return how many bytes of the log have been copied so far."""
         try:
             if self._connection is None:
                 self._connection = sqlite3.connect(self._file, isolation_level=None, check_same_thread=False)
@@ -109,7 +109,7 @@ class WriteAheadLog:
         return max(pages, 0) * FRAME_BYTES
 
     def _restart(self, connection: sqlite3.Connection, patience_ms: int) -> None:
-        """Copy the rest, and restart the log unless readers use it for longer than the patience."""
+        """Copy the rest, and restart the log unless readers use it for longer than `patience_ms`."""
         (usual_ms,) = connection.execute("PRAGMA busy_timeout").fetchone()
         connection.execute(f"PRAGMA busy_timeout = {patience_ms}")
         try:

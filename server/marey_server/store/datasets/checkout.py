@@ -32,7 +32,7 @@ from marey_versions.tree.reading import Tree
 
 
 def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
-    """Give the folder of a dataset the entries of a version, and let the next commit of the folder follow it.
+    """Replace the content of a dataset's folder by that of a version, which the next commit of the folder follows.
 
     Items of the folder keep their ids where an entry was moved or changed. An entry that was removed since gets its
     item back, or else a new item.
@@ -107,7 +107,7 @@ class _Checkout:
             self._add(one, documents)
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """Return an item with the documents of a revision of it for each content digest."""
+        """For each content digest, return an item with the documents of its revision that has this content."""
         held = revisions_with(self.tx, self.project.id, {entry.content for entry in entries})
         parts = read_part_digests(self.tx, set(held.values()))
         return {content: (key[0], parts[key]) for content, key in held.items()}

@@ -96,7 +96,7 @@ def record_commit(
 ) -> Commit:
     """Record a prepared commit, and move the branch to it on behalf of the `mover`, by default the caller.
 
-    Raises `ConflictProblem` if the branch has moved since the commit was prepared, and what `require_move` raises.
+    Raises `ConflictProblem` if the branch has moved since the commit was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

@@ -43,7 +43,7 @@ def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents
 
 
 def _in_order(waiting: Mapping[RevisionKey, _Waiting]) -> list[RevisionKey]:
-    """Sort revisions so that each comes after those that it refers to; a circle is entered at any of its members."""
+    """Sort revisions so that each comes after those that it refers to; a circle of references may begin anywhere."""
     ordered: dict[RevisionKey, None] = {}
     entered: set[RevisionKey] = set()
     path = list(waiting)
@@ -113,7 +113,7 @@ _PARTS = (
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
     """Return conditions that hold for the parts of the wanted revisions, and for few others.
 
-    SQLite would scan the table for pairs of an id and a number.
+    If the condition compared pairs of an id and a number, SQLite would scan the whole table.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

@@ -23,7 +23,7 @@ from marey_versions.tree.reading import Tree
 
 @dataclass(frozen=True)
 class FolderState:
-    """Entries that a folder has now, and the items that they stand for, by key."""
+    """Entries of the present content of a folder, and the items that they record, by key."""
 
     entries: Mapping[str, Value]
     items: Mapping[str, Row[Any]]

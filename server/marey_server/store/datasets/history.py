@@ -248,7 +248,7 @@ def _shown_entries(tx: Transaction, project_id: str, entries: Sequence[DatasetEn
 
 
 def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Entry:
-    """Return an entry as a document; `held` gives a revision of the project for content digests."""
+    """Return an entry as a document; `held` maps content digests to revisions of the project."""
     item_id, number = held.get(entry.content, (None, None))
     return Entry(
         path=entry.path, kind=Kind(entry.kind), parts=dict(entry.parts), tags=entry.tags, item=item_id, revision=number
@@ -256,7 +256,7 @@ def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Ent
 
 
 def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
-    """Return a revision of the project for each content digest that one has, of existing items rather than deleted."""
+    """Find a revision of the project for each content digest, of a deleted item only if there is no other."""
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}
     for start in range(0, len(wanted), IN_LIST):

@@ -78,8 +78,9 @@ def prepare_merge(
 def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest, *, undo: bool) -> PreparedMerge:
     """Compute the version of a branch in which the changes of one commit are repeated, or undone.
 
-    It is a merge of the commit into the branch whose base is the parent of the commit; `undo` exchanges the two. Raises
-    `InvalidProblem` for a merge without a choice of its parent, and if the branch would not change.
+    This merges the commit into the branch, with the parent of the commit as the common base; `undo` exchanges commit
+    and parent. Raises `InvalidProblem` for a commit of a merge without a choice of its parent, and if the branch would
+    not change.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

@@ -254,7 +254,7 @@ def protect_branch(
 def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
     """Return the digest of the commit that a version names.
 
-    Raises `NotFoundProblem`, and `InvalidProblem` for digits with which several commits begin.
+    Raises `NotFoundProblem`, and `InvalidProblem` for an abbreviated digest with which several commits begin.
     """
     match = _VERSION.fullmatch(version)
     if match is None:
@@ -272,7 +272,7 @@ def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
 
 
 def first_parents(dataset_id: str, start: str, steps: int) -> CTE:
-    """Return the query of a commit and of its first parent, that one's first parent and so on, by `digest` and `place`.
+    """Return the query for the `digest` and `place` of a commit, its first parent, the first parent of that, and so on.
 
     `start` has the place 0; the query ends at the place `steps`.
     """

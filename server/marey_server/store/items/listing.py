@@ -41,7 +41,7 @@ class ItemFilters:
     exact_name: str | None = None
     """Exact name; a final `*` is an ordinary character."""
     tags: tuple[str, ...] = ()
-    """Items that match any of these."""
+    """Tags; items with at least one of these match."""
     skeleton: str | None = None
     clip: str | None = None
     """Id of a clip; its annotations match."""
@@ -53,7 +53,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether only items of one name match, or of names that begin with one that ends in `*`."""
+        """Whether the filters match only one name, or only names that begin with a text which itself ends in `*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 

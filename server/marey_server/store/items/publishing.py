@@ -31,7 +31,7 @@ DRAFTS_TOGETHER = 256
 """Greatest number of drafts that are published with the same statements."""
 
 _RACES = 20
-"""Number of attempts to publish while concurrent writes are faster."""
+"""Maximum number of tries to publish a draft if concurrent writes interfere."""
 
 
 def publish(
@@ -286,7 +286,7 @@ class _Publication:
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def _create(self, new: Sequence[_Ready], kind: Kind) -> None:
-        """Create items whose places are still free. Raises `ConflictProblem` if another draft requires a new item."""
+        """Create the items whose names are free. Raises `ConflictProblem` for a taken name with the `reuse` `new`."""
         if not new:
             return
         for one in new:
@@ -371,7 +371,7 @@ class _Publication:
 
 
 def _names(draft: Draft) -> Iterator[str]:
-    """Yield names to try for a new item: its own, and numbered ones if the draft is identified by its content."""
+    """Yield names to try for a new item: that of the draft, then numbered ones if content identifies the draft."""
     yield draft.item_name
     if draft.reuse == "by_content":
         for number in itertools.count(2):

@@ -220,7 +220,7 @@ MOST_BYTES_AT_ONCE = 32 << 20
 
 
 def load_parts(tx: Transaction, project: str, wanted: Sequence[PartPlace]) -> list[dict[str, Any] | None]:
-    """Load the documents of parts with encoded arrays, in the order of the request; None for a part without one.
+    """Load the documents of parts with encoded arrays, in the order of the request; None for a missing part.
 
     If the documents together are too large, those at the end are left out; the first one is always loaded.
     """

@@ -33,7 +33,7 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """Return `tree` with the digest of the model of the same draft, if it refers to that as `PartDigestRef`."""
+    """Return `tree` with the digest of the model of the same draft, if it refers to the model as `PartDigestRef`."""
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}

@@ -40,7 +40,7 @@ def write_head(
 ) -> bool:
     """Set the item's newest revision to the next one; return false if the item does not meet `conditions`.
 
-    `bodies` may omit parts that do not change. `added_bytes` is what the changed parts count for.
+    `bodies` may omit parts that do not change. `added_bytes` is the size of the changed parts for quotas.
     """
     known = dict(bodies)
     for part, digest in parts.items():

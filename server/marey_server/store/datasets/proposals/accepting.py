@@ -39,7 +39,7 @@ MOST_PREVIEWED = 10_000
 MOST_SHOWN_CONFLICTS = 100
 
 WAITING_MERGE = ProposalMerge()
-"""Merge that is recorded when a review or a check adds the last missing thing."""
+"""Request to merge that is used when a review or a check meets the last requirement of a waiting proposal."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
 
 
 def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
-    """Return the reasons that lie in the two versions."""
+    """Yield the reasons against a merge that result from the two versions."""
     if prepared.refusal is not None and prepared.refusal.error_code != LARGE_MERGE:
         yield Missing(code=prepared.refusal.error_code, detail=prepared.refusal.detail)
     if prepared.merge is None:
@@ -157,7 +157,7 @@ def merge_proposal(
     """Merge a proposal, or, with `when_green`, merge it later if something is missing.
 
     Raises `ConflictProblem` if the proposal has ended, if something is missing, or if a branch has moved since the
-    merge was prepared, and what `require_move` raises.
+    merge was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -218,7 +218,7 @@ def _record(
 
 
 def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Proposal:
-    """Let a proposal wait for a request to merge it, although somebody has sent one with `when_green`."""
+    """Cancel the request to merge a proposal as soon as nothing is missing (`when_green`); the proposal stays open."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = lock_open(tx, found.id, number)
     if is_waiting(row):
@@ -229,7 +229,7 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
 def merge_if_green(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
 ) -> None:
-    """Merge a locked proposal that waits for this, if nothing is missing any more.
+    """Merge a locked proposal if it was to be merged as soon as nothing is missing, and nothing is missing now.
 
     Nothing happens if the user who asked for the merge may no longer move the branch. Raises `ConflictProblem` if a
     branch has moved since the merge was prepared.

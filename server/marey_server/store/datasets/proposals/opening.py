@@ -165,7 +165,7 @@ def close_proposal(tx: Transaction, project: str, name: str, number: int) -> Pro
 
 
 def end(tx: Transaction, row: Row[Any], state: ProposalState, **values: Any) -> None:
-    """Give a proposal its last state, and keep the commits that it is about from now on."""
+    """Set the final state of a proposal, and record the commits at which its source and target are now."""
     touch(
         tx, row, state=state.value, head=row.head_now, target_commit=row.target_now, when_green_id=None,
         when_green_head=None, ended_us=tx.now_us, **values,
@@ -173,7 +173,7 @@ def end(tx: Transaction, row: Row[Any], state: ProposalState, **values: Any) -> 
 
 
 def touch(tx: Transaction, row: Row[Any], **values: Any) -> None:
-    """Change a locked proposal."""
+    """Set columns of a locked proposal, the time of its last change, and its next `rev`."""
     changed = update(proposal).where(*is_proposal(row.dataset_id, row.number))
     tx.execute(changed.values(**values, updated_us=tx.now_us, rev=proposal.c.rev + 1))
 
@@ -184,7 +184,7 @@ def touch(tx: Transaction, row: Row[Any], **values: Any) -> None:
 def list_proposals(
     tx: Transaction, project: str, name: str, *, state: ProposalState | None, cursor: str | None, limit: int
 ) -> Page:
-    """List the proposals of a dataset, newest first; `state` leaves out those in other states."""
+    """List the proposals of a dataset, newest first; with `state`, only those in this state."""
     found = find_dataset(tx, projects.require(tx, project), name)
     statement = _rows(found.id)
     if state is not None:
