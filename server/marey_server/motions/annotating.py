@@ -10,6 +10,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.problems import FieldError
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
+from marey_server.motions.loading import LOADING
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import prepare_part, prepare_parts
 from marey_server.store.items.annotating import AnnotatedClip, ChangedAnnotation, FoundAnnotation
@@ -36,9 +37,10 @@ def apply_commands(
 
 
 def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocument:
-    from marey_motion import documents
-    from marey_motion.editing.annotations.commands import COMMANDS
-    from marey_motion.errors import MotionError
+    with LOADING:
+        from marey_motion import documents
+        from marey_motion.editing.annotations.commands import COMMANDS
+        from marey_motion.errors import MotionError
 
     annotation = Annotation.model_validate(found.tree)
     layer = documents.layer_from_document(annotation, found.frame_count)
@@ -66,9 +68,10 @@ def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCrea
 
     Raises `InvalidProblem`.
     """
-    from marey_motion import documents
-    from marey_motion.errors import MotionError
-    from marey_motion.formats.predecessor.annotation import layer_of_document
+    with LOADING:
+        from marey_motion import documents
+        from marey_motion.errors import MotionError
+        from marey_motion.formats.predecessor.annotation import layer_of_document
 
     try:
         layer = layer_of_document(

@@ -12,6 +12,7 @@ from marey_schemas.imports import ImportEntry, Refusal, refused_entry
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
 from marey_server.errors import ApiProblem, InvalidProblem
+from marey_server.motions.loading import LOADING
 from marey_server.store import blobs, items, projects
 from marey_server.store.blobs import Spool
 from marey_server.store.documents import PreparedDocument, prepare_document
@@ -61,7 +62,8 @@ class PreparedImport:
 
 def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
     """Read the skeleton named in the options of an import. Raises `NotFoundProblem`."""
-    from marey_motion.importing.items import GivenSkeleton
+    with LOADING:
+        from marey_motion.importing.items import GivenSkeleton
 
     part = items.read_part(tx, project, Kind.SKELETON, item_id, "hierarchy")
     return GivenSkeleton(item_id, part.revision, part.tree)
@@ -69,14 +71,16 @@ def read_skeleton(tx: Transaction, project: str, item_id: str) -> GivenSkeleton:
 
 def plan(names: Sequence[str]) -> list[PlannedFile]:
     """Return the import plan of each file of a batch."""
-    from marey_motion.importing.plan import plan_imports
+    with LOADING:
+        from marey_motion.importing.plan import plan_imports
 
     return plan_imports(names)
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
     """Return the entry of a file that is not read itself, or None."""
-    from marey_motion.importing.files import planned_entry
+    with LOADING:
+        from marey_motion.importing.files import planned_entry
 
     entry = planned_entry(planned)
     return None if entry is None else PreparedImport(planned.name, entry=entry)
@@ -86,7 +90,8 @@ def file_order(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> bytes:
     """Return the order by which a child process reads a file with its companion."""
-    from marey_server.motions.reading import FileOrder, packed_skeleton
+    with LOADING:
+        from marey_server.motions.reading import FileOrder, packed_skeleton
 
     file, companion = sources[0], sources[1] if len(sources) > 1 else None
     return FileOrder(
@@ -102,7 +107,8 @@ def file_order(
 
 def prepared_import(name: str, sources: Sequence[SourceFile], answer: bytes) -> PreparedImport:
     """Return what a child process read from a file, ready to be stored."""
-    from marey_server.motions.reading import ReadFile
+    with LOADING:
+        from marey_server.motions.reading import ReadFile
 
     found = ReadFile.unpack(answer)
     if found.refusal is not None:
@@ -142,7 +148,8 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 
 def mapping_order(file: PreparedImport) -> bytes:
     """Return the order by which a child process derives the joint mapping and axes of a file's skeleton."""
-    from marey_server.motions.reading import MappingOrder, ReadDocument
+    with LOADING:
+        from marey_server.motions.reading import MappingOrder, ReadDocument
 
     motion = next((_part(draft, "motion") for draft in file.drafts if draft.kind is Kind.CLIP), None)
     return MappingOrder(
@@ -153,7 +160,8 @@ def mapping_order(file: PreparedImport) -> bytes:
 
 def found_mapping(answer: bytes) -> PreparedDocument:
     """Return the part `mapping` that a child process derived."""
-    from marey_server.motions.reading import ReadDocument
+    with LOADING:
+        from marey_server.motions.reading import ReadDocument
 
     return ReadDocument.unpack(answer).document()
 
@@ -248,8 +256,9 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
     """Return the draft of a graph with models of the project. Raises `InvalidProblem`."""
-    from marey_motion.errors import MotionError
-    from marey_motion.importing.graphs import FEW, NamedModel, graph_item
+    with LOADING:
+        from marey_motion.errors import MotionError
+        from marey_motion.importing.graphs import FEW, NamedModel, graph_item
 
     def find(name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
         named = ItemFilters(exact_name=name, directly_in=collection)

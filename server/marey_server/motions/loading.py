@@ -1,0 +1,13 @@
+"""Lock for imports of the motion library, which the server loads only when a request needs it."""
+
+from __future__ import annotations
+
+import threading
+
+LOADING = threading.RLock()
+"""Held by every thread of the server while it imports modules of the motion library.
+
+If one thread imports a package while another imports a module of that package, each can hold the lock of what the other
+waits for. Python then ends one of the imports with an error. With this lock, only one thread imports at a time. Child
+processes need no lock, because they import in a single thread.
+"""

@@ -1,0 +1,35 @@
+"""Imports of the motion library in threads of the server."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from marey_server.motions import annotating, importing
+
+SLOW = ("marey_motion", "marey_server.motions.reading")
+"""What takes long to import; the module of the server imports the motion library itself."""
+
+
+def imports_in(function: ast.FunctionDef) -> set[int]:
+    """The lines at which a function imports the motion library."""
+    imports = (node for node in ast.walk(function) if isinstance(node, ast.ImportFrom))
+    return {node.lineno for node in imports if (node.module or "").startswith(SLOW)}
+
+
+@pytest.mark.parametrize("module", [annotating, importing], ids=lambda module: module.__name__.rpartition(".")[2])
+def test_threads_of_the_server_import_the_motion_library_one_at_a_time(module: object) -> None:
+    """Without the lock, one of two requests at the same time sometimes got an error, seldom enough to be overlooked."""
+    tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))  # type: ignore[attr-defined]
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    found = set().union(*map(imports_in, functions))
+    alone = {
+        node.lineno
+        for block in ast.walk(tree)
+        if isinstance(block, ast.With) and ast.unparse(block.items[0].context_expr) == "LOADING"
+        for node in block.body
+    }
+    assert found
+    assert found <= alone
