@@ -14,15 +14,15 @@ from marey_versions.tree.difference import difference
 from marey_versions.tree.reading import ChunkReader, Tree
 
 PATH = "path"
-"""Name under which the origin of an entry's path is given: the commit that added or moved the entry."""
+"""Name of the origin of an entry's path: the commit that added or moved the entry."""
 TAGS = "tags"
-"""Name under which the origin of an entry's tags is given."""
+"""Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
 """Greatest number of entries that differ between two commits among which a moved entry is sought."""
 
 
 class HistoricCommit(Protocol):
-    """Commit, as a search for origins reads it."""
+    """Commit in the form that a search for origins needs."""
 
     @property
     def tree(self) -> str:
@@ -30,7 +30,7 @@ class HistoricCommit(Protocol):
 
     @property
     def parents(self) -> Sequence[str]:
-        """The digests of the commits that it follows."""
+        """The digests of the commits before this one."""
 
     @property
     def generation(self) -> int:
@@ -70,7 +70,7 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return the entry in a parent of a commit, which may have it under another key; None if it is new."""
+        """Return an entry as a parent of a commit has it, perhaps under another key; None if it is new."""
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
@@ -135,5 +135,5 @@ def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[st
 
 
 def _named(entry: DatasetEntry) -> Mapping[str, Any]:
-    """Return what a commit can change of an entry, by name."""
+    """Return the path, the tags and the parts of an entry by name, which a commit can change."""
     return {**entry.parts, PATH: entry.path, TAGS: entry.tags}

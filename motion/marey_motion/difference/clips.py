@@ -93,7 +93,7 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, among the paired joints, of the joint whose path is that of the body."""
+    """Return the index, among the paired joints, of the first moving joint, whose path counts as that of the body."""
     if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
         return 0
     for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):

@@ -88,8 +88,9 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
 def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
     """Compute the costs of paired frames, by which frames are matched.
 
-    The cost is the mean over all joints of the angle divided by `FAR_DEG`, at most 1, where the position of the root
-    counts as one more joint. A joint that was edited a lot therefore adds no more than its share.
+    Each joint costs min(angle / `FAR_DEG`, 1), and the root costs min(distance / `FAR_M`, 1) in addition. A joint that
+    was edited a lot therefore adds no more than its share. If the mean m of these costs is not 0, the cost of the pair
+    is `UNEQUAL` + (1 - `UNEQUAL`)·m.
 
     Parameters
     ----------

@@ -149,7 +149,7 @@ def compare_mappings(before: SkeletonMapping, after: SkeletonMapping) -> Mapping
 
     Returns
     -------
-    MappingDifference    standard joints with another joint, and joints with other axes
+    MappingDifference    standard joints that are mapped to another joint, and joints with other axes
     """
     standards = dict.fromkeys((*before.joints, *after.joints))
     joints = ((name, before.joints.get(name), after.joints.get(name)) for name in standards)

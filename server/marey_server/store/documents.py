@@ -250,7 +250,7 @@ def _file_bytes(one: PreparedDocument, sizes: Mapping[str, int]) -> int:
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
-    """Store documents with the arrays and files of stored documents, given by digest, but with another body."""
+    """Store copies of documents, given by digest, with other bodies but the same arrays and files."""
     if not variants:
         return
     digests = [digest_of_body(body) for _, body in variants]

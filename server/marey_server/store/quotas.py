@@ -115,7 +115,7 @@ class Held:
 
 
 COUNTED = ("items", "stored_bytes")
-"""Quotas of which the table `holding` has counters."""
+"""Quotas whose counters are in the table `holding`."""
 
 _ADD = Prepared(
     update(holding)

@@ -29,7 +29,7 @@ from marey_server.store.tables import (
 from marey_server.store.transaction import Transaction
 
 DELETED_LOG = b"[This log was deleted because it was old.]\n"
-"""Text of a log that was deleted. Logs that are not longer are kept."""
+"""Text that replaces a deleted log. Logs that are not longer than this text are kept."""
 
 
 @dataclass(frozen=True)

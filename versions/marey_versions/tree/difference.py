@@ -34,7 +34,7 @@ def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, pref
 
 
 def _before_all_with(prefix: str) -> str | None:
-    """Return a text that is less than all texts with the prefix, but greater than most others that are less."""
+    """Return a text shortly before all texts with the prefix, in the order of texts; None for an empty prefix."""
     if not prefix:
         return None
     last = ord(prefix[-1])

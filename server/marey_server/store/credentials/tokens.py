@@ -144,8 +144,8 @@ def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
     Raises `ForbiddenProblem` if it would have a scope that the caller's own token lacks, would allow workers a label
-    that this token does not allow, or would be valid longer than it; `InvalidProblem` for labels without the scope
-    `work`.
+    that the caller's token does not allow, or would be valid longer than the caller's token. Raises `InvalidProblem`
+    for labels without the scope `work`.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -236,7 +236,7 @@ def _in_words(seconds: int) -> str:
 def list_tokens(
     tx: Transaction, wanted: TokenFilter = OWN_TOKENS, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """Return tokens, newest first, without their secrets: by default the caller's, for administrators anybody's.
+    """Return tokens, newest first, without their secrets: by default the caller's; administrators may list anybody's.
 
     Raises `ForbiddenProblem`, or `NotFoundProblem` for a user whom the caller may not see.
     """
@@ -295,7 +295,7 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
 
 
 def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
-    """Return the query for the ids of tokens, and of all that were created with them or replaced by rotations."""
+    """Return the query for the ids of tokens, their predecessors and successors, and the tokens created with these."""
     chain = select(token.c.id, token.c.successor_of).where(which).cte("chain", recursive=True)
     connected = or_(
         token.c.created_by == chain.c.id, token.c.successor_of == chain.c.id, token.c.id == chain.c.successor_of

@@ -36,7 +36,7 @@ PATIENCE_MS = 10
 LONG_PATIENCE_MS = 250
 """Milliseconds to wait for readers if the log is too long: longer than most reads, shorter than a backup."""
 PAUSES = 20
-"""Pause after readers prevented a restart of the log, as a multiple of the time for which they were waited for."""
+"""Pause after readers prevented a restart of the log, as a multiple of the time spent waiting for them."""
 
 
 class WriteAheadLog:

@@ -217,7 +217,7 @@ def _require_checked_out(found: Row[Any], parent: str | None) -> None:
 def _from_folder(
     tx: Transaction, project_row: ProjectRow, found: Row[Any], store: StoredChunks, before: str | None
 ) -> tuple[str, Contents]:
-    """Return the tree of the items in the dataset's folder, and their contents."""
+    """Store the tree of the items in the dataset's folder; return the digest of its root, and the items' contents."""
     state = read_folder(tx, project_row, found)
     if before is None:
         return build(store, sorted(state.entries.items())), state.contents

@@ -162,7 +162,7 @@ def read_origins(tx: Transaction, project: str, name: str, version: str, *, path
 
 @dataclass(frozen=True)
 class _ReadCommit:
-    """Commit of the database, as a search for origins reads it."""
+    """Commit read from the database, in the form that the search for origins needs."""
 
     row: Row[Any]
     parents: Sequence[str]
@@ -228,7 +228,7 @@ class VersionEntries(NamedTuple):
 def entries_of_kind(
     tx: Transaction, project_row: ProjectRow, name: str, version: str, kind: Kind, *, path: str, most: int
 ) -> VersionEntries:
-    """Return the entries of a kind in a version, at a path and below it, by path; at most `most` of them."""
+    """Return at most `most` entries of a kind in a version, at a path and below it, in the order of their paths."""
     row = find_dataset(tx, project_row, name)
     commit = resolve(tx, row.id, version)
     entries = (entry_of(*one) for one in _entries_at(tx, tree_of(tx, row.id, commit), path))

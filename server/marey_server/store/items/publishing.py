@@ -64,7 +64,7 @@ def publish(
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A draft with the bodies of its parts, in the order of its kind's parts, and the drafts that these refer to."""
+    """A draft with the bodies of its parts, in the order that its kind declares, and the drafts to which they refer."""
 
     draft: Draft
     bodies: Mapping[str, Tree]
@@ -232,7 +232,7 @@ class _Publication:
     # -- finding -------------------------------------------------------------------------------------------------------
 
     def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
-        """Return existing items by the names of drafts that add a revision to them or have the same content."""
+        """Return existing items by the names of drafts that add a revision to the item or have its content."""
         if reuse == "new":
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)

@@ -180,7 +180,7 @@ def load_part(
 def cut_part(
     tree: dict[str, Any], frames: slice | None, joints: Sequence[str] | None, *, encoded: bool
 ) -> dict[str, Any]:
-    """Cut a motion, loaded with encoded arrays, to `frames` and `joints`; the arrays of the result are as `encoded`.
+    """Cut a motion, loaded with encoded arrays, to `frames` and `joints`; `encoded` also leaves the result encoded.
 
     `frames` is half-open and clipped to the motion; `joints` are names, in the order of the result. Raises
     `InvalidProblem` if they do not fit the document.

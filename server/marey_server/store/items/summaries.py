@@ -41,7 +41,7 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
 
 
 def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:
-    """Return the summary of a motion, extended by known facts."""
+    """Return the summary of a motion, with the facts in `known` added."""
     frames = motion["poses"]["shape"][0]
     shown = {
         "frames": frames,

@@ -67,7 +67,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return the dependencies of each job, without the job whose result it waits to share."""
+    """Return the dependencies of each job, except a job whose result it shares."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):

@@ -67,7 +67,10 @@ def _ready_for_inputs(tx: Transaction, ids: Sequence[str]) -> Iterable[Row[Any]]
 
 
 def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
-    """Return the job with its inputs pinned; its kind may have changed since the submission."""
+    """Return the job with its inputs pinned.
+
+    Raises `LateInputError` if this version of the server does not accept the kind or the parameters any more.
+    """
     try:
         kind = find_kind(row.kind)
         params = kind.params.model_validate(row.params)

@@ -98,7 +98,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Give jobs their cache keys; a job whose result exists or is being computed waits for it."""
+    """Set the cache keys of jobs, and let those wait whose results exist or are being computed."""
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
     for one in jobs:

@@ -1,10 +1,10 @@
 """Result cache: identical jobs share one computation, finished or still running.
 
-Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. An input counts with its item,
-its name, its path and the content of the documents that the kind reads, because results are named after inputs and
-refer to them. A kind declares further conditions: the place of the results, or the newest revision of an item that the
-parameters name. Jobs whose result depends on data that is read while they run have no cache key. For each job, shared
-results are published again, into the job's own collection. The cache is limited to one project.
+Jobs are identical if kind, version of the kind, parameters, seed and inputs are equal. Inputs are equal if the item,
+its name, its path, and the content of the documents that the kind reads are equal, because results are named after
+inputs and refer to them. A kind can require more to be equal: the collection of the results, or the newest revision of
+an item that the parameters name. Jobs whose result depends on data that is read while they run have no cache key. For
+each job, shared results are published again, into the job's own collection. The cache is limited to one project.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ MOST_PREVIEWED = 10_000
 MOST_SHOWN_CONFLICTS = 100
 
 WAITING_MERGE = ProposalMerge()
-"""Request to merge that is used when a review or a check meets the last requirement of a waiting proposal."""
+"""Request with default options, used to preview a merge, and to merge a waiting proposal."""
 
 
 @dataclass(frozen=True)

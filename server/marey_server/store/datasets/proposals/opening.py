@@ -31,7 +31,9 @@ _AUTHOR, _WAITING, _ENDING = user.alias("author"), user.alias("waiting"), user.a
 
 
 def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
-    """Return the row of a proposal with the names of its users, its `head_now` and its `target_now`."""
+    """Return a proposal's row with the names of its users, and the commits of its source and target as `head_now` and
+    `target_now`.
+    """
     row = tx.execute(_rows(dataset_id).where(proposal.c.number == number)).first()
     if row is None:
         raise NotFoundProblem(f"The dataset has no proposal {number}.", code="no-proposal")
