@@ -74,12 +74,15 @@ def _soak_only(item: pytest.Item) -> bool:
     return item.get_closest_marker("soak") is not None
 
 
-def _fault_on_other_database(item: pytest.Item) -> bool:
-    """Return whether a fault case runs on the other database; its name decides, so that each gets about half."""
+def _on_other_database(item: pytest.Item) -> bool:
+    """Return whether a fault case or a whole way runs on the other database.
+
+    The name of the fault case, or of the module of the way, decides; so each database gets about half of them.
+    """
     backend = backend_of(item)
-    if not _fault(item) or backend is None or item.get_closest_marker("every_database"):
+    if backend is None or item.get_closest_marker("every_database") or not (_fault(item) or _whole_way(item)):
         return False
-    name = item.nodeid.replace(backend, "")
+    name = item.nodeid.replace(backend, "") if _fault(item) else _folder(item)
     return BACKENDS[zlib.crc32(name.encode()) % len(BACKENDS)] != backend
 
 
@@ -93,7 +96,13 @@ TIERS = {
             "slow": _slow,
         },
     ),
-    "test": Tier(1, {"for the tier soak": _soak_only, "fault cases on the other database": _fault_on_other_database}),
+    "test": Tier(
+        1,
+        {
+            "for the tier soak": _soak_only,
+            "fault cases and whole ways on the other database": _on_other_database,
+        },
+    ),
     "soak": Tier(SOAK_EFFORT, {}),
 }
 
