@@ -59,7 +59,7 @@ def key_of(path: str, kind: str) -> str:
 
 
 def entry_of(key: str, value: Value) -> DatasetEntry:
-    """Return the entry with a key and a value of the tree."""
+    """Return the entry that a key and its value in the tree describe."""
     return DatasetEntry(*path_and_kind(key), value["parts"], tuple(value["tags"]))
 
 

@@ -232,7 +232,7 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def share_with_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> bool:
-    """Protect the blobs of a result that a job shares with an identical job; return whether all are still stored."""
+    """Protect the blobs of the result that a job gets from an identical job; return whether all are still stored."""
     wanted = set(digests)
     if wanted - _renew(tx, blob, wanted):
         return False

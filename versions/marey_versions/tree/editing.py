@@ -106,7 +106,7 @@ class _ChunksOfLevel:
             (chunk,) = self._reader.below([chunk.children[place]], chunk.level - 1)
 
     def advance(self) -> None:
-        """Go to the next chunk; the present one is not the last."""
+        """Go to the next chunk. The present chunk must not be the last."""
         while self._path[-1][1] == len(self._path[-1][0].children) - 1:
             self._path.pop()
         branch, place = self._path.pop()

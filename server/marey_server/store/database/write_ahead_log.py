@@ -125,7 +125,7 @@ class WriteAheadLog:
             self._copied_bytes = 0
 
     def _note_failure(self, error: sqlite3.Error) -> None:
-        """Log an error once; the next commit tries again."""
+        """Log an error, but not its repetitions; the next commit tries again."""
         if not self._failing:
             log.warning("the log of the database %s cannot be copied, and grows: %s", self._file, error)
         self._failing = True

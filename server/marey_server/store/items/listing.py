@@ -71,7 +71,7 @@ def list_items(
 ) -> Page:
     """Return one page of a project's items of a kind; with `fields`, only these members of each item.
 
-    Attempts of jobs may only look up names. Raises `ForbiddenProblem`.
+    Raises `ForbiddenProblem` if an attempt of a job lists items without looking up a name.
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
         raise ForbiddenProblem(

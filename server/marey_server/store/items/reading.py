@@ -22,7 +22,7 @@ from marey_server.store.transaction import Transaction
 
 
 def find_contents(tx: Transaction, project: str, kind: Kind, part: str, digests: Collection[str]) -> set[str]:
-    """Return those of the digests that are the current content of a part in any item of the project."""
+    """Return those of `digests` that are the current content of the part `part` in any item of the kind."""
     row = projects.require(tx, project)
     statement = (
         select(revision_part.c.document_digest)

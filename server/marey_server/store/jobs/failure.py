@@ -1,4 +1,4 @@
-"""Decision whether a job is retried, fails or is cancelled after an unsuccessful attempt, and its application."""
+"""Decides whether a job is retried, fails or is cancelled after an unsuccessful attempt, and applies the decision."""
 
 from __future__ import annotations
 

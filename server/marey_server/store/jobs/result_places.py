@@ -1,6 +1,7 @@
 """Checks, before a job is queued, whether its results could be stored; the results are not known at that time.
 
-The worker checks again for each clip, but each task of a job knows only its own share of the inputs.
+The worker checks again for each clip. But it cannot compare all inputs, because each task of a job knows only its own
+share of them.
 """
 
 from __future__ import annotations
