@@ -14,9 +14,11 @@ from marey_client.cli.invocation import AsJson, JobId, ProjectName, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.schema_options import Chosen, add_command
 from marey_client.cli.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
+    from marey_client.reruns import ComparedOutput
     from marey_schemas.jobs import InputSpec, Job, JobInput, JobKind
 
 job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
@@ -210,6 +212,64 @@ def retry_job(
         ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)
     if ended is not None:
         print_ended(ended, as_json)
+
+
+@job.command("rerun")
+def rerun_job(
+    context: typer.Context,
+    job_id: JobId,
+    into: Annotated[
+        str | None, typer.Option(help="Folder that receives the repeated results; default: reruns/ and the job's id.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat a job from its record, and compare the results.
+
+    The repetition reads the same revisions, with the same parameters and seed, and uses no cached result. The exit
+    status is 1 if a result differs.
+    """
+    from marey_client.reruns import CannotRerun, compare_outputs, rerun_request
+
+    with connect(context) as marey:
+        first = marey.jobs.get(job_id)
+        try:
+            request = rerun_request(first, _kind_of_job(marey, first.kind), into=into and into.strip("/"))
+        except CannotRerun as error:
+            raise WrongUsage(str(error)) from None
+        project = marey.project(first.project)
+        again = follow(marey, project.submit(request))
+        assert again is not None
+        outputs = (list(marey.jobs.outputs(one.id)) for one in (first, again))
+        compared = list(compare_outputs(project, *outputs))
+    described = [(one, _difference_of(one)) for one in compared]
+    differing = [(one.name, lines) for one, lines in described if lines]
+    if not compared and first.result != again.result:
+        differing.append(("result", [f"{json.dumps(first.result)} before, {json.dumps(again.result)} now"]))
+    if as_json:
+        found = [{"name": one.name, "comparison": one.agreement, "lines": lines} for one, lines in described]
+        print_json({"job": again.id, "outputs": found})
+    else:
+        for name, lines in differing:
+            typer.echo("\n".join((f"{name}:", *(f"  {line}" for line in lines))))
+        identical = sum(one.agreement == "identical" for one in compared)
+        print_message(
+            f"{again.id} repeats {first.id} in {request.into}: {counted(len(compared), 'output')}, {identical} "
+            f"identical, {len(compared) - identical - len(differing)} with equal content, {len(differing)} different"
+        )
+    if differing:
+        raise Refused
+
+
+def _difference_of(one: ComparedOutput) -> list[str]:
+    """Return lines that say how an output differs from its repetition; none if it has the same content."""
+    from marey_client.cli.difference.words import NO_DIFFERENCE, changes_in_words
+
+    if one.difference is not None:
+        lines = list(changes_in_words(one.difference))
+        return [] if lines == [NO_DIFFERENCE] else lines
+    only = "the first job" if one.second is None else "the repetition"
+    texts = {"missing": f"only {only} has this output", "deleted": "cannot be compared, because its item was deleted"}
+    return [texts[one.agreement]] if one.agreement in texts else []
 
 
 def why(

@@ -16,6 +16,7 @@ from marey_client import Marey
 from marey_client.errors import Invalid, RequestFailed
 from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
+from marey_client.reruns import compare_outputs
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_from_document, skeleton_from_document
 from marey_motion.editing.registry import edit_clip
@@ -80,6 +81,28 @@ def test_an_edit_is_saved_applied_to_a_folder_and_replayed_exactly(marey: Marey,
     assert again.result is not None
     for name, clip in clips_of(lab, "again/walks").items():
         assert np.array_equal(clip.motion().poses, made[name].motion().poses)
+
+
+def test_a_job_is_repeated_from_its_record_and_its_results_are_compared(
+    marey: Marey, lab: ProjectHandle, run: CommandLine
+) -> None:
+    job = ended(marey, lab.edit("walks", [{"command": "trim", "start": 30}], into="once"))
+    straight = clips_of(lab, "walks")["walk 0"]
+    ended(marey, lab.edit(straight, [{"command": "trim", "stop": 60}], in_place=True))  # a newer revision is not read
+    done = run("job", "rerun", job.id)
+    assert f"in reruns/{job.id}: 3 outputs, 3 identical, 0 with equal content, 0 different" in done.stderr
+    found = json.loads(run("job", "rerun", job.id, "--into", "again", "--json").stdout)
+    assert [one["comparison"] for one in found["outputs"]] == ["identical"] * 3
+
+    other = ended(marey, lab.edit(straight, [{"command": "trim", "start": 10}], into="other"))
+    outputs = [list(marey.jobs.outputs(one.id)) for one in (job, other)]
+    compared = {one.name: one for one in compare_outputs(lab, *outputs)}
+    assert sorted(one.agreement for one in compared.values()) == ["missing", "missing", "other bytes"]
+    (differing,) = (one.difference for one in compared.values() if one.difference is not None)
+    assert differing.motion is not None
+
+    in_place = next(one for one in lab.jobs() if one.params.get("in_place"))
+    assert "has replaced its sources" in run("job", "rerun", in_place.id, status=2).stderr
 
 
 def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: ProjectHandle) -> None:

@@ -21,6 +21,7 @@ from marey_schemas.documents.differences import (
 )
 from marey_schemas.wording import counted
 
+NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
 """Most joints, segments or fields that are listed; the others are counted."""
 MOST_SPANS = 3
@@ -44,7 +45,7 @@ def described(difference: Difference) -> Iterator[str]:
 def changes_in_words(difference: Difference) -> Iterator[str]:
     """Yield a line for each change."""
     lines = list(_changes(difference))
-    yield from lines or ["no difference"]
+    yield from lines or [NO_DIFFERENCE]
 
 
 def _changes(difference: Difference) -> Iterator[str]:

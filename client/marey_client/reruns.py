@@ -1,0 +1,98 @@
+"""Repetition of jobs from their records, and comparison of the results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from marey_client.errors import NotFound
+from marey_client.project import ProjectHandle
+from marey_schemas.documents.differences import Difference
+from marey_schemas.job_kinds import job_kinds
+from marey_schemas.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
+from marey_schemas.kinds import Kind
+
+RERUNS = "reruns"
+"""Folder that receives repeated results, in a folder with the id of the job."""
+
+Agreement = Literal["identical", "other bytes", "missing", "deleted"]
+"""Comparison of an output with its repetition.
+
+`missing`: only one of the jobs has this output; `deleted`: one of the two items was deleted, so that they cannot be
+compared. Outputs of the same job that refer to each other have other bytes, because their ids differ.
+"""
+
+
+class CannotRerun(ValueError):
+    """The job cannot be repeated."""
+
+
+@dataclass(frozen=True)
+class ComparedOutput:
+    """Output of a job and that of its repetition; one of them is None if it is missing."""
+
+    name: str
+    agreement: Agreement
+    first: JobOutput | None
+    second: JobOutput | None
+    difference: Difference | None = None
+    """Difference of the content if the bytes differ; it is empty if only references to other outputs differ."""
+
+
+def rerun_request(job: Job, kind: JobKind, *, into: str | None = None) -> JobCreate:
+    """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
+
+    The results go to the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for jobs that
+    have not succeeded, tasks of other jobs, and jobs that replace their sources.
+    """
+    if job.state is not JobState.SUCCEEDED:
+        raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")
+    if job.parent is not None:
+        raise CannotRerun(f"{job.id} is a task of {job.parent}; repeat that job")
+    declared = job_kinds().get(job.kind)
+    if declared is not None and declared.in_place and job.params.get(declared.in_place):
+        raise CannotRerun(f"the job {job.id} has replaced its sources; its repetition would change them again")
+    return JobCreate(
+        kind=job.kind,
+        inputs={name: _inputs(pins, many=kind.inputs[name].many) for name, pins in job.inputs.items()},
+        params=job.params,
+        seed=job.seed,
+        into=f"{RERUNS}/{job.id}" if into is None else into,
+        cache="off",
+        message=f"Repeats the job {job.id}",
+    )
+
+
+def _inputs(pins: Sequence[Mapping[str, Any]], *, many: bool) -> Any:
+    found = tuple(ItemInput(item=pin["item"], revision=pin["revision"]) for pin in pins)
+    return found if many else found[0]
+
+
+def compare_outputs(
+    project: ProjectHandle, first: Sequence[JobOutput], second: Sequence[JobOutput]
+) -> Iterator[ComparedOutput]:
+    """Yield the comparison of each output of a job with the output of the same kind and name of its repetition."""
+    left: dict[tuple[Kind, str], list[JobOutput]] = {}
+    for one in second:
+        left.setdefault((one.kind, one.name), []).append(one)
+    for one in first:
+        others = left.get((one.kind, one.name))
+        yield _compared(project, one, others.pop(0)) if others else ComparedOutput(one.name, "missing", one, None)
+    yield from (ComparedOutput(one.name, "missing", None, one) for others in left.values() for one in others)
+
+
+def _compared(project: ProjectHandle, first: JobOutput, second: JobOutput) -> ComparedOutput:
+    items = project.items(first.kind)
+    try:
+        before, after = items.get(first.item), items.get(second.item)
+    except NotFound:
+        return ComparedOutput(first.name, "deleted", first, second)
+    parts = [
+        {name: part.document for name, part in item.revision(output.revision).parts.items()}
+        for item, output in ((before, first), (after, second))
+    ]
+    if parts[0] == parts[1]:
+        return ComparedOutput(first.name, "identical", first, second)
+    difference = before.difference(first.revision, second.revision, other=after)
+    return ComparedOutput(first.name, "other bytes", first, second, difference)
