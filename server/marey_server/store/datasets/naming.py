@@ -267,7 +267,8 @@ def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
     chain = first_parents(dataset_id, digest, back)
     found = tx.execute(select(chain.c.digest).where(chain.c.place == back)).scalar()
     if found is None:
-        raise NotFoundProblem(f"There are fewer than {back} commits before {name!r}.", code="no-version")
+        few = "There is no commit" if back == 1 else f"There are fewer than {back} commits"
+        raise NotFoundProblem(f"{few} before {name!r}.", code="no-version")
     return str(found)
 
 
