@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import islice
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
+from marey_versions.ancestry import HistoricCommit
 from marey_versions.compared import compare_entries
 from marey_versions.records import DatasetEntry, entry_of
 from marey_versions.tree.difference import difference
@@ -19,22 +20,6 @@ TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
 """Greatest number of entries that differ between two commits among which a moved entry is sought."""
-
-
-class HistoricCommit(Protocol):
-    """Commit in the form that a search for origins needs."""
-
-    @property
-    def tree(self) -> str:
-        """The digest of the root of the tree of entries."""
-
-    @property
-    def parents(self) -> Sequence[str]:
-        """The digests of the commits before this one."""
-
-    @property
-    def generation(self) -> int:
-        """A number that is greater than those of all parents."""
 
 
 class FoundOrigin(NamedTuple):

@@ -142,20 +142,14 @@ def read_origins(tx: Transaction, project: str, name: str, version: str, *, path
     reader = ChunkReader(StoredChunks(tx))
     if Tree(reader, tree_of(tx, row.id, start)).get(key) is None:
         raise NotFoundProblem(f"The version has no {kind.value} at {path!r}.", code="no-entry")
-    known: dict[str, _ReadCommit] = {}
-
-    def commit_of(digest: str) -> _ReadCommit:
-        if digest not in known:
-            known[digest] = _read(tx, row.id, digest)
-        return known[digest]
-
+    commits = CommitReader(tx, row.id)
     found = {
         part: Origin(
-            commit=_shown(known[one.commit].row, known[one.commit].parents),
+            commit=_shown(commits.read(one.commit).row, commits.read(one.commit).parents),
             path=path_and_kind(one.key)[0],
             certain=one.certain,
         )
-        for part, one in find_origins(reader, commit_of, start, key, most=MOST_EXAMINED).items()
+        for part, one in find_origins(reader, commits.read, start, key, most=MOST_EXAMINED).items()
     }
     return EntryOrigins(path=path, kind=kind, place=found.pop(PATH), tags=found.pop(TAGS), parts=found)
 
@@ -176,10 +170,22 @@ class _ReadCommit:
         return int(self.row.generation)
 
 
-def _read(tx: Transaction, dataset_id: str, digest: str) -> _ReadCommit:
-    of_dataset = (dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest == digest)
-    row = tx.execute(select(dataset_commit).where(*of_dataset)).one()
-    return _ReadCommit(row, _parents(tx, dataset_id, [digest]).get(digest, ()))
+class CommitReader:
+    """Reads commits of a dataset, and remembers those that were read."""
+
+    def __init__(self, tx: Transaction, dataset_id: str) -> None:
+        self._tx = tx
+        self._dataset_id = dataset_id
+        self._known: dict[str, _ReadCommit] = {}
+
+    def read(self, digest: str) -> _ReadCommit:
+        """Return a commit that exists."""
+        if digest not in self._known:
+            of_dataset = (dataset_commit.c.dataset_id == self._dataset_id, dataset_commit.c.digest == digest)
+            row = self._tx.execute(select(dataset_commit).where(*of_dataset)).one()
+            parents = _parents(self._tx, self._dataset_id, [digest]).get(digest, ())
+            self._known[digest] = _ReadCommit(row, parents)
+        return self._known[digest]
 
 
 # -- entries ----------------------------------------------------------------------------------------------------------

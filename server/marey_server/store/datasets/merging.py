@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import Row, select
+from sqlalchemy import Row
 
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.merges import (
@@ -24,11 +24,11 @@ from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import projects
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.committing import PreparedCommit, head_of, record_commit, recorded_as
-from marey_server.store.datasets.history import read_commit, revisions_with, shown_entry, tree_of
+from marey_server.store.datasets.history import CommitReader, read_commit, revisions_with, shown_entry, tree_of
 from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.datasets.protection import Mover
-from marey_server.store.tables import commit_parent
 from marey_server.store.transaction import Transaction
+from marey_versions.ancestry import nearest_common
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import MergeConflict, merge_entries
 from marey_versions.records import key_of, path_and_kind
@@ -210,15 +210,7 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
 
     Raises `ConflictProblem` if there are several, none of which precedes another.
     """
-    rows = tx.execute(
-        select(commit_parent.c.digest, commit_parent.c.parent).where(commit_parent.c.dataset_id == dataset_id)
-    )
-    parents: dict[str, list[str]] = {}
-    for row in rows:
-        parents.setdefault(row.digest, []).append(row.parent)
-    shared = _with_ancestors(parents, [ours]) & _with_ancestors(parents, [theirs])
-    earlier = _with_ancestors(parents, [parent for one in shared for parent in parents.get(one, ())])
-    nearest = sorted(shared - earlier)
+    nearest = nearest_common(CommitReader(tx, dataset_id).read, ours, theirs)
     if len(nearest) > 1:
         raise ConflictProblem(
             "The two versions have several nearest common commits, because earlier merges crossed. Merge one side into "
@@ -227,14 +219,3 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
             context={"commits": nearest},
         )
     return nearest[0] if nearest else None
-
-
-def _with_ancestors(parents: Mapping[str, list[str]], commits: Iterable[str]) -> set[str]:
-    found: set[str] = set()
-    waiting = list(commits)
-    while waiting:
-        one = waiting.pop()
-        if one not in found:
-            found.add(one)
-            waiting += parents.get(one, ())
-    return found
