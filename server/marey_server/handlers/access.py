@@ -164,7 +164,7 @@ class TokenQuery(PageQuery):
 
 
 class RevokeQuery(Request):
-    """Query of the end of a token."""
+    """Query of the revocation of a token."""
 
     with_created: bool = Field(False, description="Also revoke the tokens that were created with it.")
 

@@ -26,16 +26,16 @@ RESERVED_DESCRIPTORS = 256
 """File descriptors that are kept for the database, files and child processes."""
 MOST_CONNECTIONS = 10_000
 ADDRESS_SHARE = 0.75
-"""Largest part of all connections that one address may have; a proxy that is trusted is no such address."""
+"""Largest share of all connections that one address may have; trusted proxies may have more."""
 EVICTED_SHARE = 1 / 16
-"""Part of all connections that is closed at once, if so many are idle, when the last place is taken."""
+"""Share of all connections that is closed at once when the limit is reached, if so many are idle."""
 ACCEPTED_AT_ONCE = 128
 PAUSE_S = 0.5
 """Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""
 LOG_EVERY_S = 60.0
 CHECKS_PER_TIMEOUT = 4
 LEAST_TAKEN_BYTES = 64 * KIB
-"""Least number of bytes that a client must take in each write timeout while more are waiting for it."""
+"""Least number of bytes that a client must receive within each write timeout while more wait to be sent."""
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
@@ -227,7 +227,7 @@ class Connections:
         self.close_slow(time.monotonic())
 
     def close_slow(self, now_s: float) -> None:
-        """Close connections whose clients have not received enough of the waiting bytes until `now_s`."""
+        """Close connections whose clients have not received enough of the waiting bytes by `now_s`."""
         for one in [one for one in self._open if one.writing() and now_s - one.since_s >= self._write_timeout_s]:
             if one.taken_bytes < LEAST_TAKEN_BYTES:
                 self._log("slow", "closed a connection of %s, whose client read only %d bytes in %.0f s",

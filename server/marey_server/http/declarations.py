@@ -67,8 +67,8 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
-    `streamed` bodies are passed to the resource piece by piece while they are received. `results` of a job may contain
-    arrays of up to `max_bytes` when decoded; they are stored in the encoding in which they arrive.
+    `streamed` bodies are passed to the resource piece by piece while they are received. `results`: the body contains
+    results of a job, whose arrays may have up to `max_bytes` when decoded; they are stored as they arrive.
     """
 
     content: Content | type[Files]

@@ -25,7 +25,7 @@ from marey_server.process.services import Services
 LINGER_BYTES = 64 * 2**20
 """Number of bytes of a refused body that are read and discarded, so that its sender receives the answer."""
 JOINED_BYTES = 64 * KIB
-"""Size of a body above which it is sent in pieces, each after the client took the one before."""
+"""Size of a body above which it is sent in pieces, each after the client has received the one before."""
 PIECE_BYTES = MIB
 """Size of a piece of a body: the most that waits in a connection for its client."""
 _LENGTH = re.compile("[0-9]{1,4300}")

@@ -11,7 +11,7 @@ from marey_server.store.blobs import Spool
 
 BATCH_BYTES = MIB
 WRITTEN_AT_ONCE_BYTES = 64 * KIB
-"""Greatest end of a body that is written on the event loop; more is written in a thread."""
+"""Greatest number of last bytes of a body that are written on the event loop; more are written in a thread."""
 
 
 class Receiver:

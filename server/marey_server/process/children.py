@@ -127,7 +127,7 @@ class Children:
         self._running: list[ChildTask[Any]] = []
         self._requests: Counter[str] = Counter()
         self._turns: dict[str, int] = {}
-        """Number of the last turn of each caller, of whom no one has two before another has one."""
+        """Number of the last turn of each caller; a caller gets a second turn only after all others had one."""
         self._turn = 0
         self._threads: list[threading.Thread] = []
         self._idle: set[int] = set()

@@ -25,7 +25,7 @@ from marey_server.store.wakeups import COMMITTED_EVENTS, wakeups, work_topic
 T = TypeVar("T")
 
 LOOK_EVERY_S = 2.0
-"""Interval in seconds at which the feed is read without a reason: retries become due, and wake-ups may be lost."""
+"""Interval in seconds at which the feed is read even without a notification, because one may be lost."""
 
 PAUSE_S = 0.05
 """Least time in seconds between two reads of the feed; under load, one read serves many commits."""

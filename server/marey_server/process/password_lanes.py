@@ -25,9 +25,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 PLACES = 16
-"""Greatest number of requests in a lane, the one whose password is being hashed included."""
+"""Greatest number of requests in a lane, including the one whose password is being hashed."""
 PLACES_PER_ADDRESS = 4
-"""Greatest number of requests from one address among them."""
+"""Greatest number of requests in a lane from one address."""
 IPV6_NETWORK_BITS = 64
 """Length of the prefix of an IPv6 address that a provider assigns to one customer, who uses all addresses below it."""
 REFUSALS_REMEMBERED = 10_000

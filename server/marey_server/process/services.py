@@ -80,9 +80,9 @@ class Services:
         self.draining = asyncio.Event()
         self.in_flight: set[Any] = set()
         self.password_lane = PasswordLane("known")
-        """For signed-in users, and sign-ins from addresses that the user has signed in from before."""
+        """Lane for signed-in users, and for sign-ins from addresses from which the user has signed in before."""
         self.stranger_lane = PasswordLane("stranger")
-        """For all other sign-ins."""
+        """Lane for all other sign-ins."""
         self.refused_tries = RefusedTries()
         self.compute_threads = ComputeThreads()
         self.children = children or Children(settings.child_limits)
