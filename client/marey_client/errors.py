@@ -98,8 +98,8 @@ class RequestFailed(MareyError):
         self.anonymous = anonymous
 
     def __str__(self) -> str:
-        told = (f"{field.pointer}: {field.detail}" for field in self.errors)
-        return "; ".join([self.detail, *(one for one in told if one not in self.detail)])
+        texts = (f"{field.pointer}: {field.detail}" for field in self.errors)
+        return "; ".join([self.detail, *(one for one in texts if one not in self.detail)])
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The other members come back as the instance's dictionary; so do notes.

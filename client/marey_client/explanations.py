@@ -22,8 +22,8 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
     """Explain a job, given its attempts and the project's running jobs."""
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
-        told = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
-        return [f"{job.state}: it gathers {job.size} tasks, of which {told or 'none has begun'}."]
+        counts = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
+        return [f"{job.state}: it gathers {job.size} tasks, of which {counts or 'none has begun'}."]
     reasons = {
         JobState.WAITING: [_why_waiting(job)],
         JobState.QUEUED: _why_queued(job, running, now),
@@ -32,15 +32,15 @@ def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime
         JobState.FAILED: [_why_failed(job)],
         JobState.CANCELLED: ["cancelled."],
     }[job.state]
-    return reasons + [_told(attempt) for attempt in attempts if attempt.outcome not in (None, "succeeded")]
+    return reasons + [_outcome_text(attempt) for attempt in attempts if attempt.outcome not in (None, "succeeded")]
 
 
 def _why_waiting(job: Job) -> str:
     if job.cached_from:
         return f"waiting: {job.cached_from} computes the same result, which this job will reuse."
     makers = {entry["job"] for entries in job.inputs.values() for entry in entries if "job" in entry}
-    told = [f"{one}, which makes its inputs" if one in makers else one for one in job.after]
-    return f"waiting: it depends on {' and '.join(told) or 'other jobs'}; not all of these have succeeded."
+    waited_for = [f"{one}, which makes its inputs" if one in makers else one for one in job.after]
+    return f"waiting: it depends on {' and '.join(waited_for) or 'other jobs'}; not all of these have succeeded."
 
 
 def _why_queued(job: Job, running: list[Job], now: datetime) -> list[str]:
@@ -71,6 +71,6 @@ def _why_failed(job: Job) -> str:
     return f"failed ({job.failure.reason}, {job.failure.code}): {job.failure.detail}"
 
 
-def _told(attempt: Attempt) -> str:
+def _outcome_text(attempt: Attempt) -> str:
     detail = f": {attempt.detail.strip().splitlines()[-1]}" if attempt.detail else ""
     return f"attempt {attempt.fence} on {attempt.worker} was {attempt.outcome}{detail}"

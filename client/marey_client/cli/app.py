@@ -39,7 +39,7 @@ app = typer.Typer(
 )
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
@@ -59,7 +59,7 @@ def marey(
         bool, typer.Option("--verbose", "-v", help="Show details, including tracebacks of errors.")
     ] = False,
     version: Annotated[  # noqa: ARG001 - its callback does it
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
     """Store, check, retarget, edit and evaluate motion data on a Marey server."""

@@ -102,8 +102,8 @@ def save_edit(
         held = edits.save(place.name, commands, title=title, collection=folder, message=message)
     if as_json:
         return print_json(held.item)
-    told = counted(len(commands.commands), "command")
-    return typer.echo(f"{held.id} {held.path} revision {held.item.revision}: {told}")
+    count = counted(len(commands.commands), "command")
+    return typer.echo(f"{held.id} {held.path} revision {held.item.revision}: {count}")
 
 
 @edit.command("show")
@@ -121,8 +121,8 @@ def show_edit(
         typer.echo(document.title)
     for number, command in enumerate(document.commands):
         given = command.model_dump(mode="json", exclude_defaults=True)
-        told = " ".join(f"{name}={json.dumps(value)}" for name, value in given.items() if name != "command")
-        typer.echo(f"{number:3}  {command.command} {told}".rstrip())
+        values = " ".join(f"{name}={json.dumps(value)}" for name, value in given.items() if name != "command")
+        typer.echo(f"{number:3}  {command.command} {values}".rstrip())
     return None
 
 
@@ -299,11 +299,11 @@ def _print_preview(shown: EditPreview, piece: int) -> None:
 
 def _finding(finding: dict[str, Any]) -> str:
     """Return the finding of a command as one line, with segments as ranges of frames."""
-    told = []
+    figures = []
     for name, value in finding.items():
         if name == "segments":
-            told += [f"{one['label']} {one['start']}:{one['end']}" for one in value]
+            figures += [f"{one['label']} {one['start']}:{one['end']}" for one in value]
         elif name not in ("name", "item", "command", "frame_count", "frame_rate_hz"):
-            told.append(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
+            figures.append(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
     place = f"{finding['name']}: " if "name" in finding else ""
-    return f"{place}{finding['command']}: {', '.join(told) or 'nothing'}"
+    return f"{place}{finding['command']}: {', '.join(figures) or 'nothing'}"

@@ -62,7 +62,7 @@ def sentence(error: BaseException) -> str:
     """Return an error in one line, with its code, request id and notes if it has them."""
     from marey_client.errors import NotFound, RequestFailed
 
-    text = " ".join(_told(error).split()) or type(error).__name__
+    text = " ".join(_text_of(error).split()) or type(error).__name__
     if not isinstance(error, RequestFailed):
         return text
     whole = f"{text} ({error.code}, request {error.request_id})"
@@ -71,7 +71,7 @@ def sentence(error: BaseException) -> str:
     return "; ".join([whole, *getattr(error, "__notes__", ())])
 
 
-def _told(error: BaseException) -> str:
+def _text_of(error: BaseException) -> str:
     """Return the text of an error; for errors about files, the name of the file and the reason."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
         return f"{os.fsdecode(error.filename)}: {error.strerror}"

@@ -31,7 +31,7 @@ OPTIMISE = OptionsOf("marey_schemas.job_params:OptimiseParams", short=WEIGHT)
 SWEEP = OptionsOf("marey_schemas.job_params:SweepParams", short=WEIGHT)
 
 SHOWN = 10
-TOLD_FIRST = (
+PRINTED_METRICS = (
     ("offset_mean", "offset m"),
     ("abs_se_v", "speed error m/s"),
     ("abs_se_omega_deg", "turn error degrees/s"),
@@ -209,7 +209,7 @@ def _print_comparison(document: Mapping[str, Any]) -> None:
     rows = [
         (label, f"{one['before']:.4f}", f"{one['after']:.4f}", f"{one['change']:+.4f}",
          f"{one['low']:+.4f} to {one['high']:+.4f}", one["verdict"])
-        for name, label in TOLD_FIRST if (one := metrics.get(name)) is not None
+        for name, label in PRINTED_METRICS if (one := metrics.get(name)) is not None
     ]  # fmt: skip
     columns = ("metric", "before", "after", "change", "95 % interval", "verdict")
     print_table(columns, rows, right=columns[1:5])

@@ -137,13 +137,13 @@ def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
     return chosen
 
 
-def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, told: str) -> None:
+def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, option: str) -> None:
     """Set a value in nested objects. Raises `WrongUsage` if its path conflicts with an earlier one."""
     place: Any = chosen
     for depth, name in enumerate(path[:-1], start=1):
         place = place.setdefault(name, {})
         if not isinstance(place, dict):
-            raise WrongUsage(f"{told} conflicts with --set {'.'.join(path[:depth])}={place}; give only one of them")
+            raise WrongUsage(f"{option} conflicts with --set {'.'.join(path[:depth])}={place}; give only one of them")
     place[path[-1]] = value
 
 
@@ -197,7 +197,7 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
     finally:
         print_steps(run, as_json)
         if not as_json:
-            _tell_shortfalls(run)
+            _print_shortfalls(run)
     if any(map(_refused, run.steps.values())):
         raise Refused
     return None
@@ -210,7 +210,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
     return [*result.get("refused", ()), *({"name": entry["name"], **entry["error"]} for entry in failed)]
 
 
-def _tell_shortfalls(run: PipelineRun) -> None:
+def _print_shortfalls(run: PipelineRun) -> None:
     """Print refused and empty inputs of the steps, and the notes of their jobs."""
     for step, job in run.steps.items():
         if refused := _refused(job):

@@ -161,10 +161,10 @@ class _Option:
             *(["may be repeated"] if self._form in ("texts", "assignments") else []),
             *(["a,b,c or first:last:step"] if self._form == "numbers" else []),
             *([f"{NONE}{f' or {self.null}' if self.null else ''}: no limit"] if self._form == "number or none" else []),
-            f"default {told}" if (told := default_text(self.schema)) else "",
+            f"default {default}" if (default := default_text(self.schema)) else "",
         ]
-        told = "; ".join(filter(None, notes))
-        return f"{meaning} {told[:1].upper()}{told[1:]}.".strip() if told else meaning
+        note = "; ".join(filter(None, notes))
+        return f"{meaning} {note[:1].upper()}{note[1:]}.".strip() if note else meaning
 
     @cached_property
     def _schema(self) -> Schema:

@@ -212,8 +212,8 @@ def _print(answer: SearchAnswer) -> None:
     print_table(columns, rows, right=columns[2:4])
     for number, step in enumerate(answer.steps):
         likely = step.likelihood_percentile
-        told = "" if likely is None else f", likelier than {likely:.0f} % of the examples"
-        typer.echo(f"step {number}: {step.duration_s:.2f} s{told}")
+        likelihood = "" if likely is None else f", likelier than {likely:.0f} % of the examples"
+        typer.echo(f"step {number}: {step.duration_s:.2f} s{likelihood}")
         if step.tree == "drawn":
             print_message("The model has no tree of its own; samples were drawn for this search. marey tree makes one.")
     for place in answer.out_of_reach:

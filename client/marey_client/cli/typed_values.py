@@ -23,7 +23,7 @@ MOST_DIGITS = 18
 MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
-MOST_TOLD = 1e15
+GREATEST_SHOWN_BOUND = 1e15
 """Bounds above this are those of machine integers, and are not shown."""
 
 
@@ -89,7 +89,7 @@ def range_text(schema: Schema) -> str:
     if "minimum" in of and "maximum" in of:
         return f"{_number_text(of['minimum'])} to {_number_text(of['maximum'])}"
     words = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
-    bounds = {word: of[name] for name, word in words.items() if abs(of.get(name, inf)) < MOST_TOLD}
+    bounds = {word: of[name] for name, word in words.items() if abs(of.get(name, inf)) < GREATEST_SHOWN_BOUND}
     return ", ".join(f"{word} {_number_text(bound)}" for word, bound in bounds.items())
 
 

@@ -71,12 +71,12 @@ class ClipHandle(ItemHandle):
         found = Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle)
         return found.list(sort="created_at", filters={"clip": self.id})
 
-    def annotate(self, layer: str, *, name: str | None = None, **said: Any) -> AnnotationHandle:
+    def annotate(self, layer: str, *, name: str | None = None, **content: Any) -> AnnotationHandle:
         """Create an annotation of this revision of the clip, in the clip's folder.
 
-        `said` contains the fields `segments` and `keyframes` of `Annotation`; without these, the annotation is empty.
+        `content` has the fields `segments` and `keyframes` of `Annotation`; without these, the annotation is empty.
         """
-        document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **said})
+        document = Annotation.model_validate({"clip": self.as_input().model_dump(), "layer": layer, **content})
         return Items(self.transport, self.project, Kind.ANNOTATION, AnnotationHandle).create(
             name or f"{self.name} {layer}",
             {"annotation": document.model_dump(mode="json", by_alias=True)},

@@ -89,10 +89,10 @@ class CoverageStreamHandle:
         At most 4096 frames at a time; 0.1 s to 1 s is usual. If an answer is lost, the frames are sent again, but
         counted only once. Raises `Conflict` if another program sends to the same stream.
         """
-        said: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
+        body: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:
-            said |= {"translations": translations, "translated_joints": list(several(translated_joints))}
-        return self._send({"offset": self.offset, "ends_take": ends_take, **said})
+            body |= {"translations": translations, "translated_joints": list(several(translated_joints))}
+        return self._send({"offset": self.offset, "ends_take": ends_take, **body})
 
     def end_take(self) -> CoverageProgress:
         """End the take, after a pause or lost frames; the next frames are measured as a new take."""
@@ -106,9 +106,9 @@ class CoverageStreamHandle:
         """Delete the stream at once; otherwise, the server deletes it a day after its last frame."""
         self.transport.send("DELETE", self.url)
 
-    def _send(self, said: dict[str, Any]) -> CoverageProgress:
+    def _send(self, body: dict[str, Any]) -> CoverageProgress:
         response = self.transport.send(
-            "POST", f"{self.url}/frames", content=encode_tree(said, MSGPACK), media_type=MSGPACK, repeatable=True
+            "POST", f"{self.url}/frames", content=encode_tree(body, MSGPACK), media_type=MSGPACK, repeatable=True
         )
         progress = read_model(CoverageProgress, response)
         self.offset = progress.offset

@@ -107,7 +107,7 @@ class CoverageStreamFrames(Resource):
         if not isinstance(given, NextFrames):
             return _progress(given)
         made = await self.compute_apart(coverage.ADVANCE_COVERAGE, lambda: given.order, AdvancedStream.unpack)
-        step = StreamStep(given.said, made.answer, made.offset, made.state)
+        step = StreamStep(given.digest, made.answer, made.offset, made.state)
         return await self.answer_with(_progress, coverage_streams.advance_stream, project, held, step)
 
 

@@ -140,8 +140,8 @@ def find_figure(report: ReportDocument, name: str, trial: str | None) -> StoredF
         known = ", ".join(dict.fromkeys(figure.name for figure in report.figures))
         raise NotFoundProblem(f"The report has no figure {name!r}; it has {known or 'none'}.", code="no-figure")
     trials = ", ".join(str(figure.trial) for figure in named if figure.trial is not None)
-    told = f"for the trials {trials}" if trials else "for all trials together; leave out the trial"
-    raise NotFoundProblem(f"The figure {name!r} exists only {told}.", code="no-figure")
+    where = f"for the trials {trials}" if trials else "for all trials together; leave out the trial"
+    raise NotFoundProblem(f"The figure {name!r} exists only {where}.", code="no-figure")
 
 
 def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:

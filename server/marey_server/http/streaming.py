@@ -103,7 +103,7 @@ class BlobSender(Resource):
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)
         opened = await self.look_up(_open_blob, digest, wanted, head=self.request.method == "HEAD")
-        told = {
+        fields = {
             "ETag": etag,
             "Cache-Control": cache_control,
             "Repr-Digest": f"sha-256=:{base64.b64encode(bytes.fromhex(digest[7:])).decode()}:",
@@ -111,11 +111,11 @@ class BlobSender(Resource):
             "Vary": "Accept, Accept-Encoding, Authorization",
         }
         if matches(self.request.headers.get("If-None-Match"), etag):
-            return Rendered(304, told, b"")
+            return Rendered(304, fields, b"")
         if wanted is not None:
-            told["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
-        told |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
-        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, told, opened.first))
+            fields["Content-Range"] = f"bytes {opened.start}-{opened.stop - 1}/{opened.size}"
+        fields |= {"Content-Type": media_type, "Content-Disposition": disposition, **headers}
+        await self._send_pieces(digest, opened, Rendered(200 if wanted is None else 206, fields, opened.first))
         return None
 
     async def _send_pieces(self, digest: str, opened: _Opened, first: Rendered) -> None:

@@ -86,7 +86,7 @@ class StreamOrder(Message):
 class NextFrames:
     """Digest of the frames of a request, and the order to add them."""
 
-    said: str
+    digest: str
     order: bytes
 
 
@@ -150,16 +150,16 @@ def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
 
     Raises `CoverageOffset` if the frames do not start at the stream's offset.
     """
-    said = _said(frames)
-    if (answer := answered_before(held, said)) is not None:
+    digest = _digest_of(frames)
+    if (answer := answered_before(held, digest)) is not None:
         return answer
     require_offset(held, frames.offset)
     packed = encode_tree(frames.model_dump(), MSGPACK)
     order = StreamOrder(settings=held.settings, rig=held.rig, state=held.state, frames=packed)
-    return NextFrames(said, order.pack())
+    return NextFrames(digest, order.pack())
 
 
-def _said(frames: CoverageFrames) -> str:
+def _digest_of(frames: CoverageFrames) -> str:
     """Return the digest of a request's frames and offset, independent of the media type."""
     hashed = hashlib.sha256(f"{frames.offset} {frames.ends_take}".encode())
     hashed.update("/".join(frames.translated_joints).encode())

@@ -226,7 +226,7 @@ def file_of(
 
 
 def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintError, ...]:
-    told = []
+    errors = []
     for number, step in enumerate(request.asked_steps):
         refined, sampled = result.sequel.measured.errors[number], result.sequel.sampled.errors[number]
         for place, constraint in enumerate(step.constraints):
@@ -234,7 +234,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
             finished = None if result.finished is None else result.finished.errors.get((number, place))
             error = _in_unit(float(refined[place]), unit)
             left = error if finished is None else _in_unit(finished, unit)
-            told.append(
+            errors.append(
                 ConstraintError(
                     step=number,
                     constraint=place,
@@ -246,7 +246,7 @@ def _errors(result: SearchResult, request: SearchRequest) -> tuple[ConstraintErr
                     **{f"error_{unit}": error},
                 )
             )
-    return tuple(told)
+    return tuple(errors)
 
 
 def _tolerance(constraint: SearchConstraint, unit: str) -> float:

@@ -32,7 +32,7 @@ from marey_client.cli.following import follow, print_ended
 from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import _done
 from marey_client.cli.output import print_table
-from marey_client.cli.pipelines import _tell_shortfalls
+from marey_client.cli.pipelines import _print_shortfalls
 from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
 from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
@@ -600,7 +600,7 @@ def test_where_files_go_is_called_the_same_by_every_command(command: str) -> Non
 def test_what_a_step_found_nothing_in_is_counted_as_people_count(capsys: pytest.CaptureFixture[str]) -> None:
     for empty, told in ((["raw/walk"], "in raw/walk"), (["raw/a", "raw/b"], "in 2 clips, such as raw/a")):
         job = a_job(result={"empty": empty})
-        _tell_shortfalls(PipelineRun(None, {"annotate": job}))
+        _print_shortfalls(PipelineRun(None, {"annotate": job}))
         assert capsys.readouterr().err == f"annotate found nothing {told}\n"
 
 

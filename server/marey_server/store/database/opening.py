@@ -95,5 +95,5 @@ def _shown(url: str) -> str:
 
 def _reason(error: BaseException | None) -> str:
     """Return the first line of the driver's message."""
-    said = str(getattr(error, "orig", None) or error).strip()
-    return said.splitlines()[0] if said else "no reason is given"
+    text = str(getattr(error, "orig", None) or error).strip()
+    return text.splitlines()[0] if text else "no reason is given"
