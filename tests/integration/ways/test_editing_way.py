@@ -105,6 +105,28 @@ def test_a_job_is_repeated_from_its_record_and_its_results_are_compared(
     assert "has replaced its sources" in run("job", "rerun", in_place.id, status=2).stderr
 
 
+def test_a_list_is_searched_sorted_and_limited_to_stale_results(
+    marey: Marey, lab: ProjectHandle, run: CommandLine
+) -> None:
+    ended(marey, lab.edit("walks", [{"command": "trim", "start": 30}], into="cut"))
+
+    def names(*options: str) -> list[str]:
+        return [
+            one["name"]
+            for one in json.loads(run("ls", "lab", "-r", "--kind", "clip", *options, "--json").stdout)["items"]
+        ]
+
+    straight = clips_of(lab, "walks")["walk 0"]
+    ended(marey, lab.edit(straight, [{"command": "trim", "stop": 40}], in_place=True))
+    assert names("--stale") == ["walk 0"]
+    assert names("--sort", "frames")[0] == names("--sort", "-frames")[-1] == "walk 0"
+    assert names("--sort", "-updated")[0] == "walk 0"
+    assert sorted(names("--find", "WALK -")) == ["walk -30", "walk -30"]
+    shown = run("ls", "lab", "--find", "walk 0", "--columns", "frames,seconds").stdout.splitlines()
+    assert [line.split() for line in shown if "walks/walk" in line][-1][-2:] == ["40", "0.667"]
+    assert "the columns are" in run("ls", "lab", "--sort", "size", status=2).stderr
+
+
 def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: ProjectHandle) -> None:
     before = clips_of(lab, "walks")
     ended(marey, lab.edit("walks", [{"command": "mirror"}], suffix=" mirrored"))

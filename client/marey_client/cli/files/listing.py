@@ -7,19 +7,37 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.addresses import Address, find_item, kind_named
+from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, find_item, kind_named
 from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.revisions import require_revision
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
-    from marey_schemas.items import Revision
+    from marey_schemas.items import Item, Revision
     from marey_schemas.kinds import Kind
+
+COLUMNS: dict[str, Callable[[Item], object]] = {
+    "kind": lambda item: item.kind,
+    "revision": lambda item: item.revision,
+    "joints": lambda item: item.summary.get("joints"),
+    "frames": lambda item: item.summary.get("frames"),
+    "Hz": lambda item: item.summary.get("frame_rate_hz"),
+    "seconds": lambda item: None if (given := item.summary.get("duration_s")) is None else round(given, 3),
+    "warnings": lambda item: " ".join(item.summary.get("warnings", ())),
+    "tags": lambda item: " ".join(item.tags),
+    "created": lambda item: item.created_at,
+    "updated": lambda item: item.updated_at,
+    "id": lambda item: item.id,
+}
+"""Columns of a list of items after the name."""
+DEFAULT_COLUMNS = "kind,revision,joints,frames,Hz,tags"
+FIGURES = ("revision", "joints", "frames", "Hz", "seconds")
+"""Columns with numbers."""
 
 
 def add_to(app: typer.Typer) -> None:
@@ -40,6 +58,18 @@ def ls(
     tag: Annotated[
         str | None, typer.Option(help="List only items with one of these tags, separated by commas.")
     ] = None,
+    find: Annotated[
+        str, typer.Option(help="List only items whose names contain this text, also those in subfolders.")
+    ] = "",
+    stale: Annotated[
+        bool, typer.Option("--stale", help="List only results of which an input has a newer revision.")
+    ] = False,
+    sort: Annotated[
+        str, typer.Option(help="Column by which the items are sorted; - before it reverses the order, as in -updated.")
+    ] = "name",
+    columns: Annotated[
+        str, typer.Option(help=f"Columns after the name, separated by commas, of {', '.join(COLUMNS)}.")
+    ] = DEFAULT_COLUMNS,
     deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, in the folder and below.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -51,29 +81,50 @@ def ls(
     address = Address.parse(place)
     if deleted:
         return _show_deleted(context, address, kind, tag, as_json)
+    shown, order = _columns(columns), _columns(sort.removeprefix("-"), also=("name",))[:1]
     with connect(context) as marey:
-        folders = [] if recursive else _folders_in(marey, address)
-        items = _items_in(marey, address, recursive=recursive, kinds=kind, tag=tag)
+        folders = [] if recursive or find or stale else _folders_in(marey, address)
+        items = _items_in(marey, address, recursive=recursive or bool(find), kinds=kind, tag=tag, find=find)
         if not folders and not items and marey.project(address.project).collections.at(address.path) is None:
             items = _items_called(marey, address)
+        if stale:
+            items = _stale(items)
+    items = _sorted(items, order[0], reverse=sort.startswith("-"))
     if as_json:
         return print_json({"collections": folders, "items": [one.item for one in items]})
-    rows: list[tuple[object, ...]] = [(f"{name}/", "collection", *[""] * 5) for name in folders]
+    rows: list[tuple[object, ...]] = [
+        (f"{name}/", *("collection" if column == "kind" else "" for column in shown)) for name in folders
+    ]
     for one in items:
-        summary = one.item.summary
-        rows.append(
-            (
-                one.path if recursive else one.name,
-                one.item.kind,
-                one.item.revision,
-                summary.get("joints"),
-                summary.get("frames"),
-                summary.get("frame_rate_hz"),
-                " ".join(one.item.tags),
-            )
-        )
-    figures = ("revision", "joints", "frames", "Hz")
-    return print_table(("name", "kind", *figures, "tags"), rows, right=figures)
+        name = one.path if recursive or find else one.name
+        rows.append((name, *(COLUMNS[column](one.item) for column in shown)))
+    return print_table(("name", *shown), rows, right=[column for column in shown if column in FIGURES])
+
+
+def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
+    """Return the names of columns in a text with commas. Raises `WrongUsage`."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in COLUMNS and name not in also:
+            raise WrongUsage(f"there is no column {name!r}; the columns are {', '.join((*also, *COLUMNS))}")
+    return names
+
+
+def _sorted(items: Sequence[ItemHandle], column: str, *, reverse: bool) -> list[ItemHandle]:
+    """Sort items by a column; items without a value come last in either order."""
+    if column == "name":
+        return list(reversed(items)) if reverse else list(items)
+    values = {one.id: COLUMNS[column](one.item) for one in items}
+    with_value = [one for one in items if values[one.id] not in (None, "")]
+    without = [one for one in items if values[one.id] in (None, "")]
+    return [*sorted(with_value, key=lambda one: values[one.id], reverse=reverse), *without]  # type: ignore[arg-type, return-value]
+
+
+def _stale(items: Sequence[ItemHandle]) -> list[ItemHandle]:
+    """Return the items of which an input has a newer revision."""
+    with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
+        answers = pool.map(lambda one: one.staleness().stale, items)
+        return [one for one, stale in zip(items, answers, strict=True) if stale]
 
 
 def _show_deleted(
@@ -116,6 +167,7 @@ def _items_in(
     recursive: bool,
     kinds: Sequence[str] | None,
     tag: str | None,
+    find: str = "",
     deleted: bool = False,
 ) -> list[ItemHandle]:
     from marey_schemas.kinds import Kind
@@ -125,11 +177,11 @@ def _items_in(
 
     def of_kind(kind: Kind) -> list[ItemHandle]:
         folder = "collection" if recursive else "directly_in"
-        filters = {folder: address.path, "tag.in": tag}
+        filters = {folder: address.path, "tag.in": tag, "q": find or None}
         found: list[ItemHandle] = list(project.items(kind).list(filters=filters, deleted=deleted))
         return sorted(found, key=lambda item: item.path)
 
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
         return [item for items in pool.map(of_kind, wanted) for item in items]
 
 
