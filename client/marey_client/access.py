@@ -28,7 +28,7 @@ from marey_schemas.access import (
 )
 
 ANY_STATE = {"If-Match": "*"}
-"""Header of a change that replaces any state."""
+"""Header of a request that applies a change whatever the present state of the resource is."""
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
@@ -38,7 +38,7 @@ def change_quotas(transport: Transport, path: str, change: QuotaChange) -> Quota
 
 @dataclass(frozen=True)
 class Users:
-    """Users of a server; for administrators."""
+    """Users of a server, managed by administrators."""
 
     transport: Transport
 
@@ -55,7 +55,7 @@ class Users:
         return self.transport.post(User, "/users", user, repeatable=False)
 
     def change(self, name: str, change: UserChange) -> User:
-        """Change a user; users who change their own password give the current one."""
+        """Change a user. Users who change their own password must also send the current one."""
         return read_model(
             User, self.transport.send("PATCH", f"/users/{name}", content=as_json(change), headers=ANY_STATE)
         )
@@ -65,11 +65,11 @@ class Users:
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
-        """End the sessions of a user, or all tokens; the token of this client stays valid."""
+        """End all tokens of a user, or only the sessions; the token of this client stays valid."""
         return self.change(name, UserChange(end_tokens=which))
 
     def quotas(self, name: str) -> QuotasInUse:
-        """Return the number of items and bytes that count for a user, and the limits."""
+        """Return the number of items and bytes that count towards a user's quotas, and the limits."""
         return self.transport.get(QuotasInUse, f"/users/{name}/quotas")
 
     def change_quotas(self, name: str, change: QuotaChange) -> QuotasInUse:
@@ -97,7 +97,8 @@ class Tokens:
     ) -> Iterator[Token]:
         """List the tokens, without secrets: yours, or, for administrators, those of a user or of everybody.
 
-        `prefix` selects the token of a secret `marey_<prefix>_...`, `ends_within_s` those that end within a time.
+        `prefix` selects the token of a secret `marey_<prefix>_...`, `ends_within_s` the tokens that expire within this
+        number of seconds.
         """
         params = {"user": user, "everybody": everybody or None, "prefix": prefix, "ends_within_s": ends_within_s}
         return pages(self.transport, Token, "/tokens", params)
@@ -107,7 +108,7 @@ class Tokens:
         return self.transport.post(NewToken, "/tokens", token, repeatable=False)
 
     def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:
-        """Replace the token of this client by a successor with the same rights and the same end.
+        """Replace the token of this client by a successor with the same rights and the same expiry.
 
         The replaced token, which this client still sends, is valid for the time `grace`. A call with the same
         `rotation_id`, for example after a crash, gets the same successor; the default is a new random id.

@@ -60,7 +60,7 @@ class Blobs:
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` if its length changes in the meantime.
+        Raises `FileChanged` if the length of the file changes in the meantime.
         """
         name = digest or digest_of_file(path)
         size_bytes = path.stat().st_size

@@ -1,7 +1,7 @@
 """Lookup of the server's address and the token.
 
-A token is searched in this order: a file named on the command line, `MAREY_TOKEN`, the file written by `marey login`,
-and `admin.token` in the data folder of a server on this machine.
+The token is taken from the first of these places that has one: a file named on the command line, `MAREY_TOKEN`, the
+file written by `marey login`, and `admin.token` in the data folder of a server on this machine.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ class ProjectHandle(ProjectItems):
         """Submit a job that annotates clips by a method and its options; the results go below the folder `into`.
 
         Methods are `steps`, `velocity_minima` and `wrist_contact`, as in `{"method": "steps", "most_turn_deg": 45}`;
-        `options` are the others of `AnnotateParams`.
+        `options` are the other fields of `AnnotateParams`.
         """
         method = {"method": proposal} if isinstance(proposal, str) else proposal
         request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))

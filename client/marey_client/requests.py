@@ -140,8 +140,8 @@ def plan_model(
     """Plan the jobs that make a model of takes. Files are sent at once; the jobs import them with the given `options`.
 
     With a `layer`, clips are cut along their annotations of that layer, or aligned by them. The `choices` are fields of
-    `ModelPlan`; results go to a folder of the model's name unless one is named.
-    Raises `NoAnnotations` if the clips have no annotation of the layer.
+    `ModelPlan`; by default, results go to a folder with the model's name. Raises `NoAnnotations` if the clips have no
+    annotation of the layer.
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]

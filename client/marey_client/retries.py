@@ -26,7 +26,7 @@ class Retries:
     ----------
     tries : greatest number of times that a request is sent
     first_s : longest wait before the second try, in seconds; it doubles with each further try
-    longest_s : limit of that doubling, in seconds
+    longest_s : limit of the doubled wait, in seconds
     total_s : seconds after the first try after which no try starts
     sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
     """

@@ -45,7 +45,7 @@ class BearerToken(httpx.Auth):
 
     @property
     def token(self) -> str:
-        """The token of this moment."""
+        """The current token."""
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
     def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
@@ -103,7 +103,7 @@ class Transport:
         return other
 
     def with_present_token(self) -> Transport:
-        """Return the same connections with the token of this moment, which stays the same if its file changes."""
+        """Return the same connections with the current token, which is not read again if its file changes."""
         return self if self._auth is None else self.with_token(self._auth.token)
 
     def has_token_of(self, other: Transport) -> bool:

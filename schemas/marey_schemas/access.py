@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Choice of the tokens that end when a user is changed; the token of the request itself never ends."""
+    """Choice of the tokens that end when a user is changed; the token of the request itself stays valid."""
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -90,7 +90,7 @@ class User(Answer):
 
 
 class Me(Answer):
-    """The caller and the rights of the credential."""
+    """The caller, and the rights of the token of the request."""
 
     user: User | None
     scopes: tuple[str, ...]
@@ -122,7 +122,7 @@ class TokenCreate(Request):
 
 
 class TokenRotation(Request):
-    """Request to replace the token of the request by a successor with the same rights and the same end."""
+    """Request to replace the token that it was sent with by a successor with the same rights and the same expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
@@ -228,7 +228,7 @@ class QuotasInUse(Answer):
 
 
 class MemberChange(Request):
-    """Request to give a user a role in a project."""
+    """Request to set the role of a user in a project."""
 
     role: Role
 

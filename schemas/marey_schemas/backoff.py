@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 MOST_STEPS = 64
-"""Greatest exponent of the growth, so that numbers do not overflow; the longest delay is reached before."""
+"""Greatest exponent of the growth, so that numbers do not overflow; the delay reaches its limit before."""
 
 
 @dataclass(frozen=True)

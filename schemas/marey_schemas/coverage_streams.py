@@ -176,7 +176,7 @@ class Performer(Answer):
 
 
 class CoverageNow(Answer):
-    """Coverage so far, targets to record next, and the performer, who is null between takes."""
+    """Coverage so far, targets to record next, and the state of the performer, which is null between takes."""
 
     index: float = Field(description="Share of the cells that have enough data.")
     missing_s: float = Field(description="Seconds of data that all cells together still need.")
@@ -187,7 +187,7 @@ class CoverageNow(Answer):
 
 
 class CoverageProgress(CoverageNow):
-    """Changes made by the frames of a request."""
+    """Coverage after the frames of a request, and the changes that they made."""
 
     offset: int = Field(description="Number of frames received so far.")
     windows: int = Field(description="Number of one-second windows that these frames completed, in any cell.")
@@ -227,7 +227,7 @@ class CoverageStreamState(CoverageStream, CoverageNow):
 
 
 class MeasuredOptions(Answer):
-    """Options of an evaluation that determine its coverage."""
+    """Those options of an evaluation that determine its coverage."""
 
     grid: Grid
     coverage_least_s: float = Field(gt=0, le=3600)

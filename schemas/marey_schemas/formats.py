@@ -17,7 +17,7 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 """The earliest time in a ZIP archive; every file gets it, so that the same content gives the same bytes."""
 
 MOST_UNPACKED_BYTES = 1 << 29
-"""Greatest number of bytes that a compressed file may unpack to; readers stop unpacking there."""
+"""Greatest unpacked size in bytes of a compressed file; readers stop unpacking there."""
 
 Content = Literal["motion", "skeleton", "model", "tree", "graph", "annotation", "alignment", "item"]
 
@@ -25,7 +25,7 @@ AnnotationForm = Literal["labels", "list", "frames"]
 """Forms of annotations in the predecessor's format: sections by label, a list of sections, or frames by label."""
 DEFAULT_FORM: AnnotationForm = "labels"
 EndIndex = Literal["inclusive", "exclusive"]
-"""Whether a section of the predecessor's format includes its last index."""
+"""Meaning of the last index of a section in the predecessor's format: inside the section, or just after it."""
 DEFAULT_END_INDEX: EndIndex = "inclusive"
 
 UNITS_M = {
@@ -55,7 +55,7 @@ class FileFormat:
     other_endings : endings that identify a named file, but that folders are not searched for
     euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
     archive : whether files are ZIP archives with an ending of their own
-    companion : format of a second file that its reader takes
+    companion : format of a second file that the reader also needs or accepts
     needs_companion : reason why the second file is needed; empty if it is optional
     unread : reason why there is no reader, for formats that users may expect
     """
@@ -157,14 +157,14 @@ def format_named(name: str) -> FileFormat:
 IMPORTED = tuple(one for one in FORMATS if one.reads or one.unread)
 """Formats that imports recognise."""
 IMPORTED_ENDINGS = tuple(sorted(ending for one in IMPORTED for ending in one.endings))
-"""Endings of the files that an upload of a folder takes."""
+"""Endings of the files that the upload of a folder includes."""
 MOTION_FORMATS = tuple(one.name for one in FORMATS if "motion" in one.writes)
 """Formats that a clip can be written in."""
 SAMPLE_FORMATS = (*MOTION_FORMATS, "json")
 EXPORT_FORMATS = (ORIGINAL, *SAMPLE_FORMATS)
 """Choices of an export."""
 WRITTEN_UNITS = tuple(dict.fromkeys(unit for one in FORMATS if len(one.units) > 1 for unit in one.units))
-"""Units that the caller can choose from if the format does not fix the unit."""
+"""Units among which the caller chooses if the format does not fix the unit."""
 DEFAULT_FORMAT = "bvh"
 """Default format of written motion files."""
 DEFAULT_UNIT = "cm"

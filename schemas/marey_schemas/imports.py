@@ -12,7 +12,7 @@ from marey_schemas.names import Digest
 from marey_schemas.options.imports import ImportOptions
 
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=1024, pattern=r"^[^\x00-\x1f\x7f]+$")]
-"""Name of a file; its folders become collections below the target."""
+"""Name of a file; folders in the name become collections below the target collection."""
 
 
 class ImportFile(Request):

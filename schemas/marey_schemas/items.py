@@ -125,7 +125,7 @@ class Revision(Answer):
 
 
 class LineageEdge(Answer):
-    """One step of an item's history: an input of a revision, or a result computed from it."""
+    """One step of an item's lineage: an input of a revision, or a result computed from the revision."""
 
     item: str
     kind: Kind
@@ -169,15 +169,13 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Request for those of the given blobs that the server does not have; blobs that the caller may not read count as
-    missing.
-    """
+    """Query for the given blobs that the server does not have; blobs that the caller may not read count as missing."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 
 
 class BlobsMissing(Answer):
-    """The digests that must be sent."""
+    """Digests of the blobs that must be sent."""
 
     missing: tuple[str, ...]
 

@@ -20,7 +20,7 @@ from marey_schemas.kinds import PARTS, Kind
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000
-"""Greatest number of tasks of a job whose parameters determine the number."""
+"""Greatest number of tasks of a job, if the parameters of the job determine the number."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class KindDeclaration:
     Identical jobs reuse results. Jobs are identical if they have the same parameters, seed, and inputs with the same
     names, places and contents. Further facts that determine the results of a kind are declared, and distinguish jobs:
 
-    * `place_counts`: whether the collection that receives the results is such a fact.
+    * `place_counts`: whether the path of the collection that receives the results is such a fact.
     * `newest_of`: parameters that are the id of an item, or null; the newest revision of that item is such a fact.
     * `never_cached_for`: function that returns whether a job with the given parameters looks up names while it runs.
     * `never_cached_without`: inputs without which a job looks up names while it runs.
@@ -47,9 +47,9 @@ class KindDeclaration:
 
     Results of jobs that look up names are never reused.
 
-    `named_after` is the input whose items lend their places and names to the results; the parameter `suffix` is
-    appended. `unclear_place` returns the reason why parameters and a collection do not determine the place of the
-    results.
+    `named_after` is the input whose items determine the names and relative collections of the results; the parameter
+    `suffix` is appended to the names. `unclear_place` returns the reason if parameters and a collection do not
+    determine the place of the results.
     """
 
     name: str

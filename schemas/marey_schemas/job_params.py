@@ -177,13 +177,13 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
 
 
 def count_evaluation_tasks(params: EvaluateParams) -> int:
-    """Return the number of tasks for the trials; each task runs few trials, so that its failure loses little work."""
+    """Return the number of tasks for the trials; a task runs few trials, so that little work is lost if it fails."""
     per_task = max(TRIALS_PER_TASK, -(-params.trial_count // MOST_EVALUATION_TASKS))
     return -(-params.trial_count // per_task)
 
 
 WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
-"""Number of feature groups of every database, without extra joints, which do not increase the number of tasks."""
+"""Number of feature groups that every database has. The optional group of extra joints does not add tasks."""
 
 
 class CompareParams(Request):
@@ -228,7 +228,7 @@ class TreeParams(TreeOptions):
     """Parameters of `tree`."""
 
     def unclear_place(self, into: str) -> str | None:
-        """Return the reason why the tree cannot be stored in a collection, or None."""
+        """Return the reason why the tree cannot be stored in a collection, or None if it can."""
         return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
 
 
@@ -253,7 +253,7 @@ class EditParams(SuffixedResults):
         return self
 
     def unclear_place(self, into: str) -> str | None:
-        """Return the reason why `into` contradicts `in_place` for these results, or None."""
+        """Return the reason why `into` contradicts `in_place`, or None if it does not."""
         if self.in_place and into:
             return f"the results cannot both take the place of the clips and go to {into}"
         if not (self.in_place or into or self.suffix):

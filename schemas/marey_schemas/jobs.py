@@ -71,14 +71,14 @@ class JobKind(Answer):
 
 
 class ItemInput(Request):
-    """Item as an input, at the given revision or the newest at submission."""
+    """Item as an input, at the given revision, or else at its newest revision at the time of submission."""
 
     item: str
     revision: int | None = Field(None, ge=1)
 
 
 class CollectionInput(Request):
-    """All items of the input's kind in a collection and below it, at their newest revisions at submission."""
+    """All items of the input's kind in a collection and below it, at the revisions that are newest at submission."""
 
     collection: CollectionPath
 
@@ -98,7 +98,7 @@ class DatasetInput(Request):
 class JobOutputsInput(Request):
     """All outputs of another job of the project that have the input's kind, pinned when that job has succeeded.
 
-    The job waits for the other one, as for those in `after`.
+    The job waits for the other job, as for the jobs in `after`.
     """
 
     job: str = Field(min_length=1, max_length=40)
@@ -214,7 +214,7 @@ class Job(Answer):
 
 
 class TaskResult(Answer):
-    """Result of one task of a fan-out; None until the task has ended."""
+    """State of one task of a job, and its result, which is null until the task has ended."""
 
     job: str
     position: int

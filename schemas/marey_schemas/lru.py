@@ -19,7 +19,7 @@ class LruCache(Generic[Key, Value]):
     max_entries : largest number of values; None for no limit
     max_bytes : largest sum of `size_of` over all values; None for any sum. The newest value is kept even if it alone
         is larger, unless it exceeds `largest_bytes`.
-    largest_bytes : values larger than this are not kept, so that one of them does not displace all others
+    largest_bytes : values larger than this are not stored, so that a single value does not displace all others
     size_of : bytes of a value; needed only with a bound in bytes
     """
 

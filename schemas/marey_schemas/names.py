@@ -6,14 +6,14 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 ProjectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9_-]{0,62}[a-z0-9])?$")]
-"""Lower-case letters, digits, `-` and `_`; it is part of URLs."""
+"""Name of a project: lower-case letters, digits, `-` and `_`; the name is part of URLs."""
 
 UserName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0,62}[a-z0-9])?$")]
 
 MAX_NAME_LENGTH = 255
 
 ItemName = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME_LENGTH, pattern=r"^[^/\x00-\x1f\x7f]+$")]
-"""Any printable name without a slash."""
+"""Name of an item: any printable text without a slash."""
 
 NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-\x1f\x7f]*$")]
 """Text that can be appended to a name."""
@@ -21,7 +21,7 @@ NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=r"^[^/\x00-
 CollectionPath = Annotated[
     str, StringConstraints(max_length=1024, pattern=r"^(?:[^/\x00-\x1f\x7f]{1,255}(?:/[^/\x00-\x1f\x7f]{1,255})*)?$")
 ]
-"""Names joined by `/`, without a leading or trailing slash; the empty path is the project's root."""
+"""Path of a collection: names joined by `/`, without a leading or trailing slash; the empty path is the root."""
 
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^,\x00-\x1f\x7f]+$")]
 

@@ -61,7 +61,7 @@ class PipelineCreate(Request):
 
 
 class Pipeline(Answer):
-    """Jobs of a pipeline by the names of its steps, each after those it depends on."""
+    """Jobs of a pipeline by the names of its steps; each job comes after the jobs that it depends on."""
 
     jobs: dict[str, Job]
 
@@ -81,7 +81,7 @@ class PipelineError(ValueError):
 
 
 def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
-    """Sort the names of the steps so that each comes after those it depends on, otherwise in the given order.
+    """Sort the names of the steps so that each step comes after its dependencies; otherwise, the given order is kept.
 
     Raises `PipelineError` for a step that does not exist, and for circular dependencies.
     """
@@ -108,7 +108,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """Return the job request of a step; `ids` are those of the jobs of the steps it depends on."""
+    """Return the job request of a step; `ids` are the ids of the jobs that were made for the steps it depends on."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:

@@ -23,13 +23,13 @@ MOST_CONSTRAINTS = 64
 MOST_STEPS = 16
 MOST_CANDIDATES = 256
 MOST_CANDIDATE_CONSTRAINTS = 4096
-"""Greatest product of the numbers of candidates and constraints, which takes some seconds of one thread."""
+"""Greatest product of the numbers of candidates and constraints; such a search takes some seconds of one thread."""
 
 SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOST_CONSTRAINTS)]
 
 
 class StartPlacement(Request):
-    """Start of a motion: the model's canonical frame in the world."""
+    """Start of a motion: position and heading of the model's canonical frame in the world."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")

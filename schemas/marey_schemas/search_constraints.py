@@ -22,7 +22,10 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Component = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 Tolerance = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
-"""Tolerance; its minimum is below the accuracy of any motion capture, and squared errors divided by it stay finite."""
+"""Tolerance of a constraint.
+
+Its minimum is below the accuracy of any motion capture, and squared errors divided by it stay finite.
+"""
 Distance = Annotated[float, Field(ge=1e-5, le=1e4, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=-36_000, le=36_000, allow_inf_nan=False)]
 

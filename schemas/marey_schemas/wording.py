@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 NAMES_SHOWN = 5
-"""Most names that a message lists."""
+"""Greatest number of names that a message lists."""
 
 
 def counted(number: int, noun: str) -> str:
@@ -22,5 +22,5 @@ def one_of(names: Sequence[str]) -> str:
 
 
 def without_prefix(message: str) -> str:
-    """Return a message of a pydantic validation without the words that pydantic puts before a `ValueError`'s text."""
+    """Return a message of pydantic without the prefix "Value error, ", which marks the text of a `ValueError`."""
     return message.removeprefix("Value error, ")

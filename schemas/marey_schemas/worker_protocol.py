@@ -53,7 +53,7 @@ class PinnedInput(Answer):
 
     @property
     def folder(self) -> str:
-        """The path below the job's `into` for results with the same relative folder as this input."""
+        """The folder of this input; results are stored in the folder of this name below the job's `into`."""
         return self.collection if self.below is None else self.below
 
     @property
@@ -107,7 +107,7 @@ class Heartbeat(Request):
 
 
 class HeartbeatAnswer(Answer):
-    """Remaining lease, and whether to stop."""
+    """Remaining time of the lease, and whether the worker must stop the job."""
 
     lease_ttl_s: float
     cancel_requested: bool
@@ -140,7 +140,7 @@ class StageRequest(Request):
 
 
 class CompleteRequest(Request):
-    """Request to publish the staged outputs and end the job; repeating a `write_id` repeats the answer."""
+    """Request to publish the staged outputs and end the job; requests with the same `write_id` get the same answer."""
 
     write_id: str = Field(min_length=8, max_length=64)
     result: dict[str, Any] = Field(default_factory=dict)

@@ -38,7 +38,7 @@ def _take_any_text() -> None:
 
 
 def with_global_options_first(arguments: list[str]) -> list[str]:
-    """Move options of `marey` itself to the front, as typer needs them: `marey ls lab --server URL` works, too."""
+    """Move the global options to the front, where typer needs them, so that `marey ls lab --server URL` works, too."""
     first: list[str] = []
     rest: list[str] = []
     left = iter(arguments)

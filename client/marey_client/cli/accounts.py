@@ -206,7 +206,7 @@ def user_quota(
     defaults: DefaultLimits = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show how many items and bytes count for a user, and the limits, which administrators can change."""
+    """Show how many items and bytes count towards a user's quotas, and the limits, which administrators can change."""
     change = quota_change(items, stored_bytes, defaults)
     with connect(context) as marey:
         found = marey.users.quotas(name) if change is None else marey.users.change_quotas(name, change)

@@ -48,7 +48,7 @@ class Address:
 
     @property
     def has_id(self) -> bool:
-        """Whether the last name is an id."""
+        """Whether the last name of the path is the id of an item."""
         return _ID.fullmatch(self.name) is not None
 
 
@@ -224,8 +224,8 @@ class SingleItem:
 def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
     """Return the folder or item at an address; a final `/` means a folder.
 
-    Raises `WrongUsage` if there is none, or several. If several were deleted at this address, returns the one that was
-    deleted last.
+    Raises `WrongUsage` if the address has none of these, or several. If several were deleted at this address, returns
+    the one that was deleted last.
     """
     address = Address.parse(text)
     if not address.path:

@@ -79,7 +79,7 @@ def create(
     keyframe: Annotated[list[str] | None, typer.Option(help="Keyframe as label=frame; may be repeated.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Create an annotation of a clip, which may contain segments and keyframes."""
+    """Create an annotation of a clip, with the given segments and keyframes, if any."""
     from marey_schemas.kinds import Kind
 
     segments = sorted((_segment(text) for text in segment or ()), key=lambda one: one[1:])
@@ -136,7 +136,7 @@ def move(
         int | None, typer.Option(min=0, help="New end of the segment; the frame itself is not included.")
     ] = None,
 ) -> None:
-    """Move the start or the end of a segment; a neighbouring segment at that edge is adapted."""
+    """Move the start or the end of a segment. A segment that touches it there is extended or shortened."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
     if len(edges) != 1:
         raise WrongUsage("give exactly one of --start and --end")
@@ -197,7 +197,7 @@ def propose(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Annotate clips by an algorithm: steps (the default), pauses, or contacts of a hand."""
+    """Annotate clips by an algorithm that finds steps (the default), pauses, or contacts of a hand."""
     addresses = addresses_in_one_project(sources)
     proposal = {**DEFAULT_PROPOSAL, **params.pop("proposal", {}), **dict(map(_option, option or ()))}
     with connect(context) as marey:

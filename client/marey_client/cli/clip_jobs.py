@@ -126,7 +126,7 @@ def cut(
 
 
 def print_labelled(result: dict[str, Any]) -> None:
-    """Print the number of created clips or annotations, in total and by label, and the inputs without results."""
+    """Print the number of created clips or annotations, in total and by label, then the inputs that had no results."""
     made = counted(result["clips"], "clip") if "clips" in result else counted(result["annotations"], "annotation")
     counts = result.get("segments") or result.get("labels") or {}
     typer.echo(", ".join([made, *(f"{count} {label}" for label, count in counts.items())]))
@@ -135,7 +135,7 @@ def print_labelled(result: dict[str, Any]) -> None:
 
 
 def _print_warnings(result: dict[str, Any]) -> None:
-    """Print the number of clips with each warning to standard error."""
+    """Print to standard error how many clips have each warning."""
     for code, count in result.get("warnings", {}).items():
         print_message(f"warning {code}: {counted(count, 'clip')}; see `marey show --part info` of a clip")
 

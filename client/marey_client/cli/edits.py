@@ -137,7 +137,7 @@ def preview_edit(
     piece: Annotated[int, typer.Option(min=1, help="If the clip is split: the result to show, counted from 1.")] = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Show the result of commands on a clip without storing it. With --json, its motion too."""
+    """Show the result of commands on a clip without storing it. With --json, the output also contains its motion."""
     from marey_schemas.kinds import Kind
 
     place = Address.parse(address)
@@ -204,7 +204,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return the command with the id of its source, if the source is given by its address."""
+    """Return the command with the address of its source, if it has one, replaced by the source's id."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None

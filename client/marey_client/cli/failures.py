@@ -22,7 +22,7 @@ ANONYMOUS_HINT = (
 
 
 class Refused(Exception):
-    """The server or a job refused something; the message is already printed, and the exit status is 1."""
+    """The server or a job refused a request or an input; the message is already printed, and the exit status is 1."""
 
 
 class WrongUsage(Exception):

@@ -33,7 +33,7 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job
 
 
 def clips_at(marey: Marey, address: Address) -> ExistingInput:
-    """Return the clip at an address as the input of a job; if there is none, the folder or the version."""
+    """Return the clip at an address as the input of a job; if there is no such clip, the folder or dataset version."""
     from marey_schemas.kinds import Kind
 
     return input_at(marey, address, Kind.CLIP, pinned=False)
@@ -56,9 +56,10 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
 def follow(
     marey: Marey, submitted: Job, *, wait: bool = True, as_json: bool = False, count: int | None = None, unit: str = ""
 ) -> Job | None:
-    """Wait until a job has ended, with a progress bar; `count` is the number of units of a job with tasks.
+    """Wait until a job has ended, and show a progress bar.
 
-    Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
+    The progress of a job with tasks is shown as a number of tasks, or of `count` units if that is given. Without
+    `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
     """
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)
@@ -82,7 +83,7 @@ def follow(
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show the progress of a job; a job that is split into tasks is counted in tasks, or in `count` units."""
+    """Show the progress of a job: if it has tasks, as a number of tasks, or of `count` units if that is given."""
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)

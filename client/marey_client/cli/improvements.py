@@ -300,7 +300,7 @@ def _print_sweep(document: Mapping[str, Any]) -> None:
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a tree with arrays as lists."""
+    """Return a document with its arrays converted to lists."""
     import numpy as np
 
     def plain(value: Any) -> Any:

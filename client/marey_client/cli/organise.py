@@ -177,7 +177,7 @@ def _parted(path: str) -> tuple[str, str]:
 
 
 def _typed(thing: Thing) -> str:
-    """Return the address of a folder or item as users type it; a folder ends with a slash."""
+    """Return the address of a folder or item as users type it; the address of a folder ends with a slash."""
     place = f"{thing.place}/" if thing.kind == FOLDER else thing.place
     return place if place.isascii() and " " not in place else f"'{place}'"
 

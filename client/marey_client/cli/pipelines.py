@@ -138,7 +138,7 @@ def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, option: str) -> None:
-    """Set a value in nested objects. Raises `WrongUsage` if its path conflicts with an earlier one."""
+    """Set the value at a path in nested objects. Raises `WrongUsage` if the path conflicts with an earlier option."""
     place: Any = chosen
     for depth, name in enumerate(path[:-1], start=1):
         place = place.setdefault(name, {})
@@ -148,7 +148,7 @@ def _choose(chosen: dict[str, Any], path: Sequence[str], value: Any, option: str
 
 
 def _takes(marey: Marey, takes: list[str], project: str | None, options: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return the project, and the takes in the form that `build_model` needs. Local files are sent."""
+    """Return the project, and the takes in the form that `build_model` needs. Local files are uploaded."""
     if project is None:
         addresses = [Address.parse(take) for take in takes]
         if len({address.project for address in addresses}) > 1:
@@ -204,14 +204,14 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
 
 
 def _refused(job: Job) -> list[Mapping[str, Any]]:
-    """Return the inputs that a job refused; for an import, files."""
+    """Return the inputs that a job refused; the inputs of an import are files."""
     result = job.result or {}
     failed = [entry for entry in result.get("entries", ()) if entry["status"] == "failed"]
     return [*result.get("refused", ()), *({"name": entry["name"], **entry["error"]} for entry in failed)]
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print refused and empty inputs of the steps, and the notes of their jobs."""
+    """Print the inputs that the steps refused, those in which they found nothing, and the notes of the jobs."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {len(refused)}:")
@@ -234,7 +234,7 @@ def print_steps(run: PipelineRun, as_json: bool) -> None:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
-    """Show a table on standard error inside the block, if that is a terminal."""
+    """Show a table on standard error inside the block, if standard error is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _steps: None
         return

@@ -1,6 +1,6 @@
 """Addresses with `@`: revisions of items, as in `lab/raw/walk@2`, and versions of datasets, as in `lab/gaits@v1/raw`.
 
-Names may contain `@`, so an item or a folder whose name is the whole text comes first.
+Names may contain `@`, so an item or a folder whose name is the whole text takes precedence.
 """
 
 from __future__ import annotations

@@ -112,8 +112,9 @@ def list_tokens(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show your tokens, without their secrets. Scopes show to which projects a token is limited, labels to which
-    workers.
+    """Show your tokens, without their secrets.
+
+    The scopes of a token show the projects to which it is limited, and its labels show the workers.
     """
     within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
@@ -154,7 +155,7 @@ def rotate_token(
     ] = 60,
     as_json: AsJson = False,
 ) -> None:
-    """Replace the token in use by a new one with the same rights and the same expiry, in its file.
+    """Replace the token in use by a new one with the same rights and expiry, in the file that contains it.
 
     The new token is not shown. If the command is interrupted, run it again: it gets the same new token.
     """
@@ -194,7 +195,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of the rotation of this token that was begun before, or begin one."""
+    """Return the id of the rotation of this token that was begun before; if there is none, begin a rotation."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""

@@ -95,7 +95,7 @@ class ClipHandle(ItemHandle):
         return preview_edit(self.transport, self.url, commands, frames=bounds, **given)
 
     def import_annotation(self, document: Mapping[str, Any], **options: Any) -> AnnotationHandle:
-        """Create an annotation in the clip's folder from a document of the predecessor.
+        """Create an annotation in the clip's folder from a document of Marey's predecessor.
 
         `options` are those of `AnnotationImport`, such as `layer="phases"` or `end_index="exclusive"`.
         """

@@ -59,15 +59,15 @@ class PickOptions(TypedDict, total=False):
     into: str
     """Branch that gets the changes; default: main."""
     parent: Literal[1, 2]
-    """For a merge: the parent with which it is compared to find its changes."""
+    """For a merge commit: the number of the parent with which it is compared to find its changes."""
     message: str
     """Message of the commit."""
     resolutions: tuple[Resolution, ...]
     """Decisions of conflicts."""
     preview: bool
-    """Whether only to compute the result."""
+    """Whether the result is only computed, not recorded."""
     expected: str
-    """Commit that the branch must be at."""
+    """Commit that must be the newest one of the branch."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class DatasetHandle:
     ) -> Commit:
         """Record a new version: the content of the dataset's folder, or the newest version with `changes`.
 
-        `expected` is the commit that the branch must be at. A request that is repeated because its answer was lost
-        gets the commit that it made. Raises `Conflict` if the branch has moved.
+        `expected` is the commit that must be the newest one of the branch. If an answer is lost and the request is sent
+        again, the answer is the commit that was made the first time. Raises `Conflict` if the branch has moved.
         """
         request = CommitCreate(
             branch=branch,
@@ -170,14 +170,14 @@ class DatasetHandle:
         return self.transport.post(MergeAnswer, f"{self.url}/merges", request)
 
     def cherry_pick(self, version: str, **options: Unpack[PickOptions]) -> MergeAnswer:
-        """Repeat on a branch what one commit has changed.
+        """Repeat the changes of one commit on a branch.
 
         Raises `Conflict` with the code `merge-conflicts` if the branch has changed the same parts.
         """
         return self._pick("cherry-picks", version, options)
 
     def revert(self, version: str, **options: Unpack[PickOptions]) -> MergeAnswer:
-        """Undo on a branch what one commit has changed; later changes stay.
+        """Undo the changes of one commit on a branch; later changes stay.
 
         Raises `Conflict` with the code `merge-conflicts` if later commits have changed the same parts.
         """
@@ -193,9 +193,9 @@ class DatasetHandle:
         return self.transport.get(EntryOrigins, f"{self.url}/blame", query)
 
     def check_out(self, version: str = MAIN, *, discard: bool = False) -> CheckoutAnswer:
-        """Give the folder of the dataset the entries of a version.
+        """Bring the folder of the dataset to the state of a version.
 
-        Raises `Conflict` if the folder has changes that no commit has recorded, unless they are to be discarded.
+        Raises `Conflict` if the folder has changes that no commit has recorded, unless `discard` is true.
         """
         request = CheckoutRequest(version=version, discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
@@ -211,14 +211,14 @@ class DatasetHandle:
         return self._create(RefCreate(name=name, kind=RefKind.BRANCH, at=at))
 
     def create_tag(self, name: str, at: str = MAIN) -> Ref:
-        """Create a tag at a version; it never moves."""
+        """Create a tag at a version. A tag never moves."""
         return self._create(RefCreate(name=name, kind=RefKind.TAG, at=at))
 
     def _create(self, request: RefCreate) -> Ref:
         return self.transport.post(Ref, f"{self.url}/refs", request)
 
     def move_branch(self, name: str, to: str) -> Ref:
-        """Move a branch to any version; the commits that it had stay."""
+        """Move a branch to any version. No commit is deleted."""
         body = as_json(RefMove(at=to))
         return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=ANY_STATE))
 

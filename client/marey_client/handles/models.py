@@ -51,7 +51,7 @@ class ModelHandle(SearchableHandle):
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Return the whole model: functions, mixture, options, examples, training report; arrays are numpy arrays."""
+        """Return the whole model: functions, mixture, options, examples and training report, with numpy arrays."""
         return self.part("model", revision=revision)
 
     def training(self) -> dict[str, Any]:

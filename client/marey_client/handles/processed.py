@@ -21,16 +21,16 @@ class ProcessedHandle(ItemHandle):
     def motion(
         self, *, frames: slice | None = None, joints: str | Sequence[str] | None = None, revision: int | None = None
     ) -> MotionArrays:
-        """Return the canonical frames, in the canonical frame of reference."""
+        """Return the poses at the canonical frames, with positions in the canonical frame of reference."""
         query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Return set, keyframes, cost and options of the alignment, and the origin of the frames in the source."""
+        """Return the alignment: its set, keyframes, cost and options, and the source frame of each canonical frame."""
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """Return (N,) fractional frames of the source, counted at the set's rate, one for each canonical frame."""
+        """Return the fractional source frame of each canonical frame, (N,), counted at the frame rate of the set."""
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:

@@ -66,7 +66,10 @@ class ProposalHandle:
         kind: Kind | None = None,
         frames: tuple[int, int] | None = None,
     ) -> Comment:
-        """Comment on the proposal, on the entry at `path` of a `kind`, or on its frames from one to before another."""
+        """Comment on the proposal, on one of its entries, or on a range of an entry's frames.
+
+        `path` and `kind` name the entry; `frames` is the first frame and the end, which is not included.
+        """
         request = CommentCreate(text=text, path=path, kind=kind, frames=frames)
         return self.transport.post(Comment, f"{self.url}/comments", request)
 
@@ -75,7 +78,7 @@ class ProposalHandle:
         return pages(self.transport, Comment, f"{self.url}/comments")
 
     def review(self, verdict: Verdict, text: str = "", *, commit: str | None = None) -> Review:
-        """Review the newest commit; raises `Conflict` if `commit` is given and the newest commit is another one."""
+        """Review the newest commit. Raises `Conflict` if `commit` is given and the newest commit is another one."""
         request = ReviewCreate(verdict=verdict, text=text, commit=commit)
         return self.transport.post(Review, f"{self.url}/reviews", request)
 
@@ -95,8 +98,8 @@ class ProposalHandle:
     ) -> ProposalCheck:
         """Report the state of a check of the newest commit.
 
-        Raises `Conflict` if `commit` is given and the newest commit is another one, and if a success is reported of a
-        job that has not succeeded.
+        Raises `Conflict` if `commit` is given and the newest commit is another one, and if `state` is a success and
+        `job` has not succeeded.
         """
         request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
         return self.transport.post(ProposalCheck, f"{self.url}/checks", request)

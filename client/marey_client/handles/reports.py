@@ -41,7 +41,7 @@ class ReportedHandle(ItemHandle):
         return saved(path, self.report())
 
     def save_figures(self, folder: str | Path) -> list[Path]:
-        """Write every figure to a folder, in every form."""
+        """Write every figure to a folder: as PNG and SVG, with its data as JSON and CSV."""
         files = (file for figure in self.figures() for file in self._files_of(figure))
         return [saved(Path(folder) / safe_file_name(name), data) for name, data in files]
 

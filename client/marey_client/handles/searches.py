@@ -20,7 +20,7 @@ from marey_schemas.search import SearchAnswer, SearchRequest
 
 Constraint = Mapping[str, Any] | BaseModel
 Constraints = Constraint | Sequence[Constraint]
-"""Constraint: `{"type": "joint_position", "joint": "left_wrist", "at": "contact", "target_m": (0.3, 1, None)}`."""
+"""Constraints such as `{"type": "joint_position", "joint": "left_wrist", "at": "end", "target_m": (0.3, 1, None)}`."""
 
 
 class SearchableHandle(ReportedHandle):

@@ -1,4 +1,4 @@
-"""Picture of a difference: which frames correspond, rotations over time, paths of the root, and segments."""
+"""Picture of a difference: corresponding frames, rotations over time, paths of the root, and segments."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ if TYPE_CHECKING:
 FileType = Literal["png", "svg"]
 
 MOST_JOINTS = 40
-"""Most joints in the picture: those with the largest changes."""
+"""Greatest number of joints in the picture; the joints with the largest changes are drawn."""
 LEAST_DEG = 0.1
-"""Least change of a joint that is drawn."""
+"""Change of a rotation in degrees that a joint must exceed to be drawn."""
 BEFORE, AFTER = REFERENCE, COLOURS[0]
 REMOVED, INSERTED = COLOURS[1], COLOURS[2]
 MATCHED = "#c9ced8"
 MOST_LABELS = 60
-"""Most segments of a row whose labels are written."""
+"""Greatest number of segments in a row for which labels are written."""
 
 UNKNOWN = "#c4e3dc"
-"""Ground of frames that correspond to none."""
+"""Background colour of frames that correspond to no frame of the other revision."""
 
 MOST_SIGNS = 16
-"""Longest label of a keyframe."""
+"""Greatest length of a keyframe's label, in characters; longer labels are shortened."""
 
 _WIDTH, _LEFT, _TIMES, _PATHS = 12.8, 1.7, 6.2, 2.5
 _ROW, _HIGHEST_ROW, _LEAST_ROWS, _ABOVE, _BELOW = 0.21, 0.36, 2.0, 2.35, 0.6
 _UPPER, _LOWER = (0.74, 0.74, 1.0, 1.0), (0.0, 0.0, 0.26, 0.26)
-"""Heights of the corners of a bar."""
+"""Heights of the corners of the upper bar and of the lower bar."""
 _THINNEST, _NAME_ROOM = 0.004, 0.16
-"""Shares of the width: of the thinnest bar, and of a number of frames in words."""
+"""Least width of a bar, and room for a number of frames in words, as shares of the longest duration."""
 
 
 def draw_difference(difference: Difference, file_type: FileType) -> bytes:
@@ -119,7 +119,7 @@ def _draw_motions(difference: Difference, motion: MotionDifference, plot: Differ
 
 
 def _draw_runs(panel: Axes, motion: MotionDifference) -> None:
-    """Draw both revisions as bars; grey areas connect the frames that correspond."""
+    """Draw both revisions as bars; grey areas connect frames that correspond to each other."""
     rates, longest_s = motion.frame_rate_hz, max(motion.duration_s)
     for run in motion.runs:
         old, new = (np.array(frames) / rate for frames, rate in zip((run.before, run.after), rates, strict=True))
@@ -161,7 +161,7 @@ def _name_runs(panel: Axes, motion: MotionDifference) -> None:
 
 
 def _draw_changes(figure: Figure, panel: Axes, plot: DifferencePlot, shown: NDArray[np.intp], top: float) -> None:
-    """Draw the changes of the joints over time; where no frame corresponds, the page is grey."""
+    """Draw the changes of the joints over time; frames that correspond to none are left in the colour `UNKNOWN`."""
     times = np.array(plot.frames) / plot.frame_rate_hz
     if not len(shown):
         panel.set_yticks([])

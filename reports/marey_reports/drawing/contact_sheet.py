@@ -46,7 +46,7 @@ ARROW = {"arrowstyle": "-|>,head_length=0.35,head_width=0.18", "color": QUIET, "
 
 
 class TakePair(NamedTuple):
-    """A take before and after: its title, the source clip and the result."""
+    """Source clip and result of a take, with a title."""
 
     title: str
     source: Clip
@@ -56,10 +56,11 @@ class TakePair(NamedTuple):
 def contact_sheet(
     takes: Sequence[TakePair], *, heading: str = "Retargeting", moments: int = 6, total: int | None = None
 ) -> bytes:
-    """Draw a PNG with one row per take: at each moment the figure of the source and, on a tinted ground, of the result.
+    """Draw a PNG with one row per take: at each moment the figure of the source beside that of the result.
 
-    The figures of a take are drawn at one scale and seen from one side, to the left of where the source faces at first.
-    Each figure is drawn over its own patch of the floor y = 0, with an arrow in its facing direction.
+    The result has a tinted background. The figures of a take have the same scale and the same view: from the front left
+    of the source in its first frame. Each figure is drawn over its own patch of the floor y = 0, with an arrow in its
+    facing direction.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ class _SheetRow:
 
     @property
     def extent_m(self) -> tuple[float, float]:
-        """Lowest and highest drawn point; the floor y = 0 is always within."""
+        """Heights of the lowest and the highest drawn point, extended to include the floor y = 0."""
         heights = np.concatenate(
             [stances.points[:, np.append(body.bones, body.pelvis), 1].ravel() for body, stances in self.actors]
         )
@@ -131,10 +132,10 @@ class _SheetCell:
 
     Parameters
     ----------
-    left, bottom, width : of its ground, inches
+    left, bottom, width : place and size of its background, inches
     centre : position of the floor under the pelvis, inches
     scale : inches per metre
-    ground : colour behind it
+    ground : colour of its background
     """
 
     left: float
@@ -169,7 +170,7 @@ def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
 
 
 def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
-    """Draw a title, then one cell per moment with both figures over their floor; places in inches."""
+    """Draw a title, then one cell per moment with both figures over their floor. `top` is in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
     scale = 0.80 * STAGE / max(high - low, 1e-6)
@@ -198,7 +199,7 @@ def _draw_titles(axes: Axes, row: _SheetRow, top: float) -> None:
 
 
 def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats | None, radius_m: float) -> None:
-    """Draw the ground, the floor line, the patch of floor under the figure and an arrow in its facing direction."""
+    """Draw the background, the floor line, the patch of floor under the figure and an arrow in its facing direction."""
     from matplotlib.patches import Ellipse, Rectangle
 
     size = (stage.width, STAGE)
@@ -213,7 +214,7 @@ def _draw_floor(axes: Axes, stage: _SheetCell, camera: Camera, facing: AnyFloats
 
 
 def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats, head_m: float) -> None:
-    """Draw bones from back to front, each with an edge in the ground's colour that separates it from those behind."""
+    """Draw bones from back to front, each with an edge in the background's colour that separates it from others."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Circle
 
@@ -239,5 +240,5 @@ def _draw_body(axes: Axes, stage: _SheetCell, body: StickFigure, seen: AnyFloats
 
 
 def _write(axes: Axes, place: tuple[float, float], text: str, size: float, colour: str = INK, **options: Any) -> None:
-    """Write text literally: dollar signs in a title are not mathematics."""
+    """Write text literally, without the mathematical notation that matplotlib reads between dollar signs."""
     axes.text(*place, text, fontsize=size, color=colour, parse_math=False, **options)

@@ -1,4 +1,4 @@
-"""Drawn figures: each as two pictures (PNG and SVG), with the numbers that were drawn."""
+"""Drawn figures: a PNG and an SVG of each, with the numbers that they show."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 Column = Any
 """A sequence or an array of numbers, texts or None."""
 Tables = Mapping[str, Mapping[str, Column]]
-"""Tables by name, each with columns of one length by name; a column's name ends with its unit."""
+"""Tables by name. A table has columns of equal length by name; the name of a column ends with its unit."""
 
 
 class Sketch(NamedTuple):
-    """Result of drawing a figure: the page, the numbers on it, and a description in one or two sentences."""
+    """Page with a figure, the numbers that it shows, and a description in one or two sentences."""
 
     figure: Figure
     tables: Tables
@@ -40,7 +40,7 @@ class DrawnFigure:
     name : name by which it is requested
     number : number in the paper, or "" for figures that the paper does not have
     caption : description of the figure, also for people who cannot see it
-    tables : what was drawn, see `Tables`
+    tables : the numbers that the figure shows, see `Tables`
     """
 
     name: str
@@ -53,7 +53,7 @@ class DrawnFigure:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The tables as a tree of dicts, lists, texts, numbers and None: not-a-number is None."""
+        """The tables as a tree of dicts, lists, texts, numbers and None, which replaces NaN."""
         tables = {
             name: {column: listed(values) for column, values in table.items()} for name, table in self.tables.items()
         }
@@ -66,7 +66,7 @@ class DrawnFigure:
         }
 
     def files(self) -> dict[str, bytes]:
-        """Make files by name: PNG, SVG, the data as JSON and one CSV per table."""
+        """Make the contents of all files by name: PNG, SVG, the data as JSON and one CSV per table."""
         files = {
             f"{self.name}.png": self.png,
             f"{self.name}.svg": self.svg.encode(),
@@ -78,7 +78,7 @@ class DrawnFigure:
 
 
 def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
-    """Draw a sketch to both formats."""
+    """Write a sketch as PNG and SVG, and return it as a figure."""
     return DrawnFigure(
         name=name,
         number=number,
@@ -91,7 +91,7 @@ def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
 
 
 def listed(values: Column) -> list[Any]:
-    """Convert a column to a list of plain values; None for not-a-number."""
+    """Convert a column to a list of plain values; None replaces NaN."""
     rows = values.tolist() if isinstance(values, np.ndarray) else [_plain(value) for value in values]
     return [None if isinstance(value, float) and not math.isfinite(value) else value for value in rows]
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from markupsafe import Markup, escape
 
 Html = Markup
-"""Text that is HTML already; only this module and constants make it."""
+"""Text that is HTML already; only functions of this module and constants have this type."""
 
 VOID = frozenset({"br", "hr", "img", "meta", "col"})
 # Not allowed in HTML, or reordering what follows: names of clips come from outside.
@@ -26,7 +26,8 @@ def text(value: str) -> Html:
 def element(tag: str, /, *content: Content, **attributes: str | None) -> Html:
     """Return an element.
 
-    Underscores within names of attributes become hyphens, one at the end is dropped; None omits the attribute.
+    In names of attributes, an underscore at the end is dropped, and others become hyphens. Attributes that are None are
+    omitted.
     """
     parts = [tag]
     for key, value in attributes.items():
@@ -37,7 +38,7 @@ def element(tag: str, /, *content: Content, **attributes: str | None) -> Html:
 
 
 def joined(content: Iterable[Content]) -> Html:
-    """Join pieces to HTML; None is omitted."""
+    """Join pieces of content to HTML; pieces that are None are omitted."""
     return Html().join(_rendered(piece) for piece in content if piece is not None)
 
 

@@ -73,7 +73,7 @@ def _section(section: Section) -> Html:
 
 
 def shown(figures: Mapping[str, DrawnFigure], *names: str) -> Html:
-    """Show the given figures that exist, by name."""
+    """Show the named figures, without those that do not exist."""
     return joined(_shown(figures[name], f"f{list(figures).index(name)}") for name in names if name in figures)
 
 
@@ -83,7 +83,7 @@ def _shown(figure: DrawnFigure, prefix: str) -> Html:
 
 
 def _inline(figure: DrawnFigure, prefix: str) -> Html:
-    """Embed a figure's SVG in a page: with the page's colours and font, and ids that are unique in the page."""
+    """Return a figure's SVG for use in a page: with the colours and font of the page, and ids that are unique there."""
     svg = _NEEDLESS.sub("", figure.svg)
     svg = _BLANKS.sub(" ", _STANDING.sub("", _FONTS.sub("", svg))).replace("xlink:href", "href")
     for colour, themed in _THEMED.items():

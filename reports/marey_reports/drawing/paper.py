@@ -1,7 +1,8 @@
 """Style that all figures share, and writing of figures as PNG and SVG.
 
-Only matplotlib's object interface is used, so threads may draw at once. Global settings of matplotlib are changed only
-while an SVG is written, because its SVG writer reads some settings from there; one figure is written at a time.
+Only matplotlib's object interface is used, so several threads can draw at the same time. Its global settings are
+changed only while an SVG is written, because the SVG writer of matplotlib reads some of them; one SVG is written at a
+time.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIDE = 2.7
-"""Inches of the side of a square panel."""
+"""Side of a square panel, in inches."""
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,7 +91,7 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
 def add_colour_bar(
     figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
 ) -> Axes:
-    """Draw a colour bar at a place, upright when it is higher than wide."""
+    """Draw a colour bar at a place: upright if the place is higher than wide, else horizontal."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
@@ -105,13 +106,13 @@ def add_colour_bar(
 
 
 def write(axes: Axes, place: tuple[float, float], text: str, **options: Any) -> None:
-    """Write text literally: dollar signs in a name are not mathematics."""
+    """Write text literally, without the mathematical notation that matplotlib reads between dollar signs."""
     look: dict[str, Any] = {"fontsize": SMALL, "color": INK, "parse_math": False, "va": "center", **options}
     axes.text(*place, plain(text), **look)
 
 
 def add_keys(axes: Axes, **options: Any) -> None:
-    """Draw a legend without a frame, with names as they are."""
+    """Draw a legend without a frame; dollar signs in names do not begin mathematical notation."""
     legend = axes.legend(frameon=False, fontsize=SMALL, **options)
     for text in legend.get_texts():
         text.set_color(INK)
@@ -119,7 +120,7 @@ def add_keys(axes: Axes, **options: Any) -> None:
 
 
 def name_ticks(axes: Axes, places: Sequence[float], names: Sequence[str], others: Sequence[str] = ()) -> None:
-    """Write names of clips along the vertical axis, and below them `others`, which are not clips."""
+    """Write the names of clips along the vertical axis, and after them `others`: names of rows that are not clips."""
     labels = [plain(label) for label in (*labels_of(names), *others)]
     axes.set_yticks(list(places), labels, parse_math=False)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
@@ -133,7 +134,7 @@ def tick_whole_numbers(axis: Axis) -> None:
 
 
 def plain(text: str) -> str:
-    """Put a name on one line, without characters that cannot be drawn or written to an SVG."""
+    """Return a name on one line, without characters that cannot be drawn or written to an SVG."""
     return "".join(sign if sign.isprintable() else "�" for sign in text)
 
 
@@ -187,9 +188,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis so that it contains all values, unless a few of them lie beyond twice the range of
-    interest.
-    """
+    """Choose the end of an axis, from `wanted` to 2 · `wanted`, so that the axis shows the values without outliers."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))
@@ -213,7 +212,7 @@ def warm_colours() -> Colormap:
 
 
 def square_root_ticks(ceiling: float) -> NDArray[np.float64]:
-    """Return ticks, from 0 to `ceiling`, for a colour bar whose colours depend on the square root of the value."""
+    """Return ticks from 0 to `ceiling` for a colour bar with a square-root scale."""
     return ceiling * np.array((0.0, 0.05, 0.25, 0.5, 1.0))
 
 

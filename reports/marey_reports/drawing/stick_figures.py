@@ -1,4 +1,4 @@
-"""Bodies drawn as lines: the bones to draw, the camera, and the order of depth."""
+"""Bodies drawn as lines: the choice of bones, the camera, and the drawing order by depth."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class StickFigure:
 
     Parameters
     ----------
-    bones : (n, 2) indices of the points at the outer and the inner end: joints, then end sites
+    bones : (n, 2) indices of the points at the outer and the inner end of each bone; joints come before end sites
     sides : (n,) LEFT, CENTRE or RIGHT
     pelvis : the joint that figures are centred on
-    head : bone along which the middle of the head is, and how far from its inner (0) to its outer (1) end; None
-        where no head is known
-    facing : joints of the left side and their partners of the right, which give the direction the body faces
+    head : bone on whose line the middle of the head is, and its position from the inner (0) to the outer (1) end; None
+        if no head is known
+    facing : joints of the left side and their partners of the right, from which the facing direction is computed
     """
 
     bones: Indices
@@ -63,7 +63,7 @@ class Stances:
     Parameters
     ----------
     points : (K, P, 3) positions over the floor, centred on the pelvis, metres
-    facing : (K, 2) unit (x, z) directions, None if the body does not show them
+    facing : (K, 2) unit (x, z) directions in which the body faces, None if its joints do not determine them
     """
 
     points: AnyFloats
@@ -71,7 +71,7 @@ class Stances:
 
 
 def body_of(skeleton: Skeleton) -> StickFigure:
-    """Choose the bones of a body, without roots on the floor, props and helpers; all bones if no pelvis is known."""
+    """Choose the bones of a body, without floor roots, props and helper joints; all bones if no pelvis is known."""
     mapping = map_joints(skeleton)
     standard = {skeleton.index_of(name): key for key, name in mapping.joints.items() if key != "root"}
     pelvis = next((joint for joint, key in standard.items() if key == "pelvis"), None)

@@ -1,7 +1,7 @@
 """Strips of small figures: motions at the same moments, one motion or one set of motions per row.
 
 All cells of a column show the same patch of the floor, so that differences between rows are visible in place. The lines
-of a body are joined to one shape per side, which keeps a drawing of a hundred bodies light.
+of a body are joined to one shape per side, which keeps the file of a drawing of a hundred bodies small.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class StripRow:
 
     Parameters
     ----------
-    label, note : to its left, the note in small letters below
+    label, note : texts to the left of the row; the note is below the label, in small letters
     bodies : (m, T, P, 3) points of m motions at T moments, metres, drawn on top of each other
     ways : (m, N, 3) paths of the root, drawn on the floor; N may be 0
     ghost : (T, P, 3) points of a motion to compare with, drawn in grey behind
@@ -55,7 +55,7 @@ class StripRow:
 
 
 class StripMoments(NamedTuple):
-    """The columns of a strip: x and z of the centre of each, (T, 2) in metres, and its title."""
+    """The columns of a strip: (T, 2) x and z of the centre of each column in metres, and the titles and labels."""
 
     middles: Floats
     names: Sequence[str]
@@ -104,7 +104,7 @@ def draw_strips(
 
 @dataclass(frozen=True)
 class _StripCell:
-    """A cell: its lower left corner and size in inches, and the point at its centre, at `scale` inches per metre."""
+    """A cell: lower left corner and size in inches, point of the motion at its centre, scale in inches per metre."""
 
     corner: tuple[float, float]
     size: tuple[float, float]
@@ -216,7 +216,7 @@ def _shapes(body: StickFigure, rows: Sequence[StripRow]) -> _Shapes:
 
 
 def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, look: _Look, frame: Rectangle) -> None:
-    """Draw bones at points (P, 3), each side as one shape, the far side before the near one."""
+    """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one."""
     from matplotlib.patches import Circle, PathPatch
 
     seen = stage.placed(points)
@@ -239,7 +239,7 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
 
 
 def _middles(bones: Floats) -> list[Floats]:
-    """Shorten bones (n, 2, 2) before the joints, where a rim would cut off the neighbouring bones."""
+    """Shorten bones (n, 2, 2) at both ends, where their rims would cover the neighbouring bones."""
     middle = bones.mean(axis=1, keepdims=True)
     length = np.linalg.norm(bones[:, 1] - bones[:, 0], axis=-1)[:, None, None]
     return list(middle + (bones - middle) * np.maximum(1.0 - 2.0 * RIM_STOPS / np.maximum(length, RIM_STOPS), 0.0))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from marey_reports.drawing.markup import Content, Html, element
 
 MOST_NAMES = 40
-"""Longer lists of names are folded away."""
+"""Greatest number of names that a list shows at once; longer lists are folded."""
 
 
 class Number(NamedTuple):
@@ -44,7 +44,7 @@ def table(
     Parameters
     ----------
     numbers : columns of numbers, which are aligned to the right
-    sortable : by a click on a column's head
+    sortable : whether a click on a column's head sorts the rows
     """
     look = dict.fromkeys(numbers, "number")
     head = element(

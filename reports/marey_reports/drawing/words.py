@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def span(low: float, high: float) -> str:
-    """Format a range of numbers, or the one number."""
+    """Format a range of numbers as text, or one number if both ends are equal."""
     return f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.4g} to {high:.4g}"
 
 

@@ -133,7 +133,7 @@ def unused_chapter(result: EvaluationResult) -> Section:
 
 
 def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
-    """Describe the data to record next."""
+    """Write the chapter on the data to record next."""
     holes = find_holes(result.coverage)
     if not holes:
         text = element("p", "Nothing: every speed and turn rate that the trials ask for has enough data.")
@@ -161,7 +161,7 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def baseline_chapter(result: EvaluationResult) -> Section:
-    """Compare the suite's numbers with those of generated clips that fill every cell."""
+    """Write the chapter that compares the suite's numbers with those of generated clips that fill every cell."""
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
     rows: list[Sequence[Cell]] = []
@@ -183,7 +183,7 @@ def baseline_chapter(result: EvaluationResult) -> Section:
 
 
 def appendix_chapter(result: EvaluationResult) -> Section:
-    """List every trial and every clip."""
+    """Write the appendix, which lists every trial and every clip."""
     trials = table("All trials", TRIAL_HEADS, map(_trial_row, result.trials), numbers=range(1, 7))
     clips = table(
         "All clips",

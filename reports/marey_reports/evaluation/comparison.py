@@ -29,7 +29,7 @@ LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 
 def compared(before: EvaluationResult, after: EvaluationResult) -> str:
-    """Say in one sentence whether the change helped."""
+    """Describe in one sentence whether the second evaluation is better than the first."""
     first, second = judge(before), judge(after)
     pairs = paired(before, after)
     gained = sum(is_followed(new) and not is_followed(old) for old, new in pairs)
@@ -48,7 +48,7 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
 
 
 def paired(before: EvaluationResult, after: EvaluationResult) -> list[tuple[TrialResult, TrialResult]]:
-    """Pair the trials that both evaluations have, in the order of the first."""
+    """Pair the trials that both evaluations have, in the order of the first evaluation."""
     known = {each.trial.name: each for each in after.trials}
     return [(each, known[each.trial.name]) for each in before.trials if each.trial.name in known]
 
@@ -109,7 +109,7 @@ def metric_chapter(
 def trial_chapter(
     before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None, figures: Figures
 ) -> Section:
-    """Write the chapter on changed trials, better and worse ones, the largest changes first."""
+    """Write the chapter on the trials that became better or worse, the largest changes first."""
     pairs = [(old, new) for old, new in paired(before, after) if old.metrics != new.metrics]
     pairs.sort(key=lambda pair: (-abs(_shift(*pair)), pair[0].trial.name))
     changed = sum(not each.same_motion for each in comparison.changed) if comparison is not None else len(pairs)
@@ -169,7 +169,7 @@ def _trial_row(old: TrialResult, new: TrialResult) -> list[Cell]:
 
 
 def _shift(old: TrialResult, new: TrialResult) -> float:
-    """Compute the change of the mean offset in metres; 0 if one of the two is not defined."""
+    """Compute the change of a trial's mean offset in metres; 0 if one of the two offsets is not defined."""
     first, second = old.metrics.get("offset_mean"), new.metrics.get("offset_mean")
     return 0.0 if first is None or second is None else second - first
 

@@ -47,7 +47,7 @@ def render_report(result: EvaluationResult, *, title: str, figures: Mapping[str,
     Parameters
     ----------
     title : heading of the page, for example the name of the dataset
-    figures : by name, as `draw_figures` gives them; drawn when None. Missing ones are left out
+    figures : figures by name, as returned by `draw_figures`; if None, they are drawn. Missing figures are left out
     """
     drawn = draw_figures(result) if figures is None else figures
     sections = [
@@ -79,8 +79,8 @@ def render_comparison(
     Parameters
     ----------
     comparison : comparison of both; adds confidence intervals, and marks the trials that differ in any tick
-    labels : names of both in figures and tables
-    figures : by name, as `draw_figures` gives them for two results; drawn when None
+    labels : names of both evaluations in figures and tables
+    figures : figures by name, as returned by `draw_figures` for two results; if None, they are drawn
     """
     drawn = draw_figures(before, other=after, labels=labels) if figures is None else figures
     sections = [

@@ -48,7 +48,7 @@ def _row(name: str, values: Sequence[str], *, code: bool) -> list[Cell]:
 
 
 def _flat(prefix: str, value: object) -> Iterator[tuple[str, str]]:
-    """Return options as text by dotted name."""
+    """Yield the dotted name of each option, and its value as text."""
     if isinstance(value, Options):
         for name, member in value:
             yield from _flat(f"{prefix}.{name}" if prefix else name, member)

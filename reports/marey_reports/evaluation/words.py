@@ -18,7 +18,7 @@ class CoverageGap(NamedTuple):
 
     Parameters
     ----------
-    turn_rates_deg_s, speeds_m_s : (low, high)
+    turn_rates_deg_s, speeds_m_s : lowest and highest value
     missing_s : seconds of data missing in total
     """
 
@@ -33,10 +33,10 @@ class CoverageGap(NamedTuple):
 
 
 def find_holes(coverage: Coverage) -> list[CoverageGap]:
-    """Combine the missing cells into few rectangles, the largest deficit first.
+    """Combine the cells without enough data into few rectangles, the largest deficit first.
 
-    Cells of one side (left, straight on, right) are joined along the turn rate; equal runs are then joined along the
-    speed. A rectangle is described by the centres of its outermost cells, which are trials.
+    First, neighbouring cells of one side (left, straight on, right) are joined along the turn rate; then, equal runs of
+    cells are joined along the speed. A rectangle is described by the centres of its outermost cells, which are trials.
     """
     lacking = coverage.deficit_s > 0.0
     speeds, turns = (_centres(edges) for edges in (coverage.speed_edges_m_s, coverage.turn_rate_edges_deg_s))
@@ -74,7 +74,7 @@ def _centres(edges: Floats) -> Floats:
 
 
 def _runs(lacking: NDArray[np.bool_], sides: Floats) -> list[tuple[int, int]]:
-    """Find the first and last cell of each run of cells without data on one side."""
+    """Find the first and last cell of each run of cells that lack data, on one side."""
     runs: list[tuple[int, int]] = []
     for column in np.flatnonzero(lacking).tolist():
         if runs and runs[-1][1] == column - 1 and sides[column] == sides[column - 1]:

@@ -170,6 +170,6 @@ def making_chapter(subject: ModelSubject, figures: Figures) -> Section:
 
 
 def numbers_chapter(figures: Figures) -> Section:
-    """Write the chapter on the variance that the model keeps, and its cost."""
+    """Write the chapter on the size of the model: variance, errors of reconstruction, latent space and mixture."""
     pictures = shown(figures, "variance", "reconstruction", "latent-space", "mixture")
     return Section("numbers", "How much it keeps", pictures)

@@ -41,7 +41,7 @@ def render_model_report(
     Parameters
     ----------
     subject : the same model with its examples
-    figures : by name, as `draw_alignment_figures` and `draw_model_figures` give them. Missing ones are left out
+    figures : figures by name, as returned by `draw_alignment_figures` and `draw_model_figures`; some may be missing
     title : heading of the page, for example the name of the model
     origin : origin of the examples, from the part `model`
     """

@@ -103,7 +103,7 @@ class Entry(Answer):
 
 
 class Origin(Answer):
-    """Commit that gave an entry one of its parts."""
+    """Commit that last changed a part, the tags or the path of an entry."""
 
     commit: Commit
     path: str = Field(description="Path of the entry in that commit; it may have been moved since.")
@@ -111,7 +111,7 @@ class Origin(Answer):
 
 
 class EntryOrigins(Answer):
-    """Origins of the content of an entry."""
+    """Origins of the content, the tags and the path of an entry."""
 
     path: str
     kind: Kind

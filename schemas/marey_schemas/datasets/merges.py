@@ -18,7 +18,7 @@ MOST_CONFLICTS = 1000
 
 
 class Side(StrEnum):
-    """Version that a resolution takes: that of the branch, that of the version merged into it, or their base."""
+    """Side that wins a conflict: the branch, the version that is merged into it, or the common base of both."""
 
     OURS = "ours"
     THEIRS = "theirs"
@@ -34,7 +34,7 @@ class Resolution(Request):
 
 
 class CombineRequest(Request):
-    """Request to change a branch by what other commits have changed."""
+    """Request to apply or undo the changes of other commits on a branch."""
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
@@ -53,7 +53,7 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to repeat or undo on a branch what one commit has changed."""
+    """Request to repeat or undo the changes of one commit on a branch."""
 
     version: Version = Field(description="Commit whose changes are repeated or undone.")
     parent: Literal[1, 2] | None = Field(
@@ -64,7 +64,7 @@ class PickRequest(CombineRequest):
 
 
 class EntryConflict(Answer):
-    """Entry that both sides have changed in ways that exclude each other."""
+    """Entry that both sides have changed in ways that cannot be combined."""
 
     path: str
     kind: Kind
@@ -78,7 +78,7 @@ class EntryConflict(Answer):
 
 
 class MergeAnswer(Answer):
-    """Result of a merge, of repeated or undone changes, or of a preview of these."""
+    """Result of a merge, cherry-pick or revert, or of the preview of one."""
 
     commit: Commit | None = Field(description="New commit of the branch; null for a preview and for conflicts.")
     base: str | None = Field(description="Digest of the commit with which both sides are compared.")
@@ -92,7 +92,7 @@ class MergeAnswer(Answer):
 
 
 class CheckoutRequest(Request):
-    """Request to give the folder of a dataset the entries of a version."""
+    """Request to bring the folder of a dataset to the state of a version."""
 
     version: Version = MAIN
     discard: bool = Field(False, description="Discard changes in the folder that no commit has recorded.")

@@ -1,10 +1,10 @@
-"""States of proposals and of their checks, and verdicts of reviews; commands load them without pydantic."""
+"""States of proposals and checks, and verdicts of reviews; commands can load this module without pydantic."""
 
 from enum import StrEnum
 
 
 class ProposalState(StrEnum):
-    """State of a proposal; merged and closed ones never change again."""
+    """State of a proposal; merged and closed proposals never change their state again."""
 
     OPEN = "open"
     MERGED = "merged"

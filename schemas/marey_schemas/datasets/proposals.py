@@ -70,7 +70,7 @@ class ReviewCreate(Request):
 
 
 class CheckReport(Request):
-    """Report of the state of a check of the newest commit of a proposal; it replaces the report before."""
+    """Report of the state of a check of a proposal's newest commit; it replaces the previous report of this check."""
 
     name: CheckName
     state: CheckState
@@ -180,7 +180,7 @@ class Missing(Answer):
 
 
 class Mergeability(Answer):
-    """Result that the merge of a proposal would have now."""
+    """Result that a merge of the proposal would have at the moment."""
 
     missing: tuple[Missing, ...] = Field(description="Reasons for which it cannot be merged yet; empty: it is green.")
     changes: int | None = Field(

@@ -17,9 +17,9 @@ CheckName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9](?:[a-z0-9._-]{0
 
 
 class ProtectionRule(Request):
-    """Rule of a branch: who may move it, and what a proposal needs before it is merged into the branch.
+    """Rule of a protected branch: the users who may move it, and the conditions for merging a proposal into it.
 
-    A branch with a rule cannot be deleted, and moves only to commits that follow its newest one.
+    A branch with a rule cannot be deleted, and moves only to descendants of its newest commit.
     """
 
     role: Role = Field(Role.CONTRIBUTOR, description="Least role of a user who may move the branch.")

@@ -25,7 +25,7 @@ class ExampleRef(Request):
 
 
 class AlignedPlacement(Request):
-    """Place of the body in the first frame of the source; a point p was at R(heading) p + (x, y, z)."""
+    """Place of the body in the first frame of the source: a canonical point p was at R(heading) p + (x, y, z) there."""
 
     heading_rad: Metres = 0.0
     x: Metres = 0.0

@@ -1,7 +1,7 @@
 """Differences between two revisions, in terms of motion, annotations, skeletons, models and fields.
 
-Pairs have the value before and the value after. Ranges of frames are half open. Frames are those of the revision after,
-unless a description names the other revision.
+`before` and `after` are the two revisions; a pair contains the value in each of them. Ranges of frames are half open.
+Frames are counted in the revision `after`, unless a description names the other revision.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MatchedFloats = Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)]
 
 
 class DifferenceOptions(Options):
-    """Options of a difference: which changes of motion have their times listed."""
+    """Options of a difference: the sizes of changes of motion above which their times are listed."""
 
     threshold_deg: float = Field(
         1.0,
@@ -66,7 +66,7 @@ class ComparedRevision(Answer):
 
 
 class FrameRun(Answer):
-    """Frames that correspond to each other, or that only one revision has."""
+    """Run of frames that correspond to each other in both revisions, or that only one revision has."""
 
     change: Literal["matched", "removed", "inserted"]
     before: Range = Field(description="Range of frames before; empty for inserted frames.")
@@ -182,7 +182,7 @@ class AnnotationDifference(Answer):
 
 
 class MappedJoint(Answer):
-    """Joint of a skeleton that stands for a standard joint, before and after."""
+    """Joint of a skeleton that is mapped to a standard joint, before and after."""
 
     standard: str
     before: str | None = None
@@ -208,7 +208,7 @@ class ModelDifference(Answer):
 
 
 class FieldChange(Answer):
-    """Change of a value in a document that no other member of the difference describes."""
+    """Change of a value in a document; only changes that no other member of the difference describes are listed."""
 
     part: str
     pointer: str = Field(description="JSON pointer of the value in the document of the part.")

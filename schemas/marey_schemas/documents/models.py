@@ -19,7 +19,7 @@ MOST_JOINTS = 4096
 MOST_KEYFRAMES = 1000
 MOST_CANONICAL_FRAMES = 10_000
 MOST_BASIS_NUMBERS = 20_000_000
-"""Greatest product of the numbers of canonical frames and spline coefficients: the size of a matrix kept in memory."""
+"""Greatest size of the matrix of basis functions kept in memory: canonical frames times spline coefficients."""
 MOST_SAMPLES = 1000
 MOST_SEED = 2**63 - 1
 Vector = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=1)]
@@ -28,7 +28,7 @@ Stack = Annotated[NDArray[np.float64], ArrayOf("<f8", ndim=3)]
 
 
 class FunctionalComponentsDocument(Request):
-    """Functions of canonical time with D channels: a mean and k principal functions in n B-spline coefficients."""
+    """Functions of canonical time with D channels: a mean and k principal components in n B-spline coefficients."""
 
     degree: int = Field(3, ge=0, le=9)
     knots: Vector = Field(description="[n + degree + 1] knots of the splines, in canonical frames.")
@@ -90,9 +90,7 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Base class of records about the training of a model; members that a record does not declare are allowed and
-    ignored.
-    """
+    """Base class of records about the training of a model; undeclared members are allowed and ignored."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -198,7 +196,7 @@ class MotionPrimitiveDocument(Request):
 
 
 def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
-    """Return a validated part `model` without its notes, whose form differs in older documents."""
+    """Validate a part `model` and return it without provenance and training, whose form differs in older documents."""
     return MotionPrimitiveDocument.model_validate({**part, "provenance": {}, "training": None})
 
 

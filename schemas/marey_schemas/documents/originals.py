@@ -18,7 +18,7 @@ CONTENT = {
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""Members of a part that come from its file."""
+"""Names of the members of each part whose values come from the imported file."""
 
 
 class StoredOriginal(Request):

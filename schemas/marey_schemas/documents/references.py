@@ -23,8 +23,9 @@ class OutputRef(Request):
 
 
 class PartDigestRef(Request):
-    """Placeholder for the digest of the part `model` that the same write stores for the same item; the store replaces
-    it by the digest.
+    """Placeholder for the digest of the part `model` that the same request stores for the same item.
+
+    The store replaces it by the digest.
     """
 
     digest_of: Literal["model"]

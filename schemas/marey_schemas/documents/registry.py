@@ -22,7 +22,7 @@ from marey_schemas.editing.edits import EditDocument
 
 
 class OpenDocument(Request):
-    """Document of a kind without a fixed schema: any content under `body`."""
+    """Document without a fixed schema: it may have any members besides `schema`."""
 
     model_config = ConfigDict(extra="allow")
 

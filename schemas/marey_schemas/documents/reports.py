@@ -23,7 +23,7 @@ class StoredFile(Request):
 
 
 class StoredFigure(Request):
-    """Figure in each of its forms: image, vector drawing, and its data as one JSON and as CSV tables."""
+    """Figure in all its formats: image, vector drawing, and its data as one JSON file and as CSV tables."""
 
     name: FigureName
     number: str = Field("", description="The corresponding figure of the publication.")

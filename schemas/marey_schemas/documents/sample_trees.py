@@ -16,10 +16,10 @@ from marey_schemas.options.modelling import MOST_TREE_SAMPLES, TreeOptions
 
 
 class SampleTreeDocument(Request):
-    """Part `tree` of a model: samples of it, grouped by recursive k-means.
+    """Part `tree` of a model: samples of the model, grouped by recursive k-means.
 
-    Nodes are stored level by level from the root; the children of a node are adjacent, and each holds a contiguous part
-    of its samples. A node without children is a leaf.
+    Nodes are stored level by level from the root; the children of a node are adjacent, and each child has a contiguous
+    range of its parent's samples. A node without children is a leaf.
     """
 
     schema_: Literal["marey/sample-tree@1"] = Field("marey/sample-tree@1", alias="schema")

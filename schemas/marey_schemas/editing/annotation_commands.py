@@ -1,4 +1,4 @@
-"""Commands that change an annotation, and imports of annotations in the forms of the predecessor."""
+"""Commands that change an annotation, and requests to import annotations in the forms of Marey's predecessor."""
 
 from __future__ import annotations
 

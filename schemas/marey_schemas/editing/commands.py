@@ -177,7 +177,7 @@ class MoveToOrigin(NamedCommand):
 
 
 class Scale(NamedCommand):
-    """Scale the path of the body, including its heights. The skeleton is an item of its own and keeps its size."""
+    """Scale the path of the body, including its heights. The skeleton is another item and does not change."""
 
     command: Literal["scale"] = "scale"
     factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="Scale factor, about the origin.")
@@ -221,7 +221,7 @@ class FixDrift(NamedCommand):
 
 
 class MoveToGround(NamedCommand):
-    """Bring the ground to height zero."""
+    """Shift the whole motion vertically so that the ground is at height zero."""
 
     command: Literal["move_to_ground"] = "move_to_ground"
     height_m: Metres | None = Field(
@@ -231,13 +231,13 @@ class MoveToGround(NamedCommand):
 
 
 class FindGround(NamedCommand):
-    """Estimate the height of the ground from feet in contact with it; changes nothing."""
+    """Estimate the height of the ground from feet in contact with it; the motion does not change."""
 
     command: Literal["find_ground"] = "find_ground"
 
 
 class FindContacts(NamedCommand, ContactOptions):
-    """Find the frames in which feet are in contact with the ground; changes nothing."""
+    """Find the frames in which feet are in contact with the ground; the motion does not change."""
 
     command: Literal["find_contacts"] = "find_contacts"
     height_limit_m: float | None = Field(
@@ -259,7 +259,7 @@ class Mirror(NamedCommand):
 
 
 class Smooth(NamedCommand):
-    """Smooth rotations and translations over time; the first and last frame stay."""
+    """Smooth rotations and translations over time; the first and last frame do not change."""
 
     command: Literal["smooth"] = "smooth"
     method: Literal["savitzky_golay", "gaussian"] = Field(
@@ -332,4 +332,4 @@ MotionCommand = (
     | RotateJoint
     | Paste
 )
-"""Every command of this module, in the order of the documentation."""
+"""Every command of this module, in the order of the reference page."""

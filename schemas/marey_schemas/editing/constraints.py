@@ -170,7 +170,7 @@ class FootContact(Request):
 
 
 class PlantOptions(Options):
-    """Detection of the contacts of feet, and the blending around them."""
+    """Options for the detection of contacts of the feet, and for the blending before and after them."""
 
     speed_m_s: float = Field(
         TOE_SPEED_M_S,
@@ -203,4 +203,4 @@ class PlantFeet(NamedCommand, PlantOptions):
 
 
 ConstraintCommand = Constrain | PlantFeet
-"""Every command of this module, in the order of the documentation."""
+"""Every command of this module, in the order of the reference page."""

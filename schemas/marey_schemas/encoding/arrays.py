@@ -47,7 +47,7 @@ class EncodedArray:
     shape: tuple[int, ...]
     data: bytes
     decoded: NDArray[Any] | None = field(default=None, compare=False, repr=False)
-    """The array, if it was decoded and checked before."""
+    """The decoded array, if it was already decoded and checked."""
 
     @classmethod
     def of(cls, array: NDArray[Any], *, predict: bool = True) -> "EncodedArray":
@@ -83,9 +83,9 @@ def is_leaf(value: Mapping[str, Any]) -> bool:
 
 
 def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES) -> NDArray[Any]:
-    """Return the array of a leaf in any of its three forms; writable, C-contiguous, finite.
+    """Return the array of a leaf in any of its three forms; the array is writable, C-contiguous and finite.
 
-    Raises `ArrayError` if data does not match dtype and shape, and before allocating more than `max_bytes`.
+    Raises `ArrayError` if the data does not match dtype and shape, or if the array needs more than `max_bytes`.
     """
     unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
     if unknown:
@@ -105,7 +105,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
 
 
 def with_blocks(leaf: Mapping[str, Any], array: NDArray[Any]) -> NDArray[Any] | EncodedArray:
-    """Return the decoded array of a leaf, together with the leaf's bytes if these may be stored as they are."""
+    """Return the array of a leaf, as an `EncodedArray` with the leaf's bytes if these may be stored as they are."""
     if "encoding" in leaf and blocks.is_well_packed(leaf["data"]):
         return EncodedArray(array.dtype.str, array.shape, leaf["data"], array)
     return array
@@ -127,7 +127,7 @@ def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:
 
 
 def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
-    """Return the array of nested lists, checked level by level: numpy would truncate and cast silently."""
+    """Return the array of nested lists, after a check of each level, because numpy would truncate and cast silently."""
     level: list[Any] = [data]
     for axis, size in enumerate(spec.shape):
         for item in level:

@@ -1,4 +1,4 @@
-"""Block codec: an array as compressed tiles of frames and columns, lossless, readable in parts.
+"""Lossless block codec, which stores an array as compressed tiles of frames and columns that can be read separately.
 
 The first axis counts frames; all others together are columns. docs/reference/block-format.md describes the layout.
 """
@@ -81,8 +81,8 @@ class _Layout:
 def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
     """Encode an array of any shape and allowed dtype; the same array always gives the same bytes.
 
-    Without `predict`, tiles are uncompressed and take hardly more time than copying: for bytes that are read once.
-    Raises `ArrayError` for a dtype or shape that is not allowed.
+    Without `predict`, tiles are not compressed: this takes hardly more time than copying, and is meant for bytes that
+    are read once. Raises `ArrayError` for a dtype or shape that is not allowed.
     """
     array = little_endian(array)
     layout = _layout_of(ArraySpec.of(array))
@@ -92,7 +92,7 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 def is_well_packed(data: bytes) -> bool:
     """Return whether valid bytes may be stored instead of the bytes that `encode` would produce for the same array.
 
-    Their layout is the one of `encode`, every tile is predicted, and all together are not larger than the plain array.
+    They may if their layout is that of `encode`, every tile is predicted, and they are not larger than the plain array.
     """
     layout, starts = _read_head(data)
     return (
@@ -108,7 +108,7 @@ def _layout_of(spec: ArraySpec) -> _Layout:
 
 
 def cut_frames(data: bytes, start: int, stop: int) -> bytes:
-    """Return frames `start` to `stop` of an encoded array, encoded.
+    """Return frames `start` to `stop` of an encoded array as another encoded array.
 
     If `start` is the start of a block, whole blocks are copied as they are. All others are decoded and written
     uncompressed. Raises `BlockError`.
@@ -232,7 +232,7 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Yield the index of each block with some of the rows, and their indices in the result and in the block.
+    """Yield the index of each block with some of the rows, and the indices of these in the result and in the block.
 
     `rows` are in ascending order.
     """
@@ -249,7 +249,7 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Yield the index of each group with some of the columns, and their indices in the result and in the group."""
+    """Yield the index of each group with some of the columns, and the indices of these in the result and the group."""
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)
@@ -261,7 +261,7 @@ def _columns_by_group(
 
 
 def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return the indices counted from zero. Raises `IndexError`."""
+    """Return `columns` as indices of at least zero, as negative ones count from the end. Raises `IndexError`."""
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
         raise IndexError("columns must be a one-dimensional list of integers")

@@ -31,9 +31,9 @@ MAX_VALUES = 1 << 21
 FREE_LISTS = 1 << 17
 """Number of objects and lists that a document of any size may contain; larger documents may contain more."""
 BYTES_PER_LIST = 6
-"""Least size in bytes of an object or a list, on average: one takes 70 bytes of memory, and `[0,0],` six in JSON."""
+"""Least average size in bytes of an object or a list in a large document; each takes 70 bytes of memory."""
 BSON_COPIES = 8
-"""Greatest ratio of the bytes that reading BSON copies, once for each level, to those of the document."""
+"""Greatest number of bytes copied per byte of a BSON document; reading it copies nested objects once for each level."""
 
 ArrayForm = Literal["plain", "blocks"]
 
@@ -96,10 +96,10 @@ def decode_tree(
 ) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
-    With `keep_blocks`, arrays that are encoded as by `encode_tree` become `EncodedArray`, after a check that they can
-    be decoded. `max_bytes` limits the bytes of the input, and `max_array_bytes` those of all arrays together; without
-    it, they have the same limit as the input. `take_bytes` is called with the size of each array before it is decoded,
-    and may raise an error of its own. The number of values is limited, too. Raises `CodecError`.
+    With `keep_blocks`, arrays in the block encoding of `encode_tree` become `EncodedArray`, after a check that they can
+    be decoded. `max_bytes` limits the size of the input, and `max_array_bytes` the size of all arrays together, by
+    default to `max_bytes`. `take_bytes` is called with the size of each array before it is decoded, and may raise an
+    error of its own. The number of values is limited, too. Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:
@@ -185,7 +185,7 @@ def _parse_json(data: bytes) -> Any:
 
 
 def _count_brackets(data: bytes) -> int:
-    """Return the number of objects and lists in JSON: of opening brackets outside of strings."""
+    """Return the number of objects and lists in JSON, which is the number of opening brackets outside of strings."""
     count, start, inside = 0, 0, False
     while start < len(data):
         piece = data[start : start + _PIECE_BYTES]
@@ -264,7 +264,7 @@ _FOREIGN = (bson.Code, msgpack.ExtType)
 class _Walk:
     """Traversal of a tree that checks every value and converts every array, in either direction.
 
-    With `on_array` it turns arrays into leaves; without, it turns leaves into arrays.
+    With `on_array` it turns arrays into leaves; without it, leaves into arrays.
     """
 
     def __init__(

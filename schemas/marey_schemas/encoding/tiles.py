@@ -1,4 +1,4 @@
-"""Tiles of the block codec: some frames of some columns as one zstd frame, lossless.
+"""Tiles of the block codec: some frames of some columns of an array, as one losslessly compressed zstd frame.
 
 Compression is based on integer prediction, which is exact: float bits become integers in the order of the numbers, each
 column is differenced up to three times, and the largest component of a unit quaternion is predicted from the other
@@ -28,8 +28,8 @@ class TileError(ValueError):
 def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
-    `lead` is the number of columns before the first quaternion, None if there are no quaternions. Of the predicting
-    forms, the first that decodes to the same bits is used, unless the plain bytes compress better.
+    `lead` is the number of columns before the first quaternion, None if there are no quaternions. The tile gets the
+    first predicting form that decodes to the same bits, unless the plain bytes compress better.
     """
     plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
     packed = _compress([np.array([RAW], np.uint8), plain])
@@ -66,7 +66,7 @@ def form_of(data: bytes) -> int:
 
 
 def _compress(sections: list[Bytes], level: int = 1) -> bytes:
-    """Return one zstd frame in which every section ends a block, so that each has its own entropy tables."""
+    """Return one zstd frame in which every section ends a block, so that each section has its own entropy tables."""
     size = sum(section.size for section in sections)
     stream = zstandard.ZstdCompressor(level=level, write_checksum=True).compressobj(size=size)
     parts = []
@@ -119,7 +119,7 @@ class _Sections:
 
 
 def _to_integers(channels: NDArray[Any]) -> Integers:
-    """Return the values as unsigned integers; interpreted as signed, those of floats sort like the floats."""
+    """Return the values as unsigned integers; the integers of floats, read as signed ones, sort like the floats."""
     bits = channels.view(f"<u{channels.dtype.itemsize}")
     return _order(bits) if channels.dtype.kind == "f" else bits
 
@@ -152,7 +152,10 @@ def _unfold_sign(folded: Integers) -> Integers:
 
 
 def _difference(channels: Integers) -> list[Bytes]:
-    """Return the difference order of each channel (one byte), then the differences' byte planes, lowest byte first."""
+    """Difference each channel by the order that needs the fewest bits.
+
+    Returns the order of each channel (one byte), then the byte planes of the differences, lowest byte first.
+    """
     best = _fold_sign(channels)
     cost = _bits_needed(best)
     orders = np.zeros(len(channels), np.uint8)
@@ -167,7 +170,7 @@ def _difference(channels: Integers) -> list[Bytes]:
 
 
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
-    """Return an estimate that grows with the sum of log2 of each channel's numbers.
+    """Return an estimate of the bits that each channel needs; it grows with the sum of log2 of the channel's numbers.
 
     The bits of a float, read as an integer, grow almost linearly with its logarithm."""
     logarithms = (folded | 1).astype(np.float32).view(np.int32)

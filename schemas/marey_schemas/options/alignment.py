@@ -19,7 +19,7 @@ _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 
 
 class CostOptions(Options):
-    """Comparison of poses: the cost of a pair."""
+    """Options of the cost of a pair of poses."""
 
     cost: CostMethod = Field(
         "turned",
@@ -37,7 +37,7 @@ class CostOptions(Options):
 
 
 class AlignOptions(CostOptions):
-    """Alignment of the examples of an action."""
+    """Options of the alignment of the examples of an action."""
 
     reference: Annotated[str, StringConstraints(min_length=1, max_length=64)] = Field(
         MEDOID,

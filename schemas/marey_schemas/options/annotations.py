@@ -15,11 +15,11 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Share of the farthest reach above which a hand counts as reaching."""
+"""Distance of a hand from its rest position, as a share of its farthest reach, above which it counts as reaching."""
 
 
 class ContactOptions(Options):
-    """Detection of the contacts of a foot with the ground."""
+    """Options for detecting the contacts of a foot with the ground."""
 
     speed_m_s: float = Field(
         STANCE_SPEED_M_S,

@@ -14,9 +14,9 @@ Speed = Annotated[float, Field(gt=0, le=20, allow_inf_nan=False)]
 TurnRate = Annotated[float, Field(ge=-720, le=720, allow_inf_nan=False)]
 
 LEAST_FRAME_RATE_HZ, MOST_FRAME_RATE_HZ = 10.0, 240.0
-"""Frame rates at which coverage is measured while a performer records."""
+"""Least and greatest frame rate at which coverage is measured during a recording."""
 MOST_CELLS = 2000
-"""Greatest number of cells of a grid whose coverage is measured while a performer records."""
+"""Greatest number of cells of a grid whose coverage is measured during a recording."""
 COVERAGE_LEAST_S = 1.0
 """Default number of seconds of data that a cell needs to count as covered."""
 TARGET_PATH_S = 4.0

@@ -32,7 +32,7 @@ class ObjectiveChoice(Options):
 
 
 class SuggestionOptions(ObjectiveChoice):
-    """Suggestions to look for."""
+    """Options that select the suggestions to compute."""
 
     removals: int = Field(
         10,

@@ -10,16 +10,16 @@ from marey_schemas.names import JointName
 CANDIDATES = 8
 """Number of nodes of the tree that a search follows at each level, by default.
 
-The published number is 4; with 8 the result is a sixth nearer, for a millisecond more.
+The published number is 4. With 8, the error of the result is a sixth smaller, and a search takes a millisecond more.
 """
 PASSES = 2
-"""Number of passes of a search, by default: the tree's samples, then samples near the best of them."""
+"""Default number of passes of a search: one over the tree's samples, then one over samples near the best of these."""
 
 TRANSITION_TOLERANCE_M = 0.02
 
 
 class RefineOptions(Options):
-    """Refinement of the best sample of a search by numerical optimisation."""
+    """Options for refining the best sample of a search by numerical optimisation."""
 
     likelihood_weight: float = Field(
         1.0,
@@ -33,7 +33,7 @@ class RefineOptions(Options):
 
 
 class TransitionOptions(Options):
-    """Continuity between two motions of a sequence."""
+    """Options for the continuity between two motions of a sequence."""
 
     joints: tuple[JointName, ...] = Field(
         ("left_wrist", "right_wrist", "left_ankle", "right_ankle"),

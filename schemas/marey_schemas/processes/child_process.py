@@ -24,7 +24,7 @@ from marey_schemas.processes.limits import die_with_parent, resident_bytes
 READY = b"ready"
 """First message of a child, after it has loaded its modules."""
 READY_S = 300.0
-"""Longest wait in seconds for that message; after an installation, loading may include compiling."""
+"""Longest wait in seconds for `READY`; after an installation, the child may have to compile its modules first."""
 TERMINATE_S = 10.0
 MOST_MESSAGE_BYTES = 1 << 30
 
@@ -98,7 +98,7 @@ class ChildProcess:
                 return
 
     def receive(self, timeout_s: float | None = None) -> bytes | None:
-        """Return the next message, or None if none came in time; without a time, wait for it.
+        """Return the next message, or None if there is none within `timeout_s`; without a timeout, wait for it.
 
         Raises `EOFError` if the child has died, and `OSError` if the message is too long.
         """
@@ -123,7 +123,7 @@ class ChildProcess:
         self._close()
 
     def _close(self) -> None:
-        """Close the pipe, but not while another thread sends: the number of its descriptor may be reused at once."""
+        """Close the pipe, but not while another thread sends: a new file could get the pipe's descriptor at once."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)  # ends a `send` that waits for room
         with self._sending:

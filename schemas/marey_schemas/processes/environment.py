@@ -17,7 +17,7 @@ PASSED_ON = frozenset(
         "SYSTEMROOT", "TEMP", "TMP", "TMPDIR", "TZ", "VIRTUAL_ENV", "XDG_CACHE_HOME",
     }
 )  # fmt: skip
-"""Variables that are passed on: where programs, caches, temporary files and certificates are, and the language."""
+"""Variables that are passed on: the places of programs, caches, temporary files and certificates, and the language."""
 PASSED_ON_PREFIXES = ("CUDA_", "KMP_", "LC_", "MKL_", "NUMBA_", "OMP_", "OPENBLAS_", "PYTHON")
 """Prefixes of further variables that are passed on: settings of the interpreter and of numeric libraries."""
 EXTRA_VARIABLE = "MAREY_CHILD_VARIABLES"
@@ -31,7 +31,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 def clean_environment(source: Mapping[str, str] | None = None, *, threads: int | None = None) -> dict[str, str]:
     """Return the variables of `source` (default: of this process) that child processes get.
 
-    `threads` limits the threads of numeric libraries where `source` does not.
+    `threads` limits the threads of those numeric libraries for which `source` sets no limit.
     """
     source = os.environ if source is None else source
     extra = {name.strip() for name in source.get(EXTRA_VARIABLE, "").split(",")}

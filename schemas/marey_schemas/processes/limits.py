@@ -33,7 +33,7 @@ def allow_memory(limit_bytes: int | None) -> None:
     """Limit the memory that this process may allocate to `limit_bytes` more than now; without a number, remove the
     limit.
 
-    An allocation beyond that raises `MemoryError` at once, before the machine runs out of memory.
+    An allocation beyond the limit raises `MemoryError` at once, before the machine runs out of memory.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     soft = resource.RLIM_INFINITY if limit_bytes is None else psutil.Process().memory_info().vms + limit_bytes

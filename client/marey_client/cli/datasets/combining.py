@@ -1,4 +1,4 @@
-"""Dataset commands that change a branch by what other commits have changed: merge, cherry-pick and revert."""
+"""Dataset commands that apply or undo the changes of other commits on a branch: merge, cherry-pick and revert."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def merge(
     """Merge a version into a branch. Changes of different parts of one entry are combined.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base. In that case, the exit status is 1.
+    --ours, --theirs or --base. The exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
     resolutions = resolutions_of(ours, theirs, base)
@@ -83,10 +83,10 @@ def cherry_pick(
     base: Base = None,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat on a branch what one commit has changed.
+    """Repeat the changes of one commit on a branch.
 
     If the branch has changed the same part of an entry, nothing is recorded until each such conflict is decided by
-    --ours, --theirs or --base. In that case, the exit status is 1.
+    --ours, --theirs or --base. The exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
     options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
@@ -105,11 +105,11 @@ def revert(
     base: Base = None,
     as_json: AsJson = False,
 ) -> None:
-    """Undo on a branch what one commit has changed. Later changes stay.
+    """Undo the changes of one commit on a branch. Later changes stay.
 
     If a later commit has changed the same part of an entry, nothing is recorded until each such conflict is decided by
-    --ours (the present content), --theirs (the content before the commit) or --base (the content of the commit). In
-    that case, the exit status is 1.
+    --ours (the present content), --theirs (the content before the commit) or --base (the content of the commit). The
+    exit status is 1 while a conflict is left.
     """
     at = parse(place, version=True)
     options = _pick_options(into, parent, message, preview, resolutions_of(ours, theirs, base))
@@ -140,7 +140,7 @@ def _combine(
 
 @contextmanager
 def conflicts_printed(*, into: str, as_json: bool) -> Iterator[None]:
-    """Print the conflicts because of which the server refuses a merge in the block, and exit with 1."""
+    """If the server refuses a merge inside the block because of conflicts, print the conflicts and exit with 1."""
     from marey_client.errors import Conflict
     from marey_schemas.datasets.merges import MergeAnswer
 
@@ -163,7 +163,7 @@ def _print(found: MergeAnswer, into: str, *, as_json: bool) -> None:
 def resolutions_of(
     ours: Sequence[str] | None, theirs: Sequence[str] | None, base: Sequence[str] | None
 ) -> list[Resolution]:
-    """Return the decisions of conflicts that the options --ours, --theirs and --base name."""
+    """Return the decisions of conflicts that are given by the options --ours, --theirs and --base."""
     from marey_schemas.datasets.merges import Resolution, Side
 
     found = []

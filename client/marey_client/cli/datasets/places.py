@@ -1,4 +1,4 @@
-"""Arguments of the dataset commands that name datasets and versions."""
+"""Command-line arguments that name datasets and their versions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class NamedVersion(NamedTuple):
 
 
 def parse(text: str, *, version: bool = False) -> NamedVersion:
-    """Read an argument. Raises `WrongUsage` for a version if the command takes none."""
+    """Parse an argument. Raises `WrongUsage` if it names a version although the command takes none."""
     place, at, named = text.partition("@")
     project, _, name = place.strip("/").partition("/")
     if not project or not name or "/" in name or (at and not named):

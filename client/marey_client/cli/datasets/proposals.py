@@ -1,4 +1,4 @@
-"""Commands `proposal`: changes of a branch that others review; and commands that protect branches."""
+"""Commands `proposal`, for changes that are reviewed before they are merged, and commands that protect branches."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def show(context: typer.Context, place: DatasetPlace, number: Number, as_json: A
 
 
 def _verdicts(found: ProposalDetail) -> list[tuple[str, str, str]]:
-    """Return the rows of reviews and checks."""
+    """Return the table rows of reviews and checks."""
     reviews = [
         (one.author, f"{short(one.commit)}{', an earlier commit' if one.stale else ''}", f"{one.verdict} {one.text}")
         for one in found.reviews
@@ -242,10 +242,10 @@ def merge(
     withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw an earlier --when-green.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a proposal into its target. The command lists what is missing if it cannot be merged.
+    """Merge a proposal into its target. If it cannot be merged yet, the command lists the reasons.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
-    --ours, --theirs or --base, or resolved by a commit to the source. In that case, the exit status is 1.
+    --ours, --theirs or --base, or resolved by a commit to the source. The exit status is 1 while a conflict is left.
     """
     at = parse(place)
     with connect(context) as marey:
@@ -297,9 +297,9 @@ def protect(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Protect a branch: it can be neither deleted nor reset, and moves only as the options allow.
+    """Protect a branch from deletion and reset, and limit how it can be changed.
 
-    The options replace the rule that the branch may have.
+    If the branch is protected already, the options replace its present rule.
     """
     from marey_schemas.datasets.protection import ProtectionRule
 

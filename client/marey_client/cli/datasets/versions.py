@@ -173,7 +173,7 @@ def tag(
     place: VersionPlace,
     name: Annotated[str, typer.Argument(help="Name of the new tag.")],
 ) -> None:
-    """Create a tag at a version; it never moves."""
+    """Create a tag at a version. A tag never moves."""
     at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).create_tag(name, at.version)
@@ -186,7 +186,7 @@ def reset(
     place: VersionPlace,
     name: Annotated[str, typer.Argument(help="Branch to move.")],
 ) -> None:
-    """Move a branch to a version, also to an earlier one. The commits that it had stay."""
+    """Move a branch to a version, also to an earlier one. No commit is deleted."""
     at = parse(place, version=True)
     with connect(context) as marey:
         moved = at.on(marey).move_branch(name, at.version)
@@ -227,7 +227,7 @@ def checkout(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Give the folder of a dataset the entries of a version. Removed items can be restored."""
+    """Bring the folder of a dataset to the state of a version. Removed items can be restored."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).check_out(at.version, discard=discard)

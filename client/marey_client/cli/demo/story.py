@@ -106,7 +106,7 @@ class Story:
         return self.project.imports.upload(self.files.files, options, notice=self.advance)
 
     def _sources(self, entries: Sequence[ImportEntry]) -> dict[str, ClipHandle]:
-        """Return the clips of this run's files by path; the project may have others, of earlier runs."""
+        """Return the clips of this run's files by path, without the clips of earlier runs."""
         imported = {entry.item for entry in entries}
         clips = self.project.clips.list(collection=TAKES)
         return {clip.path: clip for clip in clips if clip.id in imported}
@@ -175,7 +175,7 @@ def _game_skeleton_parts() -> dict[str, Any]:
 
 
 def _clip_loader(project: ProjectHandle) -> Callable[[ClipHandle], Any]:
-    """Return a function that loads clips of the server as clips of `marey_motion`, each skeleton once."""
+    """Return a function that loads clips of the server as clips of `marey_motion`; it loads each skeleton only once."""
     documents = embedded.room("marey_motion.documents", "all")
     skeletons: dict[tuple[str, int], Any] = {}
 
@@ -200,12 +200,12 @@ def _demo_project(marey: Marey) -> ProjectHandle:
 
 
 def _source_path(result: ClipHandle) -> str:
-    """Return the path of a result's source, which is the result's path below its folder."""
+    """Return the path of a result's source: the path of the result, relative to the folder of all results."""
     return result.path.removeprefix(f"{RESULTS}/")
 
 
 def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:
-    """Return at most a given number of elements, evenly spaced over all of them."""
+    """Return up to `most` clips, evenly spaced over all of them."""
     if len(clips) <= most:
         return list(clips)
     return [clips[index * (len(clips) - 1) // (most - 1)] for index in range(most)]

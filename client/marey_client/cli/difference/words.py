@@ -1,4 +1,4 @@
-"""Differences between revisions in words, for people who know motion but not the document."""
+"""Differences between revisions in words, for people who know motion but not the form of the documents."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from marey_schemas.wording import counted
 
 NO_DIFFERENCE = "no difference"
 MOST_LINES = 20
-"""Most joints, segments or fields that are listed; the others are counted."""
+"""Greatest number of joints, segments or fields that are listed; the others are only counted."""
 MOST_SPANS = 3
-"""Most ranges of time that are listed for a joint."""
+"""Greatest number of ranges of time that are listed for a joint."""
 LEAST_TURN_DEG = 0.05
 LEAST_SHIFT_CM = 0.05
 THROUGHOUT = 0.95
-"""Share of the matched frames from which on a change is called a change of the whole clip."""
+"""Least share of the matched frames with a change for which the text says that the whole clip changed."""
 
 
 def described(difference: Difference) -> Iterator[str]:
@@ -127,7 +127,7 @@ def _run(run: FrameRun, motion: MotionDifference) -> str:
 
 
 def _unmatched(motion: MotionDifference) -> Iterator[str]:
-    """Yield lines about removed and inserted frames; frames removed and inserted at one place were replaced."""
+    """Yield lines about removed and inserted frames; if both are at the same place, the line says "replaced"."""
     runs = iter([*motion.runs, None])
     run = next(runs)
     while run is not None:
@@ -170,7 +170,7 @@ def _size(change: Exceeding, unit: str, threshold: float, motion: MotionDifferen
 
 
 def _number(value: float) -> str:
-    """Return a number with three digits, or more if it has more before the decimal point."""
+    """Return a number with three significant digits, or with all digits before the decimal point if there are more."""
     return f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
 
 
@@ -315,7 +315,7 @@ def _model(model: ModelDifference) -> Iterator[str]:
 
 
 def _fields(difference: Difference) -> Iterator[str]:
-    """Yield changed fields; the import checks of a clip, and details of its source, in one line each."""
+    """Yield a line for each changed field, but one line for all details of a clip's source, and few for its checks."""
     checks = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/checks/")]
     source = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/source/details")]
     for change, verb in (("removed", "no longer listed"), ("added", "added"), ("changed", "changed")):
@@ -329,7 +329,7 @@ def _fields(difference: Difference) -> Iterator[str]:
 
 
 def _check(change: FieldChange) -> str:
-    """Return the code of a check, or its place if only one of its values changed."""
+    """Return the code of an added or removed check, or the JSON pointer of a changed value in a check."""
     value = change.after if change.before is None else change.before
     return str(value["code"]) if isinstance(value, dict) and "code" in value else change.pointer
 

@@ -50,9 +50,10 @@ def download(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write clips to files: one clip, or all clips in a folder and below, or its aligned clips if it has no others.
+    """Write clips to files: one clip, or all clips in a folder and below.
 
-    After `@`, name a revision of the clip, or a version of the dataset.
+    If a folder has only aligned clips, these are written. After `@`, name a revision of the clip, or a version of the
+    dataset.
 
     An existing file is replaced; if several clips would have the same file name, the later ones get a number.
     """
@@ -83,7 +84,7 @@ class _Exported(NamedTuple):
 
 
 def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
-    """Return what an address names: an item, the clips in a folder and below, or those of a version."""
+    """Return the item at an address, the clips in a folder and below, or the clips of a dataset version."""
     from marey_schemas.kinds import Kind
 
     project = marey.project(address.project)

@@ -192,7 +192,7 @@ def show(
     history: Annotated[bool, typer.Option("--history", help="Show every revision and its inputs.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show an item: its parts, its place, and the findings of its import."""
+    """Show an item: its parts, its path, and the findings of its import."""
     from marey_schemas.kinds import Kind
 
     with connect(context) as marey:

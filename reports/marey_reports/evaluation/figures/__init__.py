@@ -1,4 +1,4 @@
-"""The figures of an evaluation: those of Abichequer Sangalli et al. (2022) and a few more, of one result or of two.
+"""The figures of an evaluation, or of two: those of Abichequer Sangalli et al. (2022) and a few more.
 
 matplotlib is loaded when the first figure is drawn. The same result gives the same bytes.
 """
@@ -43,10 +43,10 @@ class FigureKind(NamedTuple):
 
     Parameters
     ----------
-    number : in the paper, or ""
+    number : number of the figure in the paper, or "" if the paper does not have it
     trials : "one" if it shows one trial, "any" if it shows the suite or one trial, "none" if it always shows the suite
-    families : those whose trials it can show
-    draw : makes the page of one or two subjects
+    families : families of trials that it can show
+    draw : function that draws the figure for one or two subjects
     """
 
     number: str
@@ -122,7 +122,7 @@ def draw_figures(
 ) -> dict[str, DrawnFigure]:
     """Draw every possible figure of a result, or of two, by name.
 
-    Figures of missing trials are left out, and so are figures that need records that were not stored.
+    Figures are left out if their trials are missing, or if they need records that were not stored.
     """
     results = [result] if other is None else [result, other]
     names = set.intersection(*({each.trial.name for each in one.trials} for one in results))

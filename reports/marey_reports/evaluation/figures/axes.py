@@ -1,4 +1,4 @@
-"""The axes that figures of an evaluation have in common: speed, and turn rate with its two sides."""
+"""Axes that several figures of an evaluation have: speed, and turn rate to the left and right."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from marey_reports.drawing.paper import QUIET, SMALL, write
 
 ROW = 0.235
-"""Inches of the row of a clip."""
+"""Height of the row of a clip, in inches."""
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

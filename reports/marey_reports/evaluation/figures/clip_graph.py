@@ -38,7 +38,7 @@ RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
 
 class _Line(NamedTuple):
-    """Transitions from one stretch of a clip to another: uids, frames at the middle of each stretch, how many."""
+    """Transitions from one stretch of a clip to another: uids of the clips, middle frames of the stretches, number."""
 
     source: str
     left: int
@@ -76,7 +76,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
 
 
 def _popularity(subject: Subject, trial: str | None) -> dict[str, Ints]:
-    """Count the ticks of every frame, by clip."""
+    """Return the number of ticks for which each frame was displayed, by the uid of the clip."""
     return {subject.result.clips[usage.clip].uid: usage.popularity for usage in subject.usage(trial)}
 
 
@@ -89,7 +89,7 @@ def _most_used(popularity: Sequence[dict[str, Ints]], most: int) -> list[str]:
 
 
 def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[str, str], int]:
-    """Count the transitions from clip to clip, by both uids."""
+    """Count the transitions from clip to clip, by the uids of both clips."""
     links: dict[tuple[str, str], int] = {}
     for subject, each in zip(subjects, switches, strict=True):
         clips = subject.result.clips
@@ -102,9 +102,9 @@ def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[
 
 
 def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
-    """List all jumps between the circles, the most frequent first; those between the same two dots count as one.
+    """List all jumps between the circles, the most frequent first; jumps between the same two stretches are one line.
 
-    The stretches are dots of the circles, or so many dots taken together that no more than `MOST_LINES` lines remain.
+    A stretch is a dot of a circle, or several dots together, if there would be more than `MOST_LINES` lines otherwise.
     """
     clips = subject.result.clips
     owners = clips_of_rows(clips, switches[:, :2])
@@ -137,7 +137,7 @@ def _per_dot(popularity: Ints, circle: Circle) -> Ints:
 
 
 def _fit(panel: Axes, circles: dict[str, Circle], longest_name: int, size_in: tuple[float, float]) -> None:
-    """Compute axis limits that contain all circles and their names, at one scale in both directions."""
+    """Set axis limits that contain all circles and their names, with the same scale in both directions."""
     reach = max([1.0, *(float(np.linalg.norm(circle.centre)) + circle.radius for circle in circles.values())])
     aside = 0.2 + longest_name * LETTER_IN
     above = aside if len(circles) > RADIAL_NAMES else 0.4
@@ -166,7 +166,7 @@ def _draw_lines(panel: Axes, circles: dict[str, Circle], lines: Sequence[_Line])
 
 
 def _draw_dots(panel: Axes, circles: dict[str, Circle], dots: dict[str, Ints], most: int, logarithmic: bool) -> None:
-    """Draw one dot per range that was displayed, in one of a few sizes: an SVG keeps one shape per size."""
+    """Draw a dot for each displayed range of frames, in one of few sizes, because an SVG has a shape for each size."""
     colours = _colours(circles)
     places, levels, looks = [np.empty((0, 2))], [np.empty(0, np.int64)], []
     for uid, total in dots.items():

@@ -19,7 +19,7 @@ FEWEST_DOTS, FULLEST = 12, 72  # dots on one circle
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """A clip's circle: centre, radius and the number of dots its frames are summed up in."""
+    """Circle of a clip: centre, radius, number of frames, and number of dots; a dot represents a range of frames."""
 
     centre: Floats
     radius: float
@@ -27,16 +27,16 @@ class Circle:
     dots: int
 
     def dot_of(self, frames: Ints) -> Ints:
-        """Find the dot that holds each frame."""
+        """Find the dot that represents each frame."""
         return np.asarray(np.minimum(frames * self.dots // max(self.frames, 1), self.dots - 1), dtype=np.int64)
 
     def coarser(self, factor: int) -> Circle:
-        """Make the same circle with fewer dots."""
+        """Make the same circle with `factor` times fewer dots."""
         return replace(self, dots=max(1, self.dots // factor))
 
     @property
     def bounds(self) -> Ints:
-        """First frame of each dot, then the number of frames (dots + 1,)."""
+        """First frame of each dot, then the number of frames: shape (dots + 1,)."""
         return np.asarray(-(-np.arange(self.dots + 1) * self.frames // self.dots), dtype=np.int64)
 
     def middle_of(self, dots: Any) -> Any:
@@ -56,7 +56,7 @@ def arrange(frames: Mapping[str, int], links: Mapping[tuple[str, str], int]) -> 
     Parameters
     ----------
     frames : number of frames by uid, the most used clip first
-    links : transitions from clip to clip, by both uids
+    links : number of transitions from clip to clip, by the uids of both
     """
     order = _neighbours(list(frames), links)
     largest = max(frames.values(), default=1)
@@ -96,7 +96,7 @@ def _ring(radii: Floats) -> Floats:
 
 
 def _dots(frames: Sequence[int]) -> Ints:
-    """Compute the number of dots per circle: one per frame if they fit, else a number proportional to its frames."""
+    """Compute the number of dots per circle: proportional to the square root of its frames, at most one per frame."""
     counts = np.asarray(frames, dtype=np.float64)
     earned = np.clip(MOST_DOTS * counts**0.5 / max((counts**0.5).sum(), 1.0), FEWEST_DOTS, FULLEST)
     return np.asarray(np.maximum(1, np.minimum(counts, earned)), dtype=np.int64)

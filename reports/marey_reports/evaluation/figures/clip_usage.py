@@ -32,7 +32,7 @@ TRANSITIONS = "Transitions"
 
 
 class _Use(NamedTuple):
-    """Frames displayed of each clip by uid, names by uid, and transitions made."""
+    """Number of displayed frames and name of each clip, by uid, and number of transitions."""
 
     ticks: dict[str, int]
     names: dict[str, str]
@@ -73,7 +73,7 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
 def _draw_bars(
     panel: Axes, places: AnyFloats, values: Sequence[int], use: _Use, number: int, thick: float, others: bool
 ) -> None:
-    """Draw a subject's bars with numbers: clips, then the others, then the transitions, which are hatched."""
+    """Draw a subject's bars with numbers: one per clip, one for the other clips, then a hatched one for transitions."""
     total = sum(use.ticks.values())
     colours = [COLOURS[number]] * (len(values) - others) + [REFERENCE] * others
     panel.barh(places[:-1], values, height=thick, color=colours, lw=0)

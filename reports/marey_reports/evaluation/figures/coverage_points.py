@@ -36,7 +36,7 @@ CATEGORIES = len(COLOURS) * len(MARKERS)
 
 
 class _Points(NamedTuple):
-    """Drawn parts of a subject: windows (index into the coverage), and the clips with a colour of their own."""
+    """Drawn parts of a subject: indices of windows in the coverage, and the clips with a colour of their own."""
 
     windows: NDArray[np.int64]
     named: list[int]

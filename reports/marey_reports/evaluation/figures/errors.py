@@ -33,7 +33,7 @@ class _Errors(NamedTuple):
 
 
 def draw_errors(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw errors of speed on the left and of turn rate on the right; a row per subject on shared scales."""
+    """Draw errors of speed on the left and of turn rate on the right: a row per subject, all with the same scales."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     errors = [_errors(view, options.negate_errors) for view in views]

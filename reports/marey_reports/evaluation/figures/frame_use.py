@@ -34,7 +34,7 @@ STRETCHES = 200
 
 
 class _Strip(NamedTuple):
-    """A clip: ticks per frame, averaged over each of its stretches, and how many of its frames were shown at all."""
+    """Strip of a clip: mean ticks per frame in each stretch of the clip, and the share of displayed frames."""
 
     uid: str
     name: str

@@ -43,7 +43,7 @@ class _Field(NamedTuple):
 
 
 def draw_offsets(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw a row per family of trials; two subjects share the scale, and a third column shows the change."""
+    """Draw the mean offsets in a row per family of trials; for two subjects, a third column shows the change."""
     families = [family for family in subjects[0].result.options.families if family in FAMILY_TITLES]
     fields = [[_field(subject, family) for subject in subjects] for family in families]
     levels = nice_levels(max(_largest(field) for row in fields for field in row))
@@ -68,7 +68,7 @@ def _field(subject: Subject, family: str) -> _Field:
 
 
 def _largest(field: _Field) -> float:
-    """Compute the largest absolute offset, or change of an offset; 0 if none is known."""
+    """Compute the largest absolute value of a field of offsets or of their changes; 0 if the field has no value."""
     return float(np.abs(np.nan_to_num(field.offset_m)).max(initial=0.0))
 
 

@@ -57,7 +57,7 @@ def _draw(subjects: Sequence[Subject], name: str | None, family: Family) -> Sket
 
 
 def _followed(subject: Subject, trial: Trial) -> Floats | None:
-    """Look up the path of the character, where the record was stored."""
+    """Return the path of the character in a trial, or None if no records were stored."""
     return find_record(subject, trial.name).positions if subject.result.records else None
 
 
@@ -78,7 +78,7 @@ def _sections(trial: Trial, ticks: int, rate_hz: float) -> list[tuple[int, int, 
 
 
 def _limits(paths: Sequence[Floats]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Compute a square that contains all paths, the same for both panels."""
+    """Compute the square that contains all paths; all panels show this square."""
     low = np.min([path.min(axis=0) for path in paths], axis=0)
     high = np.max([path.max(axis=0) for path in paths], axis=0)
     centre, half = 0.5 * (low + high), 0.56 * max(float((high - low).max()), 0.5)
@@ -91,7 +91,7 @@ def _number_sections(
     sections: Sequence[tuple[int, int, float]],
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
-    """Write each number on its section, as far from the numbers before as its section allows."""
+    """Write each number on its section, at a place that is far enough from the earlier numbers if there is one."""
     span = limits[0][1] - limits[0][0]
     placed: list[Floats] = []
     for number, (start, stop, _) in enumerate(sections, start=1):

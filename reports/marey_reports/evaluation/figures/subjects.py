@@ -25,8 +25,8 @@ class FigureOptions:
     Parameters
     ----------
     negate_errors : draw reference minus recorded, as the paper's figure 8, instead of recorded minus reference
-    logarithmic : whether popularity of frames and lengths of bars of usage have a logarithmic scale
-    most_clips : clips that are drawn one by one; the rest is summed up
+    logarithmic : whether the sizes of dots and the lengths of bars have a logarithmic scale
+    most_clips : number of clips that are drawn one by one; the others are summed up
     """
 
     negate_errors: bool = False
@@ -48,11 +48,11 @@ class Subject:
 
     @property
     def prefix(self) -> str:
-        """Make the beginning of a sentence about one of two subjects."""
+        """Name and colon with which a sentence about one of two subjects begins; empty for a single subject."""
         return f"{self.label}: " if self.label else ""
 
     def column(self, name: str) -> str:
-        """Name a table's column that only this subject fills."""
+        """Return the name of a table's column for this subject; of two subjects, each has a column of its own."""
         return f"{self.label}_{name}" if self.label else name
 
     def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
@@ -60,7 +60,7 @@ class Subject:
         return self.result.usage if trial is None else measure_usage(self.result.clips, [find_record(self, trial)])
 
     def switches(self, trial: str | None) -> NDArray[np.int64]:
-        """List jumps (S, 3): row left, row entered and how often, in one trial or in the whole suite."""
+        """List jumps (S, 3) in one trial or in the whole suite: row before the jump, row after it, and count."""
         return self.result.switches if trial is None else count_switches(self.result.clips, [find_record(self, trial)])
 
 
@@ -104,9 +104,9 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
     """Choose a trial that all subjects have, from the first of the families that contains such a trial.
 
-    If `name` is None, it is the trial of that family that the first subject follows worst.
+    If `name` is None, choose the trial of this family that the first subject follows worst.
 
-    Raises `MotionError` if the subjects share no such trial.
+    Raises `MotionError` if the subjects have no such trial in common.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

@@ -13,11 +13,11 @@ from marey_reports.drawing.paper import COLOURS, REFERENCE, Place, add_keys, add
 from marey_reports.evaluation.figures.subjects import FigureOptions, Subject, TrialView, choose_trial, view_trial
 
 LEAST_TOP_M = 0.01
-"""Least upper end of the axis of costs; costs far below are rounding errors of a character at rest."""
+"""Least upper end of the axis of costs, in metres; far smaller costs are rounding errors of a character at rest."""
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw speeds above and costs below, a line per subject; a tick under the cost is a jump to another place."""
+    """Draw speeds above and costs below, with a line per subject; marks under the costs are jumps to other places."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     first = views[0].series

@@ -41,10 +41,10 @@ MODEL_FIGURES: dict[str, tuple[str, Callable[[ModelSubject], Sketch | None]]] = 
     "mixture": ("The choice of the mixture", draw_criterion),
     "likelihood": ("Which examples fit, and which are odd", draw_likelihood),
 }
-"""Title and maker by name. What a maker has nothing to draw of is left out."""
+"""Title and drawing function of each figure, by its name. Figures whose function returns None are left out."""
 
 PUBLISHED = {"samples": "17"}
-"""Their numbers in Herrmann et al. (2019)."""
+"""Numbers of figures in Herrmann et al. (2019), by the name of the figure."""
 
 
 def draw_alignment_figures(aligned: AlignedSet) -> dict[str, DrawnFigure]:

@@ -31,12 +31,12 @@ MOST_CELLS = 200
 
 
 class CostView(NamedTuple):
-    """One clip against the reference.
+    """Costs of the alignment of one clip with the reference.
 
     Parameters
     ----------
     costs_cm : (n, m) root mean square distance of joints at frames of the reference and of the clip
-    frames : (n,), (m,) these frames
+    frames : indices of these frames in the reference, (n,), and in the clip, (m,)
     """
 
     role: str
@@ -55,7 +55,7 @@ class CostView(NamedTuple):
 
 
 def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
-    """Draw the clips with the median and the highest cost; return None if there is only the reference."""
+    """Draw the costs of the clips with the median and the highest cost; return None if there is only the reference."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
         return None

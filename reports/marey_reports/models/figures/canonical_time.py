@@ -1,4 +1,4 @@
-"""The axis of canonical time, which figures of alignments and models have in common."""
+"""The axis of canonical time, which is common to figures of alignments and models."""
 
 from __future__ import annotations
 

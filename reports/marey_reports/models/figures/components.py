@@ -1,4 +1,4 @@
-"""Figure of the components of a model: motions from two deviations below to two above the mean."""
+"""Figures of the components of a model: motions from two standard deviations below the mean to two above it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def draw_component(subject: ModelSubject, component: int) -> Sketch:
 
 
 def sweep(subject: ModelSubject, component: int) -> Floats:
-    """Compute poses (5, N, 3 + 4·J) of the motions along a spatial component."""
+    """Compute the poses (5, N, 3 + 4·J) of five motions along a spatial component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     latents[:, component] = np.array(DEVIATIONS) * np.sqrt(primitive.spatial.variances[component])
@@ -64,12 +64,15 @@ def sweep(subject: ModelSubject, component: int) -> Floats:
 
 
 def written(deviation: float) -> str:
-    """Format a number of deviations as the name of a row."""
+    """Format a number of standard deviations as the name of a row."""
     return "mean" if not deviation else f"{'+' if deviation > 0 else '−'}{abs(deviation):g} sd"
 
 
 def most_moved(subject: ModelSubject, points: Floats) -> tuple[str, float]:
-    """Find the joint that differs most between first and last row of (rows, T, P, 3), and the difference in cm."""
+    """Find the joint that differs most between the first and last of several motions, and the difference in cm.
+
+    `points` (motions, T, P, 3) are positions in metres.
+    """
     joints = subject.primitive.skeleton.joint_names
     apart = np.linalg.norm(points[-1] - points[0], axis=-1)[:, : len(joints)].max(axis=0)
     joint = int(np.argmax(apart))

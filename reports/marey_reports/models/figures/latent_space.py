@@ -35,11 +35,11 @@ NAMED = 12
 MOST_ROWS = 30
 ROW = 0.2
 FARTHEST = 20.0
-"""Robust deviations that are drawn to scale."""
+"""Greatest number of robust deviations below the median that is drawn to scale."""
 
 
 def draw_latent_space(subject: ModelSubject) -> Sketch | None:
-    """Draw examples, samples and the mixture in pairs of latent dimensions; return None if there are none."""
+    """Draw examples, samples and the mixture in pairs of latent dimensions; return None if there is no pair."""
     primitive = subject.primitive
     pairs = _pairs(primitive.spatial.count, primitive.temporal.count)
     if not pairs:
@@ -121,7 +121,7 @@ def _draw_pair(panel: Axes, subject: ModelSubject, samples: Floats, pair: tuple[
 
 
 def ellipse(mean: Floats, covariance: Floats) -> Floats:
-    """Compute the outline (60, 2) of two standard deviations of a normal distribution in a plane."""
+    """Compute the ellipse (60, 2) at two standard deviations of a normal distribution in a plane."""
     values, vectors = np.linalg.eigh(covariance)
     angles = np.linspace(0.0, 2.0 * np.pi, 60)
     circle = np.stack((np.cos(angles), np.sin(angles)), axis=1)
@@ -167,7 +167,7 @@ def draw_likelihood(subject: ModelSubject) -> Sketch:
 
 
 def _deviations(judged: Floats) -> Floats:
-    """Convert log-likelihoods to robust deviations from the median; 0 if they do not differ."""
+    """Convert log-likelihoods to robust standard deviations from the median; 0 if the log-likelihoods do not differ."""
     away = judged - np.median(judged)
     spread = DEVIATION_OF_MEDIAN * float(np.median(np.abs(away)))
     return np.asarray(away / spread if spread > 0.0 else np.zeros(len(judged)), dtype=np.float64)

@@ -41,7 +41,7 @@ class Reach(NamedTuple):
 
 
 def reach_of(subject: ModelSubject) -> list[Reach]:
-    """Compute the range of wrists and ankles, without extreme moments, of examples and of at least 200 samples."""
+    """Compute the space that wrists and ankles reach in the examples and in at least 200 samples, without extremes."""
     frames = evenly(subject.primitive.frame_count, FRAMES)
     drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
     sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]
@@ -78,7 +78,7 @@ def _count(drawn: int, total: int) -> str:
 
 
 def _spread_cm(subject: ModelSubject, points: Floats) -> float:
-    """Compute the mean distance of the joints of (m, T, P, 3) from their mean position, centimetres."""
+    """Compute the mean distance in centimetres of the joints in `points` (m, T, P, 3) from their mean position."""
     joints = points[:, :, : subject.primitive.skeleton.joint_count]
     return 100.0 * float(np.linalg.norm(joints - joints.mean(axis=0), axis=-1).mean())
 
@@ -134,7 +134,7 @@ def _path_table(names: list[str], joints: list[str], frames: NDArray[np.int64], 
 
 
 def _followed(subject: ModelSubject) -> dict[str, int]:
-    """Choose the known wrists and ankles; ends of chains where there are none."""
+    """Return the indices of the known wrists and ankles by name, or of the ends of chains if none is known."""
     skeleton = subject.primitive.skeleton
     known = map_joints(skeleton).joints
     named = {name: skeleton.index_of(known[key]) for name, (key, _, _) in FOLLOWED.items() if key in known}
@@ -143,7 +143,7 @@ def _followed(subject: ModelSubject) -> dict[str, int]:
 
 
 def _extent(places: Floats) -> tuple[Floats, Floats]:
-    """Compute the centre of positions (n, 3), and the length that an axis needs."""
+    """Compute the centre of positions (n, 3), and the length of an axis that contains them."""
     low, high = places.min(axis=0), places.max(axis=0)
     return 0.5 * (low + high), np.maximum(1.08 * (high - low), 0.2)
 

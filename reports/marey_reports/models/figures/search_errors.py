@@ -16,7 +16,7 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Draw errors of searches for targets from examples; None if they were not measured."""
+    """Draw the errors of searches for targets from examples; return None if they were not measured."""
     check = subject.check
     if check is None:
         return None
@@ -28,7 +28,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
-    """Draw errors of the same targets after the search of the tree and after refinement.
+    """Draw the errors at the same targets after the search of the tree and after refinement.
 
     Parameters
     ----------

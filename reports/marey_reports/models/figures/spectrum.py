@@ -81,7 +81,7 @@ def _held(kind: str, energy: Floats, kept: int) -> str:
 
 
 def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
-    """Draw the error of rebuilt examples over the number of components; None if it was not measured."""
+    """Draw the error of rebuilt examples over the number of components; return None if it was not measured."""
     errors = subject.report.reconstruction
     if errors is None:
         return None
@@ -122,7 +122,7 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
-    """Draw the criterion over the number of components of the mixture; None if the training compared no numbers."""
+    """Draw the criterion over the number of mixture components; return None if the training compared no numbers."""
     candidates = subject.report.candidates
     if not candidates:
         return None

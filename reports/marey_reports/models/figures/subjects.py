@@ -1,4 +1,4 @@
-"""Subjects of the figures of a model: the model, its examples, and the data that drawing needs of both."""
+"""Subjects of the figures of a model: the model, its examples, and data for drawing both."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAMPLES = 16
 LONGEST_LABEL = 18
 
 FROM_ASIDE_RAD, FROM_AHEAD_RAD = float(np.radians(-50.0)), float(np.radians(-25.0))
-"""Directions that canonical motions, which begin facing +z, are seen from: front right, so that walks go right."""
+"""Directions from which motions are seen: from the front right. Motions begin facing +z, so that walks go right."""
 
 TRAVELS_M = 0.3
 
@@ -57,12 +57,12 @@ class ModelSubject:
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of the examples without the beginning that all share."""
+        """Names of the examples, without the folders and the first words that all share."""
         return told_apart([clip.name for clip in self.examples.clips])
 
     @cached_property
     def poses(self) -> Floats:
-        """Poses (m, N, 3 + 4·J) of the examples, with the signs of the model."""
+        """Poses (m, N, 3 + 4·J) of the examples; quaternions have the same signs as in the model."""
         return consistent_poses(self.examples.poses, self.mean_poses)
 
     @cached_property
@@ -72,7 +72,7 @@ class ModelSubject:
 
     @cached_property
     def seen_from_rad(self) -> float:
-        """View of strips: motions that travel are seen more from the side than those that stay in place."""
+        """Direction of the view in strips: motions that travel are seen more from the side than motions in place."""
         way = self.mean_poses[[0, -1], :3]
         return FROM_ASIDE_RAD if np.linalg.norm((way[1] - way[0])[[0, 2]]) > TRAVELS_M else FROM_AHEAD_RAD
 
@@ -91,7 +91,7 @@ class ModelSubject:
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
-        """Choose the canonical frames that strips show, and their columns, centred on the mean motion."""
+        """Choose the canonical frames that strips show; the column of each frame is centred on the mean motion."""
         return choose_moments(self, count)
 
 
@@ -108,7 +108,7 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
-    """Choose evenly spaced canonical frames; a keyframe replaces the nearest of them."""
+    """Choose evenly spaced canonical frames, and replace those nearest to keyframes by the keyframes."""
     last = subject.primitive.frame_count - 1
     frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
     labels = [""] * len(frames)

@@ -1,4 +1,4 @@
-"""Figure of the time functions of an alignment, with the places where each is faster or slower."""
+"""Figure of the time functions of an alignment, with the places where each clip is faster or slower."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 NAMED = 4
 POINTS = 12_000
-"""Most points of all lines of a panel together; more could not be seen."""
+"""Greatest number of points of all lines in a panel together; more could not be distinguished."""
 TABLED = 100
 SPEED_SPAN = (0.1, 10.0)
 
 
 def draw_time_warps(aligned: AlignedSet) -> Sketch:
-    """Draw time functions and speeds; the reference and the clips most unlike it are named."""
+    """Draw time functions and speeds; name the reference and the clips whose time differs most from the reference's."""
     times_s = aligned.time_functions / aligned.frame_rate_hz
     speeds = 1.0 / np.diff(aligned.time_functions, axis=1)
     reference = [clip.uid for clip in aligned.clips].index(aligned.reference)
@@ -59,7 +59,7 @@ def draw_time_warps(aligned: AlignedSet) -> Sketch:
 
 
 def _most_unlike(aligned: AlignedSet, reference: int) -> list[int]:
-    """Find the clips whose time differs most from the reference's, apart from their length."""
+    """Find the clips whose time function differs most from the reference's, after scaling all to the same length."""
     paths = aligned.time_functions / aligned.time_functions[:, -1:]
     apart = np.abs(paths - paths[reference]).max(axis=1)
     order = sorted(range(len(paths)), key=lambda place: (-apart[place], aligned.clips[place].uid))

@@ -26,7 +26,7 @@ WIDTH, HEIGHT = 2.7, 1.9
 
 
 def draw_time_components(subject: ModelSubject) -> Sketch | None:
-    """Draw time functions and speeds along each time component; None if time does not vary."""
+    """Draw time functions and speeds along each time component; return None if time does not vary."""
     primitive = subject.primitive
     count = min(MOST_COMPONENTS, primitive.temporal.count)
     if not count:
@@ -69,7 +69,7 @@ def draw_time_components(subject: ModelSubject) -> Sketch | None:
 
 
 def sweep_time(subject: ModelSubject, component: int) -> Floats:
-    """Compute the seconds passed (5, N) of five motions along a time component."""
+    """Compute the elapsed seconds (5, N) at each canonical frame of five motions along a time component."""
     primitive = subject.primitive
     latents = np.zeros((len(DEVIATIONS), primitive.dimensions))
     deviation = primitive.temporal_weight * np.sqrt(primitive.temporal.variances[component])
@@ -78,7 +78,7 @@ def sweep_time(subject: ModelSubject, component: int) -> Floats:
 
 
 def _rates(passed_s: Floats, frame_rate_hz: float) -> Floats:
-    """Compute speeds (5, N - 1) relative to the reference."""
+    """Compute the speeds (5, N - 1) of the motions relative to the reference."""
     return np.asarray(1.0 / (np.diff(passed_s, axis=1) * frame_rate_hz), dtype=np.float64)
 
 
