@@ -210,7 +210,7 @@ class RotatedToken(Resource):
 
     @writes(access=Access.USER, scope=None, body=TokenRotation, answer=NewToken)
     async def post(self, token: str, body: TokenRotation) -> Rendered:
-        """Replace the token of this request by a successor with the same rights and the same end.
+        """Replace the token of this request by a successor with the same rights and the same expiry.
 
         The replaced token remains valid for `grace_s`. A repeated request gets the same successor.
         """

@@ -199,7 +199,7 @@ class CherryPicks(Resource):
         idempotency="key",
     )
     async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
-        """Repeat on a branch what one commit has changed, or preview the result.
+        """Repeat the changes of one commit on a branch, or preview the result.
 
         Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
         """
@@ -220,7 +220,7 @@ class DatasetReverts(Resource):
         idempotency="key",
     )
     async def post(self, project: str, dataset: str, body: PickRequest) -> Rendered:
-        """Undo on a branch what one commit has changed, or preview the result. Later changes stay.
+        """Undo the changes of one commit on a branch, or preview the result. Later changes stay.
 
         Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
         """
@@ -236,7 +236,7 @@ class FolderCheckout(Resource):
 
     @writes(access=Access.MAINTAINER, body=CheckoutRequest, answer=CheckoutAnswer)
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
-        """Give the folder of the dataset the entries of a version: items are added, changed, moved and removed.
+        """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
         Changes in the folder that no commit has recorded are refused with 409, unless they are to be discarded.
         Removed items can be restored, and earlier revisions stay.
