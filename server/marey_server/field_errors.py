@@ -38,7 +38,7 @@ def field_errors(
 def _steps(location: tuple[int | str, ...], tree: Any, *, may_lack_last: bool) -> list[str]:
     """Return the steps of an error's location that exist in the document, and the name of a missing field.
 
-    The steps that are left out are names of union members, which pydantic inserts.
+    The other steps are left out: they are names of union members, which pydantic inserts.
     """
     steps = []
     for index, step in enumerate(location):

@@ -27,7 +27,7 @@ DETAIL_CHARACTERS = 1000
 
 
 def main() -> None:
-    """Serve the pipe whose file descriptor is the first argument, until it closes."""
+    """Run the jobs that arrive on a pipe, whose file descriptor is the first argument, until the pipe closes."""
     pipe = connect_to_parent()
     process = os.getpid()
     load(sys.argv[2:])

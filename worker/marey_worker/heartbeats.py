@@ -15,16 +15,16 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""Share of a lease without a successful heartbeat after which another one must succeed before results are published."""
+"""If no heartbeat succeeded for this share of the lease, one must succeed before results are published."""
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
 FIRST_S = 1.0
-"""Greatest wait before the first heartbeat, with which the attempt begins to count; shorter jobs need none."""
+"""Greatest delay in seconds of the first heartbeat, which shows the server that the job runs; short jobs need none."""
 
 TICK_S = 0.25
 JITTER = 0.2
-"""Share of the interval by which heartbeats of many attempts are spread."""
+"""Largest share of an interval that is subtracted at random, so that attempts do not send at the same time."""
 
 
 class LeaseKeeper:

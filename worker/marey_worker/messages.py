@@ -153,7 +153,7 @@ _FORMS = {
 
 
 def pack(message: Any) -> bytes:
-    """Return the bytes of a message. Raises `TypeError`, `ValueError` or `OverflowError` for values without a form."""
+    """Encode a message. Raises `TypeError`, `ValueError` or `OverflowError` for values that cannot be encoded."""
     name = type(message).__name__
     fields = _FORMS[name].dump_python(message, by_alias=True)
     packed: bytes = msgpack.packb([name, fields], default=_plain)

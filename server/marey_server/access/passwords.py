@@ -57,9 +57,7 @@ def _parse(stored: str) -> _Parsed:
 
 
 def _nobody() -> str:
-    """Return a hash that no password matches; it is checked for unknown users, so that their checks take as long as
-    others.
-    """
+    """Return a hash that no password matches, so that a check for an unknown user takes as long as any other."""
     return "$".join(("scrypt", str(LOG2_N), str(_BLOCK), str(_PARALLEL), _text(bytes(16)), _text(bytes(_KEY_BYTES))))
 
 

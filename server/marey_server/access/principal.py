@@ -30,10 +30,10 @@ class Principal:
     fence: int | None = None
     project_id: str | None = None
     token_key: bytes = field(default=b"", repr=False)
-    """Secret from which the tokens of attempts and the successor of a user's token are derived; empty without one."""
+    """Secret from which tokens of attempts and the successor of a user's token are derived; empty if there is none."""
     ended: bool = False
     labels: Mapping[str, str] | None = field(default=None, hash=False)
-    """Labels that a worker with this token may announce; None: any."""
+    """Labels that a worker with this token may announce; None if it may announce any."""
 
     @property
     def actor(self) -> str | None:

@@ -21,8 +21,8 @@ def includes(role: Role, required: Role) -> bool:
 class RequiredRole:
     """Role and scope that an operation requires in a project.
 
-    Handlers declare it, the transaction of a request contains it, and `store.projects.require` enforces them.
-    `guests` is true if callers without a role may perform the operation of a reader in a public project.
+    Handlers declare it, the transaction of a request contains it, and `store.projects.require` enforces it. `guests`
+    is false if callers without a role may not perform the operation even in a public project.
     """
 
     role: Role

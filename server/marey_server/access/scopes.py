@@ -25,7 +25,8 @@ def exceeding(wanted: Iterable[str], held: Iterable[str]) -> list[str]:
 
 
 def projects_of(scopes: Iterable[str], *needs: str) -> set[str]:
-    """Return the names of the projects for which `needs` are; the list contains an empty name if one of them is for all
-    projects.
+    """Return the names of the projects to which the scopes named in `needs` are limited.
+
+    The set also contains an empty name if one of these scopes is for all projects.
     """
     return {name for need, _, name in (scope.partition("!project=") for scope in scopes) if need in needs}

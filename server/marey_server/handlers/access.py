@@ -36,7 +36,7 @@ from marey_server.store.database.clock import datetime_of
 from marey_server.store.transaction import Transaction
 
 MAX_LOGIN_BYTES = 4 * KIB
-"""Greatest size of the body of a sign-in, the only one that a caller without a token may send."""
+"""Greatest size of the body of a sign-in."""
 
 
 def read_me(tx: Transaction) -> Me:
@@ -177,7 +177,7 @@ class OwnTokens(Resource):
 
     @reads(access=Access.USER, query=TokenQuery, answer=Token, paged=True)
     async def get(self, query: TokenQuery) -> Rendered:
-        """List your tokens, without their secrets; administrators may list those of others."""
+        """List your tokens, without their secrets; administrators may list the tokens of other users."""
         wanted = TokenFilter(query.user, query.everybody, query.prefix, query.ends_within_s)
         return await self.answer(tokens.list_tokens, wanted, cursor=query.cursor, limit=query.limit)
 
@@ -256,7 +256,7 @@ class UserResource(PasswordResource):
 
     @reads(access=Access.USER, answer=User, etag=True)
     async def get(self, user: str) -> Rendered:
-        """Return a user; for administrators, and for the user."""
+        """Return a user; only administrators and this user may read it."""
         return await self.answer(users.find_user, user)
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
@@ -302,7 +302,7 @@ class UserQuotas(Resource):
 
     @reads(access=Access.USER, answer=QuotasInUse)
     async def get(self, user: str) -> Rendered:
-        """Return the number of items and bytes that count for a user, and the limits; also to this user."""
+        """Return a user's number of items and bytes, and the limits; only administrators and this user may do so."""
         return await self.answer(users.read_quotas, user)
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)

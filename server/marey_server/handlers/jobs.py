@@ -208,7 +208,7 @@ class JobResults(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=TaskResult, paged=True, attempts=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """Return the results of the tasks of a gathering job in order; the blobs they name are kept until it ends."""
+        """Return the results of a job's tasks in order. Blobs named in the results are kept until the job ends."""
         return await self.answer(reading.list_results, job, query.cursor, query.limit)
 
 

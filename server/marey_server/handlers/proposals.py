@@ -106,7 +106,7 @@ class WaitingProposal(Resource):
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Run `function` with the prepared merge of the proposal, if it waits; prepare it again if branches move."""
+        """Run `function` with the merge that is prepared if the proposal waits; if branches move, prepare it again."""
         for _ in range(TRIES - 1):
             try:
                 return await self._try(function, project, dataset, proposal, body)

@@ -113,9 +113,7 @@ class Figure(StoredFileSender):
 
 
 def _scripts(report: ReportDocument) -> str:
-    """Return the part of the content security policy that allows only the scripts of the page, which it lists by
-    digest.
-    """
+    """Return the part of the content security policy that allows only the page's own scripts, listed by digest."""
     if not report.scripts:
         return "sandbox"
     return f"script-src {' '.join(repr(digest) for digest in report.scripts)}; sandbox allow-scripts"

@@ -113,4 +113,4 @@ def _caching(query: SampleQuery) -> dict[str, str]:
 
 
 RESOURCES: tuple[type[Resource], ...] = (ModelSamples, SampleFiles)
-"""Samples of models."""
+"""Resources of this module."""

@@ -57,14 +57,14 @@ class Caller:
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """Target of a request with a body: the project whose role it needs, or the attempt that it is for."""
+    """Target of a request with a body: the project in which the caller needs a role, or the attempt."""
 
     project: str | None = None
     attempt: tuple[str, int] | None = None
 
 
 Admission = tuple[str, Access, str | None, bool, bool, bool, BodyTarget]
-"""Hash of a token, what an operation declares about its callers, and its target."""
+"""Hash of a token, an operation's declarations about its callers, and the target of the request."""
 
 
 def admission_of(caller: Caller, target: BodyTarget) -> Admission:

@@ -28,7 +28,7 @@ Declared = Callable[..., Coroutine[Any, Any, None]]
 class Access(StrEnum):
     """Minimum access that an operation requires.
 
-    Members that are roles mean the role in the project of the path; higher roles include it.
+    A member with the name of a role requires this role, or a higher one, in the project that the path names.
     """
 
     ANYONE = "anyone"
@@ -115,13 +115,13 @@ class Operation:
 
     @property
     def stores(self) -> bool:
-        """Whether the operation may need much space on the disk: it stores a body, and is not reserved."""
+        """Whether the operation may need much disk space: it stores a body, and is not declared as `reserved`."""
         changes = self.access is Access.ATTEMPT or self.scope in ("write", "jobs")
         return changes and self.body is not None and not self.reserved
 
     @property
     def shows_project(self) -> bool:
-        """Whether this changes a project and the answer shows what is in it, which needs the scope `read` as well."""
+        """Whether the operation changes a project and its answer shows content, which needs the scope `read`, too."""
         return self.scope == "write" and self.access.role is not None and self.etag and self.answer is not None
 
     @property

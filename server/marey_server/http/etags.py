@@ -29,10 +29,10 @@ class Precondition:
 
 
 ANY_STATE = Precondition()
-"""Whether the header is `If-Match: *`."""
+"""Precondition that every state meets: that of `If-Match: *`, or of a request without preconditions."""
 
 ABSENT = Precondition(absent=True)
-"""Whether the header is `If-None-Match: *`, which allows only creation."""
+"""Precondition of the header `If-None-Match: *`, which allows only creation."""
 
 
 def entity_tag(state: int | str, form: str) -> str:

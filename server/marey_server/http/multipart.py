@@ -13,7 +13,7 @@ from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedM
 
 MAX_HEAD_BYTES = 16 * KIB
 MAX_BOUNDARY_BYTES = 70
-"""Pattern of a boundary (RFC 2046, section 5.1.1)."""
+"""Greatest length of a boundary (RFC 2046, section 5.1.1)."""
 
 
 @dataclass(frozen=True, slots=True)

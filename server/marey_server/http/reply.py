@@ -30,7 +30,7 @@ before it takes a body from here.
 
 
 MakeTree = Callable[[], Mapping[str, Any]]
-"""Makes a document from what was loaded, without the database."""
+"""Function that makes a document from loaded data; it does not use the database."""
 
 
 @dataclass(frozen=True, slots=True)

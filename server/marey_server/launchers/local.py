@@ -1,8 +1,8 @@
 """Worker processes beside the server, on the same machine.
 
 A worker gets its token through a pipe to its standard input, which stays open: when the server ends, even by a crash,
-the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables, and of the
-server's environment a worker gets only what it needs.
+the pipe closes and the worker stops. Secrets are never passed in argument lists or environment variables. A worker gets
+only those environment variables of the server that it needs.
 """
 
 from __future__ import annotations

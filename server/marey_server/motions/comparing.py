@@ -36,7 +36,7 @@ MAKE_DIFFERENCE = "marey_server.motions.comparing:make_difference"
 MOST_NUMBERS = 20_000_000
 """Greatest number of values in the poses of both revisions; a child compares them within its processor time."""
 MOST_FIELDS = 1000
-"""Most changed values that an answer lists."""
+"""Greatest number of changed values in an answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,11 +187,11 @@ DESCRIBED: dict[str, frozenset[str]] = {
     "mapping": frozenset({"joints", "axes"}),
     "annotation": frozenset({"segments", "keyframes"}),
 }
-"""Members of parts that the difference describes in other words than by fields."""
+"""Members of parts that a difference does not list field by field, because it describes them in other ways."""
 
 
 def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> list[FieldChange]:
-    """List the changed values of parts that both revisions have, as far as no other member describes them."""
+    """List the changed values of the parts that both revisions have, except the values of members in `DESCRIBED`."""
     from marey_motion.difference.fields import changed_values
 
     found: list[FieldChange] = []

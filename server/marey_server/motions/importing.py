@@ -49,7 +49,7 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """File that was read and encoded, ready to be stored, or its entry in the answer if there is nothing to store."""
+    """File that was read and encoded, ready to be stored; if there is nothing to store, its entry in the answer."""
 
     name: str
     sources: tuple[SourceFile, ...] = ()

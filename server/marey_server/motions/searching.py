@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from marey_motion.rigs import JointMapping
 
 MOST_DRAWING_WORK = 2e9
-"""Greatest cost of the trees that a request draws for models without one, in nanoseconds of one thread."""
+"""Greatest cost of all trees that a request draws for models without a tree, in nanoseconds of one thread."""
 
 SearchableKey = tuple[str, str, str]
 
@@ -71,8 +71,9 @@ class LoadedSearchable:
 class Searchable:
     """Model that can be searched.
 
-    `stored` says whether the tree belongs to the model, or was drawn for the search. `drawing_work` is the estimated
-    cost of drawing it in nanoseconds. `log_likelihoods` are those of the examples in ascending order.
+    `stored` is true if the tree is stored with the model, and false if it was drawn for the search. `drawing_work` is
+    the estimated cost of drawing the tree, in nanoseconds. `log_likelihoods` are the log-likelihoods of the examples
+    in ascending order.
     """
 
     usable: UsableModel
@@ -196,4 +197,4 @@ def size_bytes(made: Searchable) -> int:
 _SEARCHABLES: LruCache[tuple[SearchableKey, int | None], Searchable] = LruCache(
     max_bytes=models.MODEL_CACHE_BYTES, size_of=size_bytes
 )
-"""Cache of a child: parsed models by the digests of their documents, and the seed of a tree that was drawn."""
+"""Cache of a child: parsed models. The key is the digests of a model's documents, and the seed of a drawn tree."""

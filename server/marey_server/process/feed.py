@@ -74,9 +74,7 @@ class _FeedPosition:
         self._look_for_due_at_s = 0.0
 
     async def announce_news(self) -> None:
-        """Wake the requests that the events since the last call concern, and workers for job kinds of which a retry has
-        become due.
-        """
+        """Wake the requests that wait for an event since the last call, and the workers that wait for a due retry."""
         await self._services.number_events()
         if self._last is None:
             self._last = await self._read(events.newest_number)
@@ -88,7 +86,7 @@ class _FeedPosition:
         await self._announce_due()
 
     async def _announce_due(self) -> None:
-        """Wake workers for job kinds of which a retry has become due.
+        """Wake workers that wait for a kind of job if a retry of such a job has become due.
 
         This reads the whole queue, so it is not done after each commit.
         """

@@ -74,7 +74,7 @@ class Services:
         self.models: LruCache[SearchableKey, bytes] = LruCache(max_bytes=MODEL_CACHE_BYTES, size_of=len)
         """Documents of models as bytes for children, with their search trees and mappings where these are used."""
         self.admitted: LruCache[Hashable, float] = LruCache(max_entries=ADMISSIONS_REMEMBERED)
-        """Times at which callers were admitted, by what the admission depends on."""
+        """Time of the last admission of a caller, by the value that `admission_of` returns."""
         self.followers: Counter[str] = Counter()
         """Number of open connections that follow events, by the id of the user."""
         self.draining = asyncio.Event()

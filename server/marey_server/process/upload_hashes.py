@@ -59,7 +59,7 @@ class UploadHashes:
         self._lock = threading.Lock()
 
     def add(self, upload_id: str, offset: int, data: bytes) -> None:
-        """Hash a piece that was stored; a piece that does not follow the hashed bytes is hashed at the end."""
+        """Hash a stored piece if it follows the hashed bytes; otherwise `finish` hashes it."""
         running = self._running(upload_id)
         with running.lock:
             if running.offset == offset:

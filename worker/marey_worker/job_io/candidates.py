@@ -66,7 +66,7 @@ def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
 
 
 def _named(context: Context, groups: dict[tuple[str, str], _Group]) -> Iterator[tuple[str, _Group]]:
-    """Yield each group with its folder as name, and the skeleton if the folder has clips of several skeletons."""
+    """Yield each group with its name: the folder, and the skeleton if the folder has clips of several skeletons."""
     for (folder, skeleton), group in groups.items():
         alone = sum(other == folder for other, _ in groups) == 1
         yield folder if alone else f"{folder} ({context.item(Kind.SKELETON, skeleton).name})", group

@@ -68,7 +68,7 @@ class InputCache:
         return data
 
     def _keep(self, path: Path, data: bytes) -> None:
-        """Store bytes if possible; a folder that is full or missing must not fail a job."""
+        """Store bytes if possible; if the folder is full or missing, the job continues without the cache."""
         size = SEAL_BYTES + len(data)
         if size > self.max_bytes:
             return

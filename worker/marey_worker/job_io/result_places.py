@@ -23,7 +23,7 @@ class ResultPlaces:
     def take(self, kind: Kind, collection: str, *names: str) -> None:
         """Reserve names in a collection below `into` for results.
 
-        Raises `MotionError` and reserves none if one is too long, already taken, or the place of an input.
+        Raises `MotionError`, and reserves no name, if a name is too long, taken, or would replace an input.
         """
         for name in names:
             self._require_free(kind, collection, name)
@@ -37,7 +37,7 @@ class ResultPlaces:
         self._taken |= {(kind, collection, name) for name in names}
 
     def keep(self, pin: PinnedInput) -> None:
-        """Reserve the place of an input for its result. Raises `MotionError` if another result has it."""
+        """Reserve the folder and name of an input for its result. Raises `MotionError` if another result has them."""
         self._require_free(pin.kind, pin.collection, pin.name)
         self._taken.add((pin.kind, pin.collection, pin.name))
 

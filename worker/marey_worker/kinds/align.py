@@ -198,7 +198,7 @@ class _Job:
         return found
 
     def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
-        """Return the boundaries that an annotation gives a clip; annotations of the clip's own revision come first."""
+        """Return the boundaries from a clip's annotation; an annotation of the same revision is preferred."""
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known
         if len(known) != 1:

@@ -95,10 +95,10 @@ class _Cutting:
         return found
 
     def _clip_of(self, clip: RevisionRef) -> Item | PinnedInput:
-        """Return the annotated clip with its name and place, which date from submission if clips are inputs of the job.
+        """Return the annotated clip with its name and folder.
 
-        In that case only inputs may determine the results, because the results are cached for jobs with the same
-        inputs. Raises `MotionError`, `NoSuchThing`.
+        If clips are inputs of the job, name and folder are those at the time of submission: results are cached for jobs
+        with the same inputs, so later changes must not affect them. Raises `MotionError` or `NoSuchThing`.
         """
         if not self._clips:
             return self._context.item(Kind.CLIP, clip.item)
@@ -111,7 +111,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """Return the selected segments with their names; numbers count all segments of a label, selected or not."""
+        """Yield each selected segment with the name of its piece, which is numbered among all segments of the label."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1

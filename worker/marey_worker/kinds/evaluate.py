@@ -87,7 +87,7 @@ def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[s
 
 
 def _trials(params: EvaluateParams, options: EvaluationOptions) -> tuple[Trial, ...]:
-    """Return all trials of the suite. Raises `JobRefused` if a figure is requested for another trial."""
+    """Return all trials of the suite. Raises `JobRefused` if a figure is requested for a trial outside the suite."""
     with refusing_motion_errors():
         trials = suite_trials(options)
     if unknown := set(params.trial_figures) - {trial.name for trial in trials}:

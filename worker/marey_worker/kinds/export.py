@@ -100,7 +100,7 @@ class _Exporting:
 
 
 def _place(pin: PinnedInput) -> str:
-    """Return a path inside the archive that cannot lead outside of the folder it is extracted to."""
+    """Return the path of a clip in the archive; it never leads out of the folder where the archive is extracted."""
     parts = [part for part in (*pin.collection.split("/"), pin.name) if part not in ("", ".", "..")]
     return "/".join(part.replace("\\", "_") for part in parts)
 
