@@ -6,15 +6,18 @@ import logging
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
 from tests.support.rest_server import PATIENCE_S, Server, running
 
 from marey_schemas.encoding.codecs import MSGPACK, encode_tree
+from marey_server.process.computing import RENDERING_THREADS
 from marey_server.store.database.connections import Database
+from marey_server.store.database.lanes import Client
 
 MIB = 2**20
 DOCUMENT_BYTES = 6 * MIB
@@ -76,3 +79,19 @@ def test_one_client_cannot_hold_all_memory_of_answers(database: Database, tmp_pa
             assert server.client(other).get("/me").status_code == 200
         wait_until(lambda: memory.held_bytes == 0)
         assert server.client(token).get(path, headers={"Accept": MSGPACK}).status_code == 200
+
+
+def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(database: Database, tmp_path: Path) -> None:
+    with running(database, tmp_path, request_memory_bytes=3 * DOCUMENT_BYTES) as server, ExitStack() as open_until:
+        token = server.make_project()
+        path, services = add_long_document(server, token), server.app.services
+        go_on = Event()
+        open_until.callback(go_on.set)
+        for number in range(RENDERING_THREADS):
+            services.compute_threads.rendering.submit(Client(f"busy-{number}"), go_on.wait)
+        for _ in range(2):
+            open_until.enter_context(reading(server, path, token))
+        wait_until(lambda: services.memory.held_bytes > 1.5 * DOCUMENT_BYTES)  # stored documents are compressed
+        refused = server.client(token).get(path, headers={"Accept": MSGPACK})
+        assert (refused.status_code, refused.json()["code"]) == (503, "memory")
+        go_on.set()

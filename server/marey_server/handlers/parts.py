@@ -52,9 +52,10 @@ def read_part(
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)
     if query.frames is None and query.joints is None:
-        content: Lasting | Loaded = Lasting(found.digest, load)
+        content: Lasting | Loaded = Lasting(found.digest, load, found.size_bytes)
     else:
-        content = Loaded(partial(items.cut_part, load(), query.frame_slice(), query.joints, encoded=encoded))
+        cut = partial(items.cut_part, load(), query.frame_slice(), query.joints, encoded=encoded)
+        content = Loaded(cut, found.size_bytes)
     if query.revision is None:
         return Reply(content, rev=found.rev)
     return Reply(content, rev=f"r{found.revision}", headers={"Cache-Control": IMMUTABLE})

@@ -39,6 +39,8 @@ class Lasting:
 
     digest: str
     load: Callable[[], Mapping[str, Any]]
+    size_bytes: int
+    """Memory that the loaded document needs, in bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,8 @@ class Loaded:
     """Document that was loaded and must still be encoded; one with a digest never changes."""
 
     make: MakeTree
+    size_bytes: int
+    """Memory that the loaded data needs, in bytes."""
     digest: str | None = None
 
 
@@ -102,7 +106,7 @@ def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
     cached = answers.get((content.digest, form.media.form))
     if cached is not None:
         return replace(reply, content=cached, media_type=reply.media_type or str(form.media))
-    return replace(reply, content=Loaded(partial(_itself, content.load()), content.digest))
+    return replace(reply, content=Loaded(partial(_itself, content.load()), content.size_bytes, content.digest))
 
 
 def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:

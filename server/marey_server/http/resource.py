@@ -51,7 +51,7 @@ from marey_server.http.calls import (
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
 from marey_server.http.exchange import JOINED_BYTES, Exchange
-from marey_server.http.reply import AnswerForm, Rendered, Reply, render
+from marey_server.http.reply import AnswerForm, Loaded, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
 from marey_server.process.children import ChildTask
 from marey_server.process.memory import STRANGERS, Holding
@@ -141,11 +141,13 @@ class Resource(Exchange):
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
 
     async def render_document(self, reply: Reply) -> Rendered:
-        """Render a document that was loaded, in a thread for rendering."""
-        rendering = self.services.compute_threads.rendering
-        return await asyncio.wrap_future(
-            rendering.submit(self.client, render, reply, self.answer_form, self.services.answers)
-        )
+        """Render a document that was loaded, in a thread for rendering; until then, its memory is counted."""
+        rendering, answers = self.services.compute_threads.rendering, self.services.answers
+        loaded_bytes = reply.content.size_bytes if isinstance(reply.content, Loaded) else 0
+        self.holding.grow(loaded_bytes)
+        rendered = await asyncio.wrap_future(rendering.submit(self.client, render, reply, self.answer_form, answers))
+        self.holding.shrink(loaded_bytes)
+        return rendered
 
     async def _read(self, function: Callable[[Transaction], T]) -> T:
         queue = self.services.database.queue_read

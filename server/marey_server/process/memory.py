@@ -71,6 +71,12 @@ class Holding:
         self._memory.take(self._owner, self._bytes, more, reserved=self._reserved)
         self._bytes += more
 
+    def shrink(self, less: int) -> None:
+        """Hold fewer bytes."""
+        if less:
+            self._bytes -= less
+            self._memory.give_back(self._owner, less)
+
     def release(self) -> None:
         """Release all held bytes; may be called more than once."""
         held, self._bytes = self._bytes, 0

@@ -93,11 +93,10 @@ class Settings(BaseSettings):
         "10000, or fewer if the limit on open files requires it.",
     )
     request_memory_bytes: int = Field(
-        512 * MIB,
+        256 * MIB,
         ge=MIB,
-        description="Memory in bytes for bodies and long answers of all requests together. Requests without a token "
-        "get "
-        "at most a quarter of it.",
+        description="Memory in bytes for bodies, loaded documents and long answers of all requests together. One "
+        "client gets at most three quarters of it; all requests without a token together, at most a quarter.",
     )
     min_free_bytes: int = Field(
         64 * MIB,

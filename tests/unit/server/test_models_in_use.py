@@ -27,7 +27,7 @@ from marey_server.motions.models import (
 )
 from marey_server.store.items.reading import FoundPart
 
-FOUND = FoundModel("model_1", "sway", FoundPart("sha256:" + "0" * 64, 3, 7))
+FOUND = FoundModel("model_1", "sway", FoundPart("sha256:" + "0" * 64, 3, 7, 1_000))
 
 
 @pytest.fixture(scope="module")

@@ -74,8 +74,9 @@ _PARTS = Prepared(
     )
 )  # fmt: skip
 _PART = (
-    select(item.c.rev, revision_part.c.number, revision_part.c.document_digest)
+    select(item.c.rev, revision_part.c.number, revision_part.c.document_digest, document.c.size_bytes)
     .join(revision_part, revision_part.c.item_id == item.c.id)
+    .join(document, document.c.digest == revision_part.c.document_digest)
     .where(*_THIS_ITEM, item.c.deleted_us.is_(None), revision_part.c.part == bindparam("part"))
 )
 _PARTS_OF_PROJECT = Prepared(
@@ -153,6 +154,8 @@ class FoundPart:
     revision: int
     rev: int
     """The item's `rev`, which a change of its newest revision must name."""
+    size_bytes: int
+    """Size of the stored document."""
 
 
 def find_part(
@@ -167,7 +170,7 @@ def find_part(
         row = tx.first(_PART_OF_REVISION, {**which, "number": revision})
     if row is None:
         raise NotFoundProblem(f"The {kind} {item_id!r} has no part {part!r} at the requested revision.", code="no-part")
-    return FoundPart(row.document_digest, row.number, row.rev)
+    return FoundPart(row.document_digest, row.number, row.rev, row.size_bytes)
 
 
 def load_part(
@@ -213,7 +216,7 @@ def read_part(
     """Find a part of an item and load its whole document."""
     found = find_part(tx, project, kind, item_id, part, revision=revision)
     tree = load_part(tx, found, arrays=arrays)
-    return Part(found.digest, found.revision, found.rev, tree)
+    return Part(found.digest, found.revision, found.rev, found.size_bytes, tree)
 
 
 MOST_BYTES_AT_ONCE = 32 << 20
