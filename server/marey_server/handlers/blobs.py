@@ -6,6 +6,7 @@ from marey_schemas.items import BlobsMissing, BlobsQuery
 from marey_schemas.names import is_digest
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
+from marey_server.handlers.uploads import store_in_pieces
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.receiving import Receiver
 from marey_server.http.reply import Rendered, Reply
@@ -52,6 +53,8 @@ class Blob(BlobSender):
         Others can read them once a document refers to them; bytes without a reference are deleted after a day.
         """
         with await self.receiver.finish() as spool:
+            if spool.digest == digest:
+                await store_in_pieces(self, spool)
             return await self.answer(blobs.put_blob, spool, expected=digest)
 
     @reads(

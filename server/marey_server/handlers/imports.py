@@ -16,6 +16,7 @@ from marey_schemas.options.imports import ImportOptions
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors
+from marey_server.handlers.uploads import store_in_pieces
 from marey_server.http.declarations import Access, Files, RequestBody, writes
 from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
 from marey_server.http.negotiation import body_type
@@ -102,6 +103,7 @@ class ProjectImports(Resource):
 
     async def _keep(self, spool: blobs.Spool) -> None:
         """Store a file as a blob that the caller may use in the project of the import."""
+        await store_in_pieces(self, spool)
         await self.change(_keep, self.path_kwargs["project"], spool)
 
     def _is_large(self, files: Sequence[SourceFile]) -> bool:

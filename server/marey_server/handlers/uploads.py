@@ -1,4 +1,8 @@
-"""Resumable uploads: creation, receipt of pieces, state, and storage as blobs."""
+"""Resumable uploads: creation, receipt of pieces, state, and storage as blobs.
+
+Long bodies of other requests are stored in the same way, because one transaction for all their bytes would delay the
+writes of others.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,56 @@ from marey_server.errors import BadRequestProblem, ConflictProblem
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
-from marey_server.store import uploads
+from marey_server.store import blobs, uploads
 
 PIECE_BYTES = MIB
 """Number of bytes written at a time; an interrupted request loses at most this number."""
 LONGEST_PAUSE_S = 0.2
 """Longest time that a piece waits until the database has caught up, so that uploads do not delay other writes."""
 PAUSE_STEP_S = 0.01
+LONG_BODY_BYTES = 4 * MIB
+"""Size of a body above which it is stored in pieces, in a transaction each, before it becomes a blob."""
+
+
+async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
+    """Store a long body as a blob that the caller may use; do nothing if the body is short or stored already."""
+    if spool.size_bytes <= LONG_BODY_BYTES or await resource.look_up(blobs.sizes_of, [spool.digest]):
+        return
+    upload = await resource.change(uploads.create_upload, spool.size_bytes, digest=spool.digest)
+    try:
+        pieces = spool.chunks()
+        while piece := await resource.compute(next, pieces, b""):
+            upload = await append_piece(resource, upload.id, upload.offset, piece)
+        await finish_upload(resource, upload)
+    except BaseException:
+        await resource.change(uploads.abandon, upload.id)
+        raise
+
+
+async def append_piece(resource: Resource, upload_id: str, offset: int, piece: bytes) -> uploads.StoredUpload:
+    """Store and hash a piece of an upload."""
+    await _let_database_catch_up(resource)
+    appended = await resource.change(uploads.append, upload_id, offset, piece)
+    await resource.compute(resource.services.upload_hashes.add, upload_id, offset, piece)
+    return appended
+
+
+async def _let_database_catch_up(resource: Resource) -> None:
+    deadline_s = time.monotonic() + LONGEST_PAUSE_S
+    while resource.services.database.is_behind and time.monotonic() < deadline_s:
+        await asyncio.sleep(PAUSE_STEP_S)
+
+
+async def finish_upload(resource: Resource, upload: uploads.StoredUpload) -> uploads.StoredUpload:
+    """Hash the bytes that are not hashed yet, then store the upload as a blob."""
+    hashes = resource.services.upload_hashes
+    while (content := await resource.compute(hashes.finish, resource.principal or ANONYMOUS, upload)) is None:
+        upload = await resource.look_up(uploads.read_upload, upload.id)
+        if not upload.is_received:  # another request has finished it
+            return upload
+    upload = await resource.change(uploads.finish, upload.id, *content)
+    hashes.forget(upload.id)
+    return upload
 
 
 def upload_reply(upload: uploads.StoredUpload) -> Reply:
@@ -71,21 +118,15 @@ class UploadResource(Resource):
     async def _append(self) -> None:
         data = bytes(self.piece)
         self.piece.clear()
-        if data:
-            await self._let_database_catch_up()
         try:
-            moved = await self.change(uploads.append, self.upload_id, self.offset, data)
+            if data:
+                moved = await append_piece(self, self.upload_id, self.offset, data)
+            else:
+                moved = await self.change(uploads.append, self.upload_id, self.offset, data)
         except ConflictProblem as error:
             error.headers["Upload-Offset"] = str(error.context.get("offset", ""))
             raise
-        if data:
-            await self.compute(self.services.upload_hashes.add, self.upload_id, self.offset, data)
         self.offset = moved.offset
-
-    async def _let_database_catch_up(self) -> None:
-        deadline_s = time.monotonic() + LONGEST_PAUSE_S
-        while self.services.database.is_behind and time.monotonic() < deadline_s:
-            await asyncio.sleep(PAUSE_STEP_S)
 
     @reads(access=Access.SIGNED_IN, answer=Upload, attempts=True)
     async def get(self, upload: str) -> Rendered:
@@ -108,20 +149,9 @@ class UploadResource(Resource):
             await self._append()
         found = await self.look_up(uploads.read_upload, upload)
         if found.is_received:
-            found = await self._finish(found)
+            found = await finish_upload(self, found)
         uploads.require_intact(found)
         return upload_reply(found)
-
-    async def _finish(self, upload: uploads.StoredUpload) -> uploads.StoredUpload:
-        """Hash the bytes that are not hashed yet, then store the upload as a blob."""
-        hashes = self.services.upload_hashes
-        while (content := await self.compute(hashes.finish, self.caller.principal or ANONYMOUS, upload)) is None:
-            upload = await self.look_up(uploads.read_upload, upload.id)
-            if not upload.is_received:  # another request has finished it
-                return upload
-        upload = await self.change(uploads.finish, upload.id, *content)
-        hashes.forget(upload.id)
-        return upload
 
     @writes(access=Access.SIGNED_IN, attempts=True)
     async def delete(self, upload: str) -> Rendered:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, Table, delete, exists, select
 
 from marey_schemas.jobs import JobState
+from marey_schemas.sizes import MIB
 from marey_server import faults
 from marey_server.access.principal import SYSTEM
 from marey_server.store import uploads
@@ -38,6 +39,8 @@ from marey_server.store.transaction import Transaction
 
 BATCH = 200
 """Number of rows, or of jobs, that are deleted in one transaction."""
+BATCH_BYTES = 16 * MIB
+"""Number of bytes that are deleted in one transaction, so that the writes of others do not wait long for it."""
 MOST_UPLOADS = 10_000
 """Number of rows deleted in one round; databases limit the parameters of a statement."""
 
@@ -81,8 +84,16 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    statement = select(table.c.digest).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
-    return list(tx.execute(statement.order_by(table.c.digest).limit(BATCH)).scalars())
+    """Return the next digests without references: at most `BATCH` rows, and `BATCH_BYTES` or one row."""
+    rows = select(table.c.digest, table.c.size_bytes).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
+    chosen: list[str] = []
+    left_bytes = BATCH_BYTES
+    for row in tx.execute(rows.order_by(table.c.digest).limit(BATCH)):
+        left_bytes -= row.size_bytes
+        if chosen and left_bytes < 0:
+            break
+        chosen.append(row.digest)
+    return chosen
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:

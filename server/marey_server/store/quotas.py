@@ -65,7 +65,7 @@ def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
     if used + more <= limit:
         return
     oldest = tx.execute(select(upload.c.id).where(*_open(user_id)).order_by(upload.c.created_us).limit(1)).scalar()
-    remedy = _RULES[quota].remedy.format(oldest=oldest or "none")
+    remedy = _RULES[quota].remedy.format(oldest=oldest) if used else f"The operator can raise the setting `{quota}`."
     raise _exceeded("You have", quota, _RULES[quota].noun, used, limit, more, remedy)
 
 
