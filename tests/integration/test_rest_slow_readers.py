@@ -81,6 +81,18 @@ def test_one_client_cannot_hold_all_memory_of_answers(database: Database, tmp_pa
         assert server.client(token).get(path, headers={"Accept": MSGPACK}).status_code == 200
 
 
+def test_a_reader_that_leaves_early_is_no_error_in_the_log(
+    database: Database, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with running(database, tmp_path) as server:
+        token = server.make_project()
+        path, services = add_long_document(server, token), server.app.services
+        with reading(server, path, token) as client:
+            client.recv(1000)
+        wait_until(lambda: not services.in_flight and services.memory.held_bytes == 0)
+    assert [record.message for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+
 def test_documents_that_wait_for_a_thread_that_renders_them_count_as_memory(database: Database, tmp_path: Path) -> None:
     with running(database, tmp_path, request_memory_bytes=3 * DOCUMENT_BYTES) as server, ExitStack() as open_until:
         token = server.make_project()

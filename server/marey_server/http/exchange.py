@@ -161,11 +161,19 @@ class Exchange(RequestHandler):
     def compute_etag(self) -> None:
         """Return no tag: resources set their own ETags; hashing an answer, as Tornado does, costs more than sending."""
 
+    def send_error(self, status_code: int = 500, **kwargs: Any) -> None:
+        """Answer an error; if a part of another answer is sent already, close the connection, which shows the client
+        that the answer is incomplete.
+        """
+        if not self._headers_written:
+            super().send_error(status_code, **kwargs)
+            return
+        self.request.connection.close()  # type: ignore[union-attr]
+        if not self._finished:
+            self.finish()
+
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Answer any error with a problem document; details of internal errors are only logged."""
-        if self._headers_written:  # part of an answer is out: only a cut connection says that it is not whole
-            self.request.connection.close()  # type: ignore[union-attr]
-            return
         exc_info = kwargs.get("exc_info")
         error = exc_info[1] if exc_info else HTTPError(status_code)
         if isinstance(error, HTTPError) and error.status_code == 405:  # a method that Tornado itself does not know
