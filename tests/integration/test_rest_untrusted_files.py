@@ -81,7 +81,7 @@ def test_bombs_are_refused_and_the_files_beside_them_are_imported(small: Server)
         ("created", None), ("failed", "memory-limit"), ("failed", "memory-limit"), ("failed", "format-archive"),
         ("created", None),
     ]  # fmt: skip
-    assert f"{MEMORY_MB} MB of memory" in entries[1]["error"]["detail"]
+    assert f"{MEMORY_MB} MiB of memory" in entries[1]["error"]["detail"]
 
 
 def test_a_child_that_dies_costs_one_file(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,8 +152,8 @@ class Watch:
             Stop.CANCELLED: "the job was cancelled",
             Stop.INTERRUPTED: "the worker is being stopped",
             Stop.TIME: f"the job ran longer than its {resources.time_limit_s} s",
-            Stop.MEMORY: f"the job needs more than its {resources.memory_limit_mb} MB of memory",
-            Stop.LOG: f"the job's log grew beyond {LOG_LIMIT_BYTES // MIB} MB",
+            Stop.MEMORY: f"the job needs more than its {resources.memory_limit_mb} MiB of memory",
+            Stop.LOG: f"the job's log grew beyond {LOG_LIMIT_BYTES // MIB} MiB",
         }[stop]
 
 

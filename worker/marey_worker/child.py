@@ -95,7 +95,7 @@ def run_job(run: Run, pipe: Connection) -> End:
         return Failed("invalid-params", str(error), None, retryable=False)
     except MemoryError:
         limit_mb = run.memory_limit_bytes >> 20
-        return Failed("memory-limit", f"the job needs more than its {limit_mb} MB of memory", "memory-limit", True)
+        return Failed("memory-limit", f"the job needs more than its {limit_mb} MiB of memory", "memory-limit", True)
     except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
         sys.stderr.write("".join(traceback.format_exception(error)))
         what = "".join(traceback.format_exception_only(error)).strip()[:DETAIL_CHARACTERS]
@@ -116,7 +116,7 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """Run a task, a gathering job, or a whole job.
+    """Run a task, a parent job, or a whole job.
 
     A kind with a gathering function whose job is not split into tasks runs both functions."""
     params = kind.params.model_validate(run.params)

@@ -336,7 +336,7 @@ class Children:
 
     def _too_much_memory(self) -> ApiProblem:
         return TooLargeProblem(
-            f"This needs more than the {self.limits.memory_mb} MB of memory that the server uses to answer at once "
+            f"This needs more than the {self.limits.memory_mb} MiB of memory that the server uses to answer at once "
             f"(child_memory_mb); {JOB_ADVICE}.",
             code="memory-limit",
         )

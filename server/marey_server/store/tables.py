@@ -301,7 +301,7 @@ job = Table(
     Column("publish_conflict", Document),
     Column("parent_id", ID, ForeignKey("job.id"), index=True),
     Column("position", Integer),
-    Column("size", Integer),  # set for the gathering job of a fan-out, which depends on its tasks
+    Column("size", Integer),  # set for the parent job of a fan-out, which depends on its tasks
     Column("gathers", Boolean, nullable=False, default=False, server_default=false()),  # it is worked on after them
     Column("dependencies_left", Integer, nullable=False, default=0),
     Column("on_failure", String(8), nullable=False, default="fail"),

@@ -100,7 +100,7 @@ def test_no_child_sees_a_secret(children: Children) -> None:
     [
         ("refuse", InvalidProblem, "no-walk", "no walk", True),
         ("fail", ApiProblem, "internal", "log says why", True),
-        ("eat", TooLargeProblem, "memory-limit", "256 MB of memory .*child_memory_mb", False),
+        ("eat", TooLargeProblem, "memory-limit", "256 MiB of memory .*child_memory_mb", False),
         ("burn", TooLargeProblem, "time-limit", "1 s of processor time .*child_processor_s", False),
         ("crash", InvalidProblem, "child-died", "SIGSEGV", False),
     ],

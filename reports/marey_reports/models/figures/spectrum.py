@@ -122,16 +122,14 @@ def draw_reconstruction(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_criterion(subject: ModelSubject) -> Sketch | None:
-    """Draw the criterion over the number of mixture components; return None if the training compared no numbers."""
+    """Draw BIC and AIC over the number of mixture components; return None if the training compared no numbers."""
     candidates = subject.report.candidates
     if not candidates:
         return None
     chosen = len(subject.primitive.mixture.weights)
     counts = np.array([each.components for each in candidates])
     figure = new_figure(6.9, 3.3)
-    panel = add_panel(
-        figure, Place(0.95, 0.65, 3.9, 2.3), x="components of the mixture", y="criterion (less is better)"
-    )
+    panel = add_panel(figure, Place(0.95, 0.65, 3.9, 2.3), x="components of the mixture", y="BIC, AIC (less is better)")
     for name, colour, marker in (("bic", COLOURS[0], "o"), ("aic", REFERENCE, "^")):
         values = np.array([getattr(each, name) for each in candidates])
         panel.plot(counts, values, color=colour, marker=marker, ms=4.5, lw=1.3, label=name.upper())
@@ -157,7 +155,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     }
     caption = (
         f"How many normal distributions the examples are best described by: {chosen}. More describe them better and "
-        "cost more numbers; the criterion weighs one against the other, and the lowest counts unless one of the "
-        "distributions is left with too few examples."
+        "need more parameters; BIC weighs one against the other. The number with the lowest BIC is taken, unless one "
+        "of the distributions would have too few examples. AIC is drawn for comparison."
     )
     return Sketch(figure, tables, caption)

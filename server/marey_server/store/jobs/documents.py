@@ -43,14 +43,14 @@ _UNSAID = {column.key: None if column.default is None else column.default.arg fo
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
     """Return the document of a job that this transaction inserted for the caller, without reading its row.
 
-    The result equals that of `job_documents`. The row must be unchanged, and must not belong to a gathering job.
+    The result equals that of `job_documents`. The row must be unchanged, and must not belong to a parent job.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}
     return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
-    """Return documents for rows of `select_jobs`; that of a gathering job contains the states of its tasks."""
+    """Return documents for rows of `select_jobs`; that of a parent job contains the states of its tasks."""
     gathering = [row for row in rows if row.size is not None]
     children = _children(tx, [row.id for row in gathering])
     at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
@@ -93,7 +93,7 @@ def _children(tx: Transaction, parents: Sequence[str]) -> dict[str, dict[str, in
 def _progress_of_tasks(
     tx: Transaction, heads: Sequence[Row[Any]], children: Mapping[str, dict[str, int]]
 ) -> dict[str, Progress]:
-    """Return the progress of gathering jobs as a number of tasks: ended tasks plus finished shares of running tasks."""
+    """Return the progress of parent jobs as a number of tasks: ended tasks plus finished shares of running tasks."""
     if not heads:
         return {}
     running: dict[str, list[Progress]] = {}

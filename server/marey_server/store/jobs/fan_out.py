@@ -1,4 +1,4 @@
-"""End of fan-outs: combines the results of tasks, or queues the gathering job so that a worker combines them."""
+"""End of fan-outs: combines the results of tasks, or queues the parent job so that a worker combines them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_GATHERED = 1000
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
-    """End a gathering job whose tasks have all ended, or queue it if its kind combines the results in a worker.
+    """End a parent job whose tasks have all ended, or queue it if its kind combines the results in a worker.
 
     It succeeds or is queued if all tasks succeeded; otherwise it is cancelled if cancellation was requested, and failed
     if a task failed.

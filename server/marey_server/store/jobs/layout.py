@@ -1,4 +1,4 @@
-"""Rows for checked submissions: one job, or a gathering job with its tasks."""
+"""Rows for checked submissions: one job, or a parent job with its tasks."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_c
 
 
 def _spread(head: NewJob) -> list[NewJob]:
-    """If a job has several tasks, make it a gathering job and return the tasks, which start when this job starts."""
+    """If a job has several tasks, make it a parent job and return the tasks, which start when this job starts."""
     shares = _shares(head.submission)
     if len(shares) < 2:
         return []

@@ -1,7 +1,7 @@
 """Propagates the end of a job to dependants, fan-out parent and jobs waiting on its cached result, in the same
 transaction.
 
-Rows are locked downstream: a job before its gathering job and before its dependants.
+Rows are locked downstream: a job before its parent job and before its dependants.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PAGE = 1000
 
 
 def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
-    """Propagate these ends to dependants, gathering jobs and jobs that share a result, until no further job ends."""
+    """Propagate these ends to dependants, parent jobs and jobs that share a result, until no further job ends."""
     queue = list(ended)
     while queue:
         page, queue = queue[:PAGE], queue[PAGE:]
@@ -135,7 +135,7 @@ def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
 
 
 def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
-    """Start a gathering job and make its tasks ready."""
+    """Start a parent job and make its tasks ready."""
     tasks = tx.execute(
         select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
     ).all()
@@ -150,7 +150,7 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 
 
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
-    """Count ended tasks at their gathering jobs, and gather the results of those whose last task has ended."""
+    """Count ended tasks at their parent jobs, and gather the results of those whose last task has ended."""
     following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
         left = tx.execute(

@@ -45,7 +45,7 @@ class JobFilters:
     states: tuple[JobState, ...] = ()
     kinds: tuple[str, ...] = ()
     parent: str | None = None
-    """Id of the gathering job whose tasks are listed; without it, tasks are omitted."""
+    """Id of the parent job whose tasks are listed; without it, tasks are omitted."""
     author: str | None = None
 
 
@@ -68,7 +68,7 @@ def list_jobs(
     limit: int = listing.DEFAULT_LIMIT,
     count: bool = False,
 ) -> Page:
-    """Return one page of a project's jobs, without tasks unless the filters name their gathering job."""
+    """Return one page of a project's jobs, without tasks unless the filters name their parent job."""
     project_row = projects.require(tx, project)
     order = listing.parse_order(sort, SORT_KEYS)
     identity = [project_row.id, asdict(filters)]
@@ -114,7 +114,7 @@ def list_outputs(tx: Transaction, job_id: str, cursor: str | None = None, limit:
 
 
 def list_results(tx: Transaction, job_id: str, cursor: str | None = None, limit: int = listing.MAX_LIMIT) -> Page:
-    """Return the results of the tasks of a gathering job in the order of the tasks; empty for other jobs."""
+    """Return the results of the tasks of a parent job in the order of the tasks; empty for other jobs."""
     find_job(tx, job_id)
     order = listing.parse_order("position", {"position": job.c.position, "id": job.c.id})
     statement = select(job.c.id, job.c.position, job.c.state, job.c.result).where(job.c.parent_id == job_id)
@@ -156,7 +156,7 @@ def _conditions(project_id: str, filters: JobFilters) -> list[ColumnElement[bool
 def cancel_job(tx: Transaction, job_id: str, policy: QueuePolicy = DEFAULT_POLICY) -> Job:
     """Cancel a job: at once if it is not running, else when its worker stops or the grace period ends.
 
-    A gathering job is cancelled with its tasks. A repeated cancellation has no effect. Raises `ConflictProblem` for a
+    A parent job is cancelled with its tasks. A repeated cancellation has no effect. Raises `ConflictProblem` for a
     job that has succeeded or failed, and `ForbiddenProblem` for a job of another user.
     """
     row, project = find_job(tx, job_id)
@@ -179,7 +179,7 @@ def _cancel(tx: Transaction, which: ColumnElement[bool], policy: QueuePolicy) ->
     """Cancel the jobs that have not ended, in one statement, and return them in their new states.
 
     The time limit of a running job is set to now, so that its lease cannot be extended beyond the grace period. A
-    gathering job has no lease while its tasks are running, and ends when they have ended.
+    parent job has no lease while its tasks are running, and ends when they have ended.
     """
     running = job.c.state == RUNNING
     leased = and_(running, job.c.lease_expires_us.is_not(None))

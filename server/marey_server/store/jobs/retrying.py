@@ -167,7 +167,7 @@ def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
 
 
 def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs:
-    """Return the inputs of a job; for a gathering job, those of its tasks."""
+    """Return the inputs of a job; for a parent job, those of its tasks."""
     if row.size is None or fanned is None:
         return dict(row.inputs)
     statement = select(job.c.inputs).where(job.c.parent_id == row.id).order_by(job.c.position)
@@ -176,7 +176,7 @@ def _pins_of(tx: Transaction, row: Row[Any], fanned: str | None) -> PinnedInputs
 
 
 def _concurrency_key(tx: Transaction, row: Row[Any]) -> str | None:
-    """Return the concurrency key of a job, or of a gathering job's tasks."""
+    """Return the concurrency key of a job, or of a parent job's tasks."""
     key: str | None = row.concurrency_key
     if row.size is not None:
         key = tx.execute(select(job.c.concurrency_key).where(job.c.parent_id == row.id).limit(1)).scalar()
