@@ -33,7 +33,7 @@ def find(house: House) -> Iterator[Offence]:
     named = _named(house)
     for module in house.modules.values():
         for name, node in module.definitions:
-            if named[node.name] or _is_entry(node):
+            if named[node.name] or _is_entry(node) or _is_of_format(module, node):
                 continue
             yield Offence(
                 module.path, node.lineno, f"{module.name}.{name}", f"{name} is used by tests only, or by nothing"
@@ -69,6 +69,12 @@ def _is_entry(node: Definition) -> bool:
         for decorator in node.decorator_list
         for part in ast.walk(decorator)
     )
+
+
+def _is_of_format(module: Module, node: Definition) -> bool:
+    """Return whether a definition is the reader or writer of a file format, which is found by the name of its module."""
+    folder, _, name = module.name.rpartition(".")
+    return folder == "marey_motion.formats" and node.name in (f"read_{name}", f"write_{name}")
 
 
 def _named(house: House) -> Counter[str]:

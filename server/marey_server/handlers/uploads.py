@@ -29,7 +29,9 @@ LONG_BODY_BYTES = 4 * MIB
 
 async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
     """Store a long body as a blob that the caller may use; do nothing if the body is short or stored already."""
-    if spool.size_bytes <= LONG_BODY_BYTES or await resource.look_up(blobs.sizes_of, [spool.digest]):
+    if spool.size_bytes <= LONG_BODY_BYTES:
+        return
+    if spool.digest in await resource.look_up(blobs.sizes_of, [spool.digest]):
         return
     upload = await resource.change(uploads.create_upload, spool.size_bytes, digest=spool.digest)
     try:

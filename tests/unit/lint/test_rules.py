@@ -120,6 +120,12 @@ def test_names_in_the_docs_are_used() -> None:
     assert not list(unused.find(house(modules, {"docs/use.md": "`project.of_the_sdk()`"})))
 
 
+def test_reader_and_writer_of_a_format_are_used_by_the_name_of_their_module() -> None:
+    text = "def read_toy(): pass\ndef write_toy(): pass\ndef read_other(): pass\n"
+    found = [offence.subject for offence in unused.find(house({"marey_motion.formats.toy": text}))]
+    assert found == ["marey_motion.formats.toy.read_other"]
+
+
 def test_long_functions_and_modules_are_found_and_docstrings_do_not_count() -> None:
     body = "".join(f"    x = {number}\n" for number in range(41))
     docstring = '    """Do it.\n' + "\n" * 50 + '    """\n'
