@@ -16,6 +16,8 @@ import marey_server.app  # noqa: F401 - loads every module, and so every class o
 from marey_client.cli.app import app
 from marey_motion.importing import checks
 from marey_schemas.job_kinds import job_kinds
+from marey_schemas.queries.fields import FIELDS, OPERATORS
+from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
 from marey_server import errors
 from marey_server.process.settings import Settings
 
@@ -31,6 +33,7 @@ def pages() -> dict[str, str]:
         "settings.md": settings_page(),
         "job-kinds.md": job_kinds_page(),
         "checks.md": checks_page(),
+        "queries.md": queries_page(),
         "errors.md": errors_page(),
         "motion-library.md": NOTE + library_page(),
     }
@@ -68,6 +71,31 @@ def _spelled(option: Any, context: typer.Context) -> str:
     """The spellings of an option and what it takes, as its help shows them."""
     shown, _ = option.get_help_record(context)
     return f"`{shown}`"
+
+
+def queries_page() -> str:
+    """The grammar of queries and all fields."""
+    rows = [
+        (f"`{name}`", field.type, ", ".join(f"`{one}`" for one in OPERATORS[field.type]), field.description)
+        for name, field in FIELDS.items()
+    ]
+    text = f"""# Queries
+
+A query selects items: `subject = 02 and action ~ walk and frames > 120 and not warning = foot-slide and tag in (night,
+day)`. `marey ls --query`, the parameter `query` of lists in the REST API, and `list(query=...)` of the SDK take one.
+
+* A condition is a field, an operator and a value: `frames > 120`. `=` and `!=` compare whole values, `~` finds part of
+  a text without regard to the case of letters, `in (a, b)` means one of several values, `has take` that there is one.
+* `not`, `and`, `or` and brackets join conditions; `not` binds strongest, then `and`. `a != b` means `not a = b`.
+* If an item has no value for a field, a condition about it is false, and its negation is true: `not select = best` also
+  selects clips without a choice. A field with several values, such as `tag`, meets a condition if one of them does.
+* Values with spaces or special characters are written between quotation marks: `action = "walk, slow"`. A backslash
+  before a quotation mark or another backslash makes it part of the value.
+* Dates are written as 2026-11-23, or as times: 2026-11-23T15:04:05Z. A day is compared as a whole, in UTC.
+* A query has at most {MOST_CHARACTERS:,} characters, {MOST_CONDITIONS} conditions and {MOST_COMPARED_VALUES} values.
+
+"""
+    return NOTE + text + _table(("field", "type", "operators", "meaning"), rows).rstrip() + "\n"
 
 
 def settings_page() -> str:

@@ -72,7 +72,7 @@ def _is_entry(node: Definition) -> bool:
 
 
 def _is_of_format(module: Module, node: Definition) -> bool:
-    """Return whether a definition is the reader or writer of a file format, which is found by the name of its module."""
+    """Return whether a definition is the reader or writer of a format, which is found by the name of its module."""
     folder, _, name = module.name.rpartition(".")
     return folder == "marey_motion.formats" and node.name in (f"read_{name}", f"write_{name}")
 

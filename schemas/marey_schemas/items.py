@@ -61,6 +61,22 @@ class ItemRevert(Request):
     message: Message = Field("", description="Message of the new revision; empty: a sentence that names the old one.")
 
 
+class HidingCondition(Answer):
+    """Condition of a query, with the number of items that do not meet it."""
+
+    condition: str
+    hides: int = Field(description="Number of items that do not meet this condition.")
+    alone: int = Field(description="Number of items that meet all conditions but this one.")
+
+
+class QueryExplanation(Answer):
+    """Numbers of items that a query selects and hides."""
+
+    items: int = Field(description="Number of items that the query was applied to.")
+    selected: int
+    conditions: tuple[HidingCondition, ...] = Field(description="Conditions of which a selected item meets all.")
+
+
 class PartSummary(Answer):
     """Part of an item: one document."""
 

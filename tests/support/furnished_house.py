@@ -98,6 +98,7 @@ _OTHER_THINGS = {
 _QUERIES = {
     "{item}/export": "?format=original",
     "{item}/difference": "?from=1&to=1",
+    "explanations/{kind}": "?query=has%20tag",
     "{dataset}/blame": f"?entry={CANARY}&kind=graph",
 }
 """Queries of routes that need one, by the endings of their paths."""

@@ -6,6 +6,7 @@ Lengths are metres, times seconds, quaternions w,x,y,z; axes are right-handed wi
 
 from __future__ import annotations
 
+from datetime import date
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -88,15 +89,27 @@ class ClipSource(Request):
     )
 
 
-class ClipInfo(Request):
+class TakeRecord(Request):
+    """Record of the take that a clip comes from; lists show it, and queries refer to it."""
+
+    subject: str | None = Field(None, description="Performer, under a pseudonym.")
+    action: str | None = Field(None, description="What the performer does.")
+    take: str | None = Field(None, max_length=64, description="Take, as the studio numbers it.")
+    shoot_day: date | None = Field(None, description="Day of the recording.")
+    select: Literal["best", "good", "no good"] | None = Field(None, description="Choice of the director.")
+    licence: str | None = Field(None, description="Licence of the recording.")
+    capture_system: str | None = Field(None, description="System that recorded the motion.")
+    consent_until: date | None = Field(None, description="Last day of the performer's consent.")
+
+
+class ClipInfo(TakeRecord):
     """Part `info` of a clip: descriptions by users and importers."""
 
     schema_: Literal["marey/clip-info@1"] = Field("marey/clip-info@1", alias="schema")
-    subject: str | None = None
-    action: str | None = None
     tags: tuple[Tag, ...] = ()
-    capture_system: str | None = None
-    licence: str | None = None
+    consent_for: tuple[Annotated[str, StringConstraints(min_length=1, max_length=64)], ...] | None = Field(
+        None, max_length=32, description="Purposes for which the performer gave consent; absent: not recorded."
+    )
     comment: str | None = None
     source: ClipSource | None = None
     checks: tuple[Check, ...] = ()

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pydantic import Field
 
 from marey_schemas.base import Request
-from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, Revision, Staleness
+from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, QueryExplanation, Revision, Staleness
 from marey_schemas.kinds import Kind
+from marey_schemas.queries.grammar import MOST_CHARACTERS
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
 from marey_server.http.declarations import Access, RequestBody, reads, writes
@@ -44,6 +45,11 @@ class ItemsQuery(CountedPageQuery):
     q: str | None = Field(
         None, max_length=255, description="Return items whose name contains this text, in upper or lower case."
     )
+    query: str | None = Field(
+        None,
+        max_length=MOST_CHARACTERS,
+        description="Query, such as `subject = 02 and frames > 120 and not warning = foot-slide`.",
+    )
     deleted: bool = Field(False, description="Return deleted items instead of existing ones.")
     sort: str = Field("-created_at", max_length=100, description="Sort keys: id, name, created_at, updated_at, frames.")
     fields: CommaSeparated | None = Field(None, description="Members of each item to return; absent: all.")
@@ -61,6 +67,7 @@ class ItemsQuery(CountedPageQuery):
             frames_gte=self.frames_gte,
             frames_lte=self.frames_lte,
             q=self.q,
+            query=self.query,
             deleted=self.deleted,
         )
 
@@ -219,7 +226,30 @@ class StalenessResource(Resource):
         return await self.answer(items.read_staleness, project, kind_of(kind), item)
 
 
+class ExplanationQuery(Request):
+    """Query to explain, and the folder that it is applied to."""
+
+    query: str = Field(max_length=MOST_CHARACTERS, description="Query, as for the list of items.")
+    collection: str | None = Field(
+        None, max_length=1024, description="Count only items in this folder or below it; absent: in the whole project."
+    )
+
+
+class ExplanationResource(Resource):
+    """Effect of a query on the items of a kind."""
+
+    path = "/projects/{project}/explanations/{kind}"
+    tag = "Items"
+
+    @reads(access=Access.READER, query=ExplanationQuery, answer=QueryExplanation)
+    async def get(self, project: str, kind: str, query: ExplanationQuery) -> Rendered:
+        """Return the number of items that a query selects, and the numbers that each of its conditions hides."""
+        filters = ItemFilters(collection=query.collection)
+        return await self.answer(items.explain_query, project, kind_of(kind), filters, query.query)
+
+
 RESOURCES: tuple[type[Resource], ...] = (
+    ExplanationResource,
     ItemsOfKind,
     ItemResource,
     ItemRestoration,

@@ -7,7 +7,10 @@ import sqlalchemy
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, quoted_name
+from tests.support.store_fixtures import Lab
 
+from marey_schemas.kinds import Kind
+from marey_server.store import items
 from marey_server.store.database import schema
 from marey_server.store.database.connections import Database
 from marey_server.store.tables import metadata
@@ -71,6 +74,29 @@ def test_upgrading_again_keeps_everything(database: Database, database_url: str)
     with database.engine.connect() as connection:
         assert len(before) == 2
         assert connection.execute(keys).all() == before
+
+
+def test_an_upgrade_copies_take_records_to_the_summaries_of_clips(lab: Lab, database_url: str) -> None:
+    info = {
+        "schema": "marey/clip-info@1",
+        "subject": "02",
+        "licence": "CC0",
+        "checks": [{"code": "gap", "message": ""}],
+    }
+    rig = lab.add_skeleton()
+    clips = [lab.add_clip(rig, f"take {number}", info=info, seed=number) for number in range(5)]
+    plain = lab.add_clip(rig, "plain")
+    table = metadata.tables["item"]
+    with lab.database.engine.begin() as connection:
+        for clip in clips:
+            earlier = {name: value for name, value in clip.summary.items() if name not in ("subject", "licence")}
+            connection.execute(sqlalchemy.update(table).where(table.c.id == clip.id).values(summary=earlier))
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0015'")
+    schema.upgrade_schema(database_url)
+    for clip in (*clips, plain):
+        assert lab.read(items.read_item, "lab", Kind.CLIP, clip.id).summary == clip.summary
+    assert clips[0].summary["subject"] == "02"
+    assert "subject" not in plain.summary
 
 
 def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

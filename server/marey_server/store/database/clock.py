@@ -105,6 +105,11 @@ def set_high_water(connection: Connection, us: int) -> None:
         connection.execute(insert(server_state).values(key=_HIGH_WATER, value=us))
 
 
+def micros_of(moment: datetime) -> int:
+    """Return a time of a document as it is stored."""
+    return (moment - _EPOCH) // timedelta(microseconds=1)
+
+
 def datetime_of(us: int) -> datetime:
     """Return a stored time as the `datetime` of documents."""
     return _EPOCH + timedelta(microseconds=us)

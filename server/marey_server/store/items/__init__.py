@@ -18,7 +18,7 @@ from marey_server.store.items.changing import (
 )
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
-from marey_server.store.items.listing import ItemFilters, list_items
+from marey_server.store.items.listing import ItemFilters, explain_query, list_items
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import (
     FoundPart,
@@ -43,6 +43,7 @@ __all__ = [
     "create_item",
     "cut_part",
     "delete_item",
+    "explain_query",
     "find_annotated_clip",
     "find_annotation",
     "find_contents",

@@ -6,13 +6,15 @@ from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, select
+from sqlalchemy import ColumnElement, and_, case, func, not_, select, true
 
 from marey_schemas.access import Role
-from marey_schemas.items import Item, Page
+from marey_schemas.items import HidingCondition, Item, Page, QueryExplanation
 from marey_schemas.kinds import Kind
+from marey_schemas.queries.grammar import Query, QueryError, parse, parts_of
 from marey_server.errors import BadRequestProblem, ForbiddenProblem
 from marey_server.store import collections, listing, projects
+from marey_server.store.items.querying import sql_of
 from marey_server.store.items.reading import item_rows, shown_items
 from marey_server.store.tables import collection, item, item_tag
 from marey_server.store.transaction import Transaction
@@ -49,6 +51,8 @@ class ItemFilters:
     frames_lte: int | None = None
     q: str | None = None
     """Part of the name, without regard to case."""
+    query: str | None = None
+    """Query of `marey_schemas.queries`."""
     deleted: bool = False
 
     @property
@@ -127,7 +131,39 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
         conditions.append(item.c.frames <= filters.frames_lte)
     if filters.q:
         conditions.append(item.c.name_folded.contains(filters.q.casefold(), autoescape=True))
+    if filters.query is not None:
+        conditions.append(sql_of(read_query(filters.query), project_id))
     return conditions
+
+
+def read_query(text: str) -> Query:
+    """Return the query in a text. Raises `BadRequestProblem`, which names the place of the fault."""
+    try:
+        return parse(text)
+    except QueryError as error:
+        raise BadRequestProblem(str(error), code="bad-query", context={"column": error.column}) from None
+
+
+def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilters, query: str) -> QueryExplanation:
+    """Count the items that a query selects among those that match `filters`, and those that each of its parts hides.
+
+    A part is a condition that must be true for every selected item: the query itself, or what `and` joins.
+    """
+    project_row = projects.require(tx, project)
+    parts = parts_of(read_query(query))
+    met = [sql_of(part, project_row.id) for part in parts]
+    columns: list[ColumnElement[int]] = [func.count(), func.count(case((and_(*met), 1)))]
+    for number, one in enumerate(met):
+        others = [other for at, other in enumerate(met) if at != number]
+        columns += [func.count(case((not_(one), 1))), func.count(case((and_(true(), *others, not_(one)), 1)))]
+    conditions = _conditions(project_row.id, kind, filters)
+    counts = tx.execute(select(*columns).select_from(item).where(*conditions)).one()
+    total, selected, *hidden = tuple(counts)
+    shown = [
+        HidingCondition(condition=part.source, hides=hides, alone=alone)
+        for part, hides, alone in zip(parts, hidden[::2], hidden[1::2], strict=True)
+    ]
+    return QueryExplanation(items=total, selected=selected, conditions=tuple(shown))
 
 
 def _below(project_id: str, path: str) -> Any:

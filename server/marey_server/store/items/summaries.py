@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from marey_schemas.documents.clips import TakeRecord
 from marey_schemas.kinds import Kind
 
 LABELS_SHOWN = 32
@@ -33,11 +34,17 @@ def summarise(kind: Kind, bodies: Mapping[str, dict[str, Any]]) -> Summary:
     if kind is Kind.ANNOTATION:
         return Summary(_said(bodies["annotation"]))
     if kind is Kind.CLIP:
-        checks = bodies.get("info", {}).get("checks", ())
-        return _moved(bodies["motion"], {"warnings": sorted({check["code"] for check in checks})})
+        info = bodies.get("info", {})
+        warnings = sorted({check["code"] for check in info.get("checks", ())})
+        return _moved(bodies["motion"], {"warnings": warnings, **take_record(info)})
     if kind is Kind.PROCESSED:
         return _moved(bodies["motion"], _aligned(bodies["info"]))
     return Summary({})
+
+
+def take_record(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of the take record that the part `info` of a clip has."""
+    return {name: info[name] for name in TakeRecord.model_fields if info.get(name)}
 
 
 def _moved(motion: Mapping[str, Any], known: Mapping[str, Any]) -> Summary:

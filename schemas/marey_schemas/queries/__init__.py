@@ -1,0 +1,1 @@
+"""Queries that select items: their fields, and their grammar."""

@@ -1,0 +1,48 @@
+"""Fields that queries refer to, and the operators that compare them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+FieldType = Literal["text", "number", "date"]
+OPERATORS: dict[FieldType, tuple[str, ...]] = {
+    "text": ("=", "!=", "~", "in", "has"),
+    "number": ("=", "!=", "<", "<=", ">", ">=", "in", "has"),
+    "date": ("=", "!=", "<", "<=", ">", ">=", "in", "has"),
+}
+"""Operators by the type of a field."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueryField:
+    """Field of items that queries refer to by name."""
+
+    type: FieldType
+    description: str
+
+
+FIELDS: dict[str, QueryField] = {
+    "name": QueryField("text", "Name of the item."),
+    "path": QueryField("text", "Folder and name, as in `walks/take-01`."),
+    "folder": QueryField("text", "Folder that contains the item, or a folder above it."),
+    "tag": QueryField("text", "Any tag of the item."),
+    "revision": QueryField("number", "Number of the newest revision."),
+    "created": QueryField("date", "Day on which the item was created, or time; in UTC."),
+    "updated": QueryField("date", "Day of the last change, or time; in UTC."),
+    "frames": QueryField("number", "Number of frames."),
+    "duration": QueryField("number", "Duration in seconds."),
+    "rate": QueryField("number", "Frames per second."),
+    "joints": QueryField("number", "Number of joints."),
+    "skeleton": QueryField("text", "Name or id of the skeleton."),
+    "warning": QueryField("text", "Code of any warning of the import checks."),
+    "subject": QueryField("text", "Performer, under a pseudonym."),
+    "action": QueryField("text", "What the performer does."),
+    "take": QueryField("text", "Take, as the studio numbers it."),
+    "shoot_day": QueryField("date", "Day of the recording."),
+    "select": QueryField("text", "Choice of the director: `best`, `good` or `no good`."),
+    "licence": QueryField("text", "Licence of the recording."),
+    "capture_system": QueryField("text", "System that recorded the motion."),
+    "consent_until": QueryField("date", "Last day of the performer's consent."),
+}
+"""All fields by name."""

@@ -1,0 +1,270 @@
+"""Queries that select clips and other items, such as `subject = 02 and frames > 120 and not warning = foot-slide`.
+
+`parse` turns the text of a query into conditions over the fields in `FIELDS`. Every condition is either true or false
+for an item: one about a value that the item does not have is false, and its negation is true.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from difflib import get_close_matches
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
+
+from marey_schemas.queries.fields import FIELDS, OPERATORS, QueryField
+from marey_schemas.wording import one_of
+
+if TYPE_CHECKING:
+    from lark import Lark
+
+MOST_CHARACTERS = 2_000
+MOST_CONDITIONS = 50
+MOST_COMPARED_VALUES = 200
+"""Greatest number of values of all conditions together."""
+DEEPEST = 30
+"""Greatest number of brackets and negations inside each other."""
+
+Operator = Literal["=", "~", "<", "<=", ">", ">=", "has"]
+"""Operators of conditions; `!=` and `in` are written with these."""
+_GRAMMAR = r"""
+    ?start: disjunction
+    ?disjunction: conjunction (_OR conjunction)*
+    ?conjunction: negation (_AND negation)*
+    ?negation: _NOT negation -> negated
+        | "(" disjunction ")" -> bracketed
+        | comparison
+    comparison: WORD OPERATOR _value
+        | WORD _IN "(" _value ("," _value)* ")" -> membership
+        | _HAS WORD -> presence
+    _value: WORD | TEXT
+    OPERATOR: "!=" | "<=" | ">=" | "=" | "~" | "<" | ">"
+    TEXT: /"([^"\\]|\\.)*"/s | /'([^'\\]|\\.)*'/s
+    _AND: /and(?![^\s()"',=~<>!\\])/i
+    _OR: /or(?![^\s()"',=~<>!\\])/i
+    _NOT: /not(?![^\s()"',=~<>!\\])/i
+    _IN: /in(?![^\s()"',=~<>!\\])/i
+    _HAS: /has(?![^\s()"',=~<>!\\])/i
+    WORD.-1: /[^\s()"',=~<>!\\]+/
+    %ignore /\s+/
+"""
+
+
+class QueryError(ValueError):
+    """Error of a query that cannot be understood; `column` is the place of the fault, counted from 1."""
+
+    def __init__(self, message: str, column: int) -> None:
+        super().__init__(f"query, column {column}: {message}")
+        self.column = column
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Comparison of a field with values, of which one must match; `has` has no values.
+
+    Values are numbers for fields of the type `number`, texts for the type `text`, and for the type `date` texts as in
+    `2026-11-23` or times with a zone.
+    """
+
+    field: str
+    operator: Operator
+    values: tuple[str | float | date | datetime, ...]
+    source: str
+    """The condition as the user wrote it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Negation:
+    """Query that is true where another is false."""
+
+    query: Query
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Junction:
+    """Queries of which all must be true, or at least one."""
+
+    word: Literal["and", "or"]
+    queries: tuple[Query, ...]
+    source: str
+
+
+Query = Condition | Negation | Junction
+
+
+def parse(text: str) -> Query:
+    """Return the query in a text. Raises `QueryError`, with the place and what is expected there."""
+    from lark.exceptions import UnexpectedCharacters, UnexpectedEOF, UnexpectedToken
+
+    if len(text) > MOST_CHARACTERS:
+        raise QueryError(f"the query has {len(text)} characters; at most {MOST_CHARACTERS} are accepted", 1)
+    if "\0" in text:
+        raise QueryError("a query contains no NUL character", text.index("\0") + 1)
+    if not text.strip():
+        raise QueryError("the query is empty; write a condition, such as frames > 120", 1)
+    _require_shallow(text)
+    try:
+        tree = _parser().parse(text)
+    except UnexpectedCharacters as error:
+        at = error.pos_in_stream or 0
+        raise QueryError(f"{text[at]!r} is not expected here; {_QUOTE}", at + 1) from None
+    except (UnexpectedToken, UnexpectedEOF) as error:
+        raise _unexpected(text, error) from None
+    query = _Reader(text).read(tree)
+    conditions = list(conditions_of(query))
+    if len(conditions) > MOST_CONDITIONS or sum(len(one.values) for one in conditions) > MOST_COMPARED_VALUES:
+        raise QueryError(
+            f"at most {MOST_CONDITIONS} conditions with {MOST_COMPARED_VALUES} values together are accepted", 1
+        )
+    return query
+
+
+def conditions_of(query: Query) -> Iterator[Condition]:
+    """Yield all conditions of a query."""
+    if isinstance(query, Condition):
+        yield query
+    elif isinstance(query, Negation):
+        yield from conditions_of(query.query)
+    else:
+        for part in query.queries:
+            yield from conditions_of(part)
+
+
+def parts_of(query: Query) -> tuple[Query, ...]:
+    """Return the queries that must all be true for the query to be true."""
+    return query.queries if isinstance(query, Junction) and query.word == "and" else (query,)
+
+
+@cache
+def _parser() -> Lark:
+    from lark import Lark
+
+    return Lark(_GRAMMAR, parser="lalr", propagate_positions=True, maybe_placeholders=False)
+
+
+def _require_shallow(text: str) -> None:
+    """Check the depth of brackets and negations before they are parsed; quoted ones count, too, which does no harm."""
+    depth = 0
+    for column, character in enumerate(text, 1):
+        depth += (character == "(") - (character == ")")
+        if depth > DEEPEST:
+            raise QueryError(f"more than {DEEPEST} brackets are open", column)
+    if len([word for word in text.lower().split() if word == "not"]) > MOST_CONDITIONS:
+        raise QueryError(f"at most {MOST_CONDITIONS} negations are accepted", 1)
+
+
+_QUOTE = "put values with spaces or special characters between quotation marks"
+_EXPECTED = {
+    "OPERATOR": "an operator such as = or >",
+    "WORD": "a field or a value",
+    "TEXT": "",
+    "LPAR": "an opening bracket",
+    "RPAR": "a closing bracket",
+    "COMMA": "a comma",
+    "_AND": "'and'",
+    "_OR": "'or'",
+    "_NOT": "'not'",
+    "_IN": "'in'",
+    "_HAS": "'has'",
+    "$END": "the end",
+}
+
+
+def _unexpected(text: str, error: Any) -> QueryError:
+    """Return the error for a word in the wrong place."""
+    token = getattr(error, "token", None)
+    accepted: set[str] = getattr(error, "accepts", None) or getattr(error, "expected", None) or set()
+    names = sorted(accepted)
+    expected = one_of([_EXPECTED[name] for name in names if _EXPECTED[name]])
+    if token is None or token.type == "$END":
+        return QueryError(f"the query ends too early; expected {expected}", len(text.rstrip()) + 1)
+    return QueryError(f"expected {expected}, but found {str(token)!r}", _column(token))
+
+
+class _Reader:
+    """Conversion of a syntax tree to a query, with checks of fields and values."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def read(self, tree: Any) -> Query:
+        """Return the query of a node."""
+        source = self._text[tree.meta.start_pos : tree.meta.end_pos]
+        if tree.data == "bracketed":
+            return self.read(tree.children[0])
+        if tree.data == "negated":
+            return Negation(self.read(tree.children[0]), source)
+        if tree.data in ("conjunction", "disjunction"):
+            word: Literal["and", "or"] = "and" if tree.data == "conjunction" else "or"
+            return Junction(word, tuple(self.read(child) for child in tree.children), source)
+        return self._condition(tree, source)
+
+    def _condition(self, tree: Any, source: str) -> Query:
+        field = str(tree.children[0]).lower()
+        known = _require_field(tree.children[0])
+        if tree.data == "presence":
+            return Condition(field, "has", (), source)
+        if tree.data == "membership":
+            values = tuple(_value(known, token) for token in tree.children[1:])
+            return Condition(field, "=", values, source)
+        operator = tree.children[1]
+        if operator not in OPERATORS[known.type]:
+            allowed = one_of(OPERATORS[known.type])
+            raise QueryError(f"the field {field!r} is a {known.type}; compare it with {allowed}", _column(operator))
+        value = _value(known, tree.children[2])
+        if operator == "!=":
+            return Negation(Condition(field, "=", (value,), source), source)
+        return Condition(field, operator.value, (value,), source)
+
+
+def _column(token: Any) -> int:
+    """Return the place of a word in the whole query, counted from 1."""
+    return int(token.start_pos) + 1
+
+
+def _require_field(token: Any) -> QueryField:
+    name = str(token).lower()
+    if name in FIELDS:
+        return FIELDS[name]
+    near = get_close_matches(name, FIELDS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"the fields are {', '.join(FIELDS)}"
+    raise QueryError(f"there is no field {str(token)!r}; {hint}", _column(token))
+
+
+def _value(field: QueryField, token: Any) -> str | float | date | datetime:
+    text = str(token)
+    if token.type == "TEXT":
+        text = _unquoted(text[1:-1])
+    if field.type == "text":
+        return text
+    if field.type == "number":
+        return _number(text, _column(token))
+    return _date(text, _column(token))
+
+
+def _unquoted(text: str) -> str:
+    """Return a quoted text without its backslashes."""
+    characters = iter(text)
+    return "".join(next(characters) if character == "\\" else character for character in characters)
+
+
+def _number(text: str, column: int) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        raise QueryError(f"{text!r} is not a number", column) from None
+    if not abs(number) < 1e15:
+        raise QueryError(f"{text!r} is not a number between -1e15 and 1e15", column)
+    return number
+
+
+def _date(text: str, column: int) -> date | datetime:
+    try:
+        if len(text) == len("2026-11-23"):
+            return date.fromisoformat(text)
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise QueryError(f"{text!r} is not a date; write it as 2026-11-23 or 2026-11-23T15:04:05Z", column) from None
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

@@ -1,0 +1,226 @@
+"""Queries as SQL: the condition that the rows of a list of items must meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import date, datetime, timedelta
+from string import ascii_lowercase, ascii_uppercase
+from typing import Any
+
+from sqlalchemy import Boolean, ColumnElement, Text, and_, case, exists, false, func, not_, or_, select, true
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.sql.functions import FunctionElement
+
+from marey_schemas.queries.fields import FIELDS
+from marey_schemas.queries.grammar import Condition, Negation, Query
+from marey_server.store import collections
+from marey_server.store.database.clock import DAY_US, micros_of
+from marey_server.store.tables import collection, item, item_tag
+
+Comparison = Callable[[Condition, str], ColumnElement[bool]]
+"""Function that returns the SQL of a condition in a project; the SQL is never null."""
+
+
+def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
+    """Return the SQL that is true for the items of a project that a query selects."""
+    if isinstance(query, Condition):
+        return COMPARISONS[query.field](query, project_id)
+    if isinstance(query, Negation):
+        return not_(sql_of(query.query, project_id))
+    join = and_ if query.word == "and" else or_
+    return join(*(sql_of(part, project_id) for part in query.queries))
+
+
+def _any(made: list[ColumnElement[bool]]) -> ColumnElement[bool]:
+    return or_(false(), *made)
+
+
+def _is_true(condition: ColumnElement[bool]) -> ColumnElement[bool]:
+    """Return a condition that is false instead of null."""
+    return func.coalesce(condition, false())
+
+
+class _LowerAscii(FunctionElement[str]):
+    """A text with the letters A to Z in lower case; others depend on the database and its collation."""
+
+    type = Text()
+    inherit_cache = True
+
+
+@compiles(_LowerAscii)
+def _lower(element: _LowerAscii, compiler: SQLCompiler, **options: Any) -> str:
+    return f"lower({compiler.process(element.clauses, **options)})"
+
+
+@compiles(_LowerAscii, "postgresql")
+def _lower_on_postgres(element: _LowerAscii, compiler: SQLCompiler, **options: Any) -> str:
+    return f'lower(({compiler.process(element.clauses, **options)}) COLLATE "C")'
+
+
+_TO_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
+
+
+def _contains(value: ColumnElement[Any], part: object) -> ColumnElement[bool]:
+    """Return whether a text contains another, without regard to the case of A to Z."""
+    return _LowerAscii(value).contains(str(part).translate(_TO_LOWER), autoescape=True)
+
+
+def _texts(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
+    """Return the SQL of a condition about a text that may be null."""
+    if condition.operator == "has":
+        return value.is_not(None)
+    if condition.operator == "~":
+        return _is_true(_any([_contains(value, part) for part in condition.values]))
+    return _is_true(value.in_([str(one) for one in condition.values]))
+
+
+def _numbers(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
+    """Return the SQL of a condition about a number that may be null."""
+    if condition.operator == "has":
+        return value.is_not(None)
+    if condition.operator == "=":
+        return _is_true(value.in_(condition.values))
+    return _is_true(_ordered(value, condition.operator, condition.values[0]))
+
+
+def _ordered(value: ColumnElement[Any], operator: str, limit: object) -> ColumnElement[bool]:
+    compared: ColumnElement[bool] = value.op(operator, is_comparison=True, return_type=Boolean())(limit)
+    return compared
+
+
+def _text_of(name: str) -> Comparison:
+    return lambda condition, _: _texts(item.c.summary[name].as_string(), condition)
+
+
+def _number_of(name: str) -> Comparison:
+    return lambda condition, _: _numbers(item.c.summary[name].as_float(), condition)
+
+
+def _day_of(name: str) -> Comparison:
+    """Compare a day, which is stored as in `2026-11-23`; of a time, only the day counts."""
+
+    def compare(condition: Condition, _: str) -> ColumnElement[bool]:
+        stored: ColumnElement[Any] = item.c.summary[name].as_string()
+        if condition.operator == "has":
+            return stored.is_not(None)
+        days = [one.isoformat()[: len("2026-11-23")] for one in condition.values if isinstance(one, date)]
+        if condition.operator == "=":
+            return _is_true(stored.in_(days))
+        return _is_true(_ordered(stored, condition.operator, days[0]))
+
+    return compare
+
+
+def _time_of(column: ColumnElement[Any]) -> Comparison:
+    """Compare a time in microseconds; a day stands for all its times in UTC."""
+
+    def compare(condition: Condition, _: str) -> ColumnElement[bool]:
+        if condition.operator == "has":
+            return true()
+        made = []
+        for one in condition.values:
+            first_us, length_us = _span(one)
+            made.append(
+                {
+                    "=": and_(column >= first_us, column < first_us + length_us),
+                    "<": column < first_us,
+                    "<=": column < first_us + length_us,
+                    ">": column >= first_us + length_us,
+                    ">=": column >= first_us,
+                }[condition.operator]
+            )
+        return _any(made)
+
+    return compare
+
+
+def _span(one: object) -> tuple[int, int]:
+    """Return the first microsecond of a day or time, and the number of its microseconds."""
+    if isinstance(one, datetime):
+        return micros_of(one), 1
+    assert isinstance(one, date)
+    return (one - date(1970, 1, 1)) // timedelta(days=1) * DAY_US, DAY_US
+
+
+def _name(condition: Condition, _: str) -> ColumnElement[bool]:
+    if condition.operator == "has":
+        return true()
+    if condition.operator == "~":
+        parts = [str(part).casefold() for part in condition.values]
+        return _any([item.c.name_folded.contains(part, autoescape=True) for part in parts])
+    return item.c.name.in_(condition.values)
+
+
+def _path(condition: Condition, _: str) -> ColumnElement[bool]:
+    place = collection.alias("place")  # the list itself may join the collections
+    folder = select(place.c.path).where(place.c.id == item.c.collection_id).correlate(item).scalar_subquery()
+    return _texts(case((folder == "", item.c.name), else_=folder + "/" + item.c.name), condition)
+
+
+def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
+    """Compare the folder: with `=` also the folders above, with `~` the path of the folder itself."""
+    own = collection.c.project_id == project_id
+    if condition.operator == "has":
+        chosen = collection.c.path != ""
+    elif condition.operator == "~":
+        chosen = _any([_contains(collection.c.path, part) for part in condition.values])
+    else:
+        chosen = _any([collections.at_or_below(str(path).strip("/")) for path in condition.values])
+    return item.c.collection_id.in_(select(collection.c.id).where(own, chosen).correlate(None))
+
+
+def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
+    own = item_tag.c.item_id == item.c.id
+    return exists().where(own, _texts(item_tag.c.tag, condition)).correlate(item)
+
+
+def _warning(condition: Condition, _: str) -> ColumnElement[bool]:
+    """Compare codes in a stored list, as in `["foot-slide", "gap"]`; codes have no quotation marks or commas."""
+    stored: ColumnElement[Any] = item.c.summary["warnings"].as_string()
+    if condition.operator == "has":
+        return _is_true(and_(stored.is_not(None), stored != "[]"))
+    parts = [str(part) for part in condition.values if not {'"', ",", "[", "]", " "} & set(str(part))]
+    if condition.operator == "=":
+        return _is_true(_any([stored.contains(f'"{part}"', autoescape=True) for part in parts if part]))
+    return _is_true(_any([and_(_contains(stored, part), stored != "[]") for part in parts]))
+
+
+def _skeleton(condition: Condition, project_id: str) -> ColumnElement[bool]:
+    if condition.operator == "has":
+        return item.c.skeleton_id.is_not(None)
+    rig = item.alias("rig")
+    named: ColumnElement[bool] = rig.c.name.in_(condition.values)
+    if condition.operator == "~":
+        parts = [str(part).casefold() for part in condition.values]
+        named = _any([rig.c.name_folded.contains(part, autoescape=True) for part in parts])
+    ids = select(rig.c.id).where(rig.c.project_id == project_id, rig.c.deleted_us.is_(None), named)
+    found = item.c.skeleton_id.in_(ids)
+    return _is_true(found if condition.operator == "~" else or_(found, item.c.skeleton_id.in_(condition.values)))
+
+
+COMPARISONS: dict[str, Comparison] = {
+    "name": _name,
+    "path": _path,
+    "folder": _folder,
+    "tag": _tag,
+    "revision": lambda condition, _: _numbers(item.c.head, condition),
+    "created": _time_of(item.c.created_us),
+    "updated": _time_of(item.c.updated_us),
+    "frames": _number_of("frames"),
+    "duration": _number_of("duration_s"),
+    "rate": _number_of("frame_rate_hz"),
+    "joints": _number_of("joints"),
+    "skeleton": _skeleton,
+    "warning": _warning,
+    "subject": _text_of("subject"),
+    "action": _text_of("action"),
+    "take": _text_of("take"),
+    "shoot_day": _day_of("shoot_day"),
+    "select": _text_of("select"),
+    "licence": _text_of("licence"),
+    "capture_system": _text_of("capture_system"),
+    "consent_until": _day_of("consent_until"),
+}
+"""Comparisons by the name of the field."""
+assert set(COMPARISONS) == set(FIELDS), "every field of queries needs a comparison"

@@ -1,0 +1,216 @@
+"""Queries in SQL select the same items as a plain evaluation of their conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import date, datetime, timedelta
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from tests.support.store_fixtures import Lab
+from tests.support.tiers import examples
+
+from marey_schemas.items import Item
+from marey_schemas.kinds import Kind
+from marey_schemas.queries.fields import FIELDS, OPERATORS
+from marey_schemas.queries.grammar import Condition, Negation, Query, parse
+from marey_server.errors import BadRequestProblem
+from marey_server.store import items
+from marey_server.store.database.connections import Database
+from marey_server.store.items import ItemFilters
+
+INFOS: tuple[dict[str, Any], ...] = (
+    {"subject": "02", "action": "Walk, slow", "licence": "CC-BY 4.0", "select": "best", "shoot_day": "2025-02-28"},
+    {"subject": "2", "action": "walk", "take": "7b", "shoot_day": "2025-03-01", "consent_until": "2026-01-31"},
+    {"action": "Übung 100%", "checks": [{"code": "foot-slide", "message": "m"}], "capture_system": "Vicon_8"},
+    {"checks": [{"code": "foot", "message": "m"}, {"code": "gap", "message": "m"}], "select": "no good"},
+    {},
+)
+PLACES = ("", "raw", "raw/day 1", "rawer")
+TAGS = ((), ("night",), ("night", "day"))
+TEXTS = (
+    "02", "2", "walk", "WALK", "Walk, slow", "%", "_", "Übung", "übung", "raw", "raw/day 1", "take-1", "raw/take-1",
+    "night", "day", "foot-slide", "foot", "gap", ",", '"', "best", "no good", "rig", "RIG", "",
+)  # fmt: skip
+NUMBERS = ("0", "1", "3", "4.5", "120", "0.025", "1e3")
+DATES = ("2025-02-28", "2025-03-01", "2025-03-01T10:00", "2026-01-31", "1999-12-31", "2999-01-01")
+
+
+class QueriedLab(Lab):
+    """A lab with clips of all combinations of folders and take records, of two skeletons."""
+
+    def __init__(self, database: Database) -> None:
+        super().__init__(database)
+        rigs = [self.add_skeleton("rig"), self.add_skeleton("Other_rig", joints=4)]
+        for number, info in enumerate(INFOS * len(PLACES)):
+            joints = 3 + number % 2
+            self.add_clip(
+                rigs[number % 2],
+                f"take-{number}",
+                collection=PLACES[number % len(PLACES)],
+                tags=TAGS[number % len(TAGS)],
+                frames=2 + number % 4,
+                joints=joints,
+                seed=number,
+                info={"schema": "marey/clip-info@1", **info} if info else None,
+            )
+        self.rigs = {rig.id: rig.name for rig in rigs}
+        self.clips: list[Item] = self.read(items.list_items, "lab", Kind.CLIP, limit=100).items
+
+
+@pytest.fixture
+def queried(database: Database) -> QueriedLab:
+    return QueriedLab(database)
+
+
+def values_of(lab: QueriedLab, clip: Item, field: str) -> list[Any]:
+    """Return the values that a clip has for a field."""
+    summary = clip.summary
+    known: dict[str, list[Any]] = {
+        "name": [clip.name],
+        "path": [clip.path],
+        "tag": list(clip.tags),
+        "revision": [clip.revision],
+        "created": [clip.created_at],
+        "updated": [clip.updated_at],
+        "frames": [summary["frames"]],
+        "duration": [summary["duration_s"]],
+        "rate": [summary["frame_rate_hz"]],
+        "joints": [summary["joints"]],
+        "skeleton": [lab.rigs[summary["skeleton"]], summary["skeleton"]],
+        "warning": summary["warnings"],
+        "folder": [clip.collection] if clip.collection else [],
+    }
+    return known[field] if field in known else [summary[field]] if field in summary else []
+
+
+def folded(field: str, text: str) -> str:
+    return text.casefold() if field in ("name", "skeleton") else "".join(c.lower() if c.isascii() else c for c in text)
+
+
+def meets(field: str, operator: str, value: Any, wanted: Any) -> bool:
+    """Return whether a value of a clip meets a condition with one wanted value."""
+    if operator == "~":
+        return folded(field, wanted) in folded(field, value)
+    if field == "folder":
+        path = wanted.strip("/")
+        return not path or value == path or value.startswith(f"{path}/")
+    if isinstance(wanted, date) and isinstance(value, str):  # a day
+        value, wanted = date.fromisoformat(value), date(wanted.year, wanted.month, wanted.day)
+    elif isinstance(wanted, date) and not isinstance(wanted, datetime):
+        value = value.date()
+    compared: bool = {
+        "=": value == wanted,
+        "<": operator == "<" and value < wanted,
+        "<=": operator == "<=" and value <= wanted,
+        ">": operator == ">" and value > wanted,
+        ">=": operator == ">=" and value >= wanted,
+    }[operator]
+    return compared
+
+
+def selects(lab: QueriedLab, query: Query, clip: Item) -> bool:
+    """Evaluate a query for one clip."""
+    if isinstance(query, Negation):
+        return not selects(lab, query.query, clip)
+    if not isinstance(query, Condition):
+        return (all if query.word == "and" else any)(selects(lab, part, clip) for part in query.queries)
+    values = values_of(lab, clip, query.field)
+    if query.operator == "has":
+        return bool(values)
+    if query.field == "folder" and not values:
+        values = [""]
+    if query.field == "skeleton" and query.operator == "~":
+        values = values[:1]
+    return any(meets(query.field, query.operator, value, wanted) for value in values for wanted in query.values)
+
+
+def quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+@st.composite
+def conditions(draw: st.DrawFn) -> str:
+    name = draw(st.sampled_from(sorted(FIELDS)))
+    field = FIELDS[name]
+    operator = draw(st.sampled_from(OPERATORS[field.type]))
+    pool = {"text": tuple(map(quoted, TEXTS)), "number": NUMBERS, "date": DATES}[field.type]
+    value = st.sampled_from(pool)
+    if operator == "has":
+        return f"has {name}"
+    if operator == "in":
+        return f"{name} in ({', '.join(draw(st.lists(value, min_size=1, max_size=3)))})"
+    return f"{name} {operator} {draw(value)}"
+
+
+queries = st.recursive(
+    conditions(),
+    lambda inner: (
+        st.builds("not ({})".format, inner)
+        | st.builds("({}) {} ({})".format, inner, st.sampled_from(["and", "or"]), inner)
+    ),
+    max_leaves=5,
+)
+
+
+@given(queries)
+@example('path = "take-4" or path = "raw/take-1" or path = "rawer/take-3"')
+@example('warning = "foot" and not warning = "foot-slide"')
+@example("created >= 2999-01-01 or not updated < 2999-01-01")
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(150))
+def test_sql_selects_what_the_conditions_say(queried: QueriedLab, text: str) -> None:
+    query = parse(text)
+    expected = {clip.id for clip in queried.clips if selects(queried, query, clip)}
+    filters = ItemFilters(query=text)
+    found = queried.read(items.list_items, "lab", Kind.CLIP, filters, limit=100, count=True)
+    assert {clip.id for clip in found.items} == expected
+    assert found.count == len(expected)
+    explained = queried.read(items.explain_query, "lab", Kind.CLIP, ItemFilters(), text)
+    assert (explained.items, explained.selected) == (len(queried.clips), len(expected))
+    parts = [parse(part.condition) for part in explained.conditions]
+    for number, part in enumerate(explained.conditions):
+        met = [[selects(queried, one, clip) for one in parts] for clip in queried.clips]
+        assert part.hides == sum(not row[number] for row in met)
+        assert part.alone == sum(not row[number] and sum(row) == len(parts) - 1 for row in met)
+
+
+def test_fields_of_times_compare_with_the_time_of_the_item(queried: QueriedLab) -> None:
+    now = queried.clips[0].created_at
+    day = now.date()
+
+    def selected(text: str) -> int:
+        return len(queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text), limit=100).items)
+
+    everything = len(queried.clips)
+    assert selected(f"created = {day} or created = {day + timedelta(days=1)}") == everything
+    assert selected(f"created < {day}") == 0
+    assert selected(f"created > {day - timedelta(days=1)} and not created > {day + timedelta(days=1)}") == everything
+    assert selected(f"created <= {queried.clips[0].created_at.isoformat()}") == everything
+
+
+def test_a_query_that_cannot_be_read_is_refused_with_its_place(queried: QueriedLab) -> None:
+    for function, more in ((items.list_items, ()), (items.explain_query, ("frames >",))):
+        with pytest.raises(BadRequestProblem, match="query, column 9") as refused:
+            queried.read(function, "lab", Kind.CLIP, ItemFilters(query="frames >"), *more)
+        assert refused.value.error_code == "bad-query"
+
+
+def test_a_cursor_belongs_to_its_query(queried: QueriedLab) -> None:
+    page = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query="frames > 2"), limit=2)
+    with pytest.raises(BadRequestProblem):
+        queried.read(
+            items.list_items, "lab", Kind.CLIP, ItemFilters(query="frames > 3"), limit=2, cursor=page.next_cursor
+        )
+
+
+def test_skeletons_of_other_projects_have_no_names_here(queried: QueriedLab, database: Database) -> None:
+    other = Lab(database, "elsewhere")
+    other.add_skeleton("secret")
+
+    def pages() -> Iterator[int]:
+        for text in ("skeleton = secret", "skeleton ~ secret"):
+            yield len(queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text)).items)
+
+    assert list(pages()) == [0, 0]
