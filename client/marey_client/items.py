@@ -12,7 +12,17 @@ from marey_client.one_or_several import several
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.documents.differences import Difference, DifferenceRequest
-from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, Page, Revision, Staleness
+from marey_schemas.items import (
+    Item,
+    ItemChange,
+    ItemCreate,
+    ItemRevert,
+    Lineage,
+    Page,
+    QueryExplanation,
+    Revision,
+    Staleness,
+)
 from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 
@@ -180,6 +190,7 @@ class Items(Generic[Handle]):
         directly_in: str | None = None,
         path: str | None = None,
         sort: str | None = None,
+        query: str | None = None,
         deleted: bool = False,
         filters: Params | None = None,
         page_size: int = 500,
@@ -187,14 +198,22 @@ class Items(Generic[Handle]):
         """Yield items in order, requested page by page.
 
         `collection` selects a folder and everything below it, `directly_in` a folder alone ("" is the root), `path` one
-        item, `deleted` the deleted items, which `restore` can restore; `filters` are those of the API, such as
-        `{"frames.gte": 120, "tag.in": "walk,run"}`.
+        item, `query` those that meet conditions, such as `subject = 02 and frames > 120`, `deleted` the deleted items,
+        which `restore` can restore; `filters` are those of the API, such as `{"frames.gte": 120}`.
         """
         params = {
-            "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort,
+            "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort, "query": query,
             "deleted": "true" if deleted else None, "limit": page_size, **(filters or {}),
         }  # fmt: skip
         return (self._handle(item) for item in pages(self.transport, Item, self.url, params))
+
+    def explain(self, query: str, *, collection: str | None = None) -> QueryExplanation:
+        """Count the items that a query selects, and those that each of its conditions hides.
+
+        `collection` is a folder; without it, all items of the kind in the project are counted.
+        """
+        path = f"/projects/{self.project}/explanations/{self.kind.plural}"
+        return self.transport.get(QueryExplanation, path, {"query": query, "collection": collection})
 
     def get(self, item_id: str) -> Handle:
         """Return an item by its id."""

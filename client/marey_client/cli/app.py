@@ -26,7 +26,7 @@ from marey_client.cli import (
 )
 from marey_client.cli.datasets import proposals, versions
 from marey_client.cli.difference import diff
-from marey_client.cli.files import downloading, listing, uploading
+from marey_client.cli.files import downloading, listing, records, uploading
 from marey_client.cli.invocation import Invocation
 
 app = typer.Typer(
@@ -75,6 +75,7 @@ for register in (
     listing,
     downloading,
     organise,
+    records,
     diff,
     versions,
     proposals,

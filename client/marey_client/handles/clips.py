@@ -60,7 +60,7 @@ class ClipHandle(ItemHandle):
 
     def put_info(self, info: ClipInfo) -> Item:
         """Create a revision with another description and the same poses."""
-        return self.put_part("info", info.model_dump(mode="json", by_alias=True))
+        return self.put_part("info", info.model_dump(mode="json", by_alias=True, exclude_none=True))
 
     def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:
         """Create a revision with other poses. Raises `PreconditionFailed` if the clip was changed since it was read."""

@@ -180,6 +180,72 @@ def test_tags_are_added_and_taken_away(run: Command, lab: ProjectHandle) -> None
     assert "tags.0" in run("tag", "lab/raw/a", "--add", "a,b", status=2).stderr
 
 
+def test_take_records_come_from_a_table_and_are_found_by_queries(
+    run: Command, lab: ProjectHandle, tmp_path: Path
+) -> None:
+    table = tmp_path / "takes.csv"
+    table.write_text("File,Performer,Action,select\na.bvh,02,Walk slowly,best\nb.bvh,02,run,\n")
+    refused = run("record", "lab/raw", "--table", str(table), status=2).stderr
+    assert "the column 'Performer' is not a field; name one with --column 'Performer=FIELD'" in refused
+    arguments = ("record", "lab/raw", "--table", str(table), "--column", "Performer=subject")
+    assert run(*arguments).stderr == "2 records changed, 0 unchanged\n"
+    assert run(*arguments).stderr == "0 records changed, 2 unchanged\n"
+    listed = json.loads(run("ls", "lab", "--query", "subject = 02 and action ~ WALK", "--json").stdout)
+    assert [one["name"] for one in listed["items"]] == ["a"]
+    assert {clip.path for clip in lab.clips.list(query="not has select")} == {"raw/b", "raw/c"}
+    assert run("record", "lab", "--query", "subject = 02", "--set", "select=good").stderr.startswith(
+        "2 records changed"
+    )
+    run("record", "lab/raw/a", "--set", "select=", "--set", "licence=CC0")
+    record = lab.clips.get(next(lab.clips.list(path="raw/a")).id).info()
+    assert (record.subject, record.select, record.licence) == ("02", None, "CC0")
+
+
+def test_a_query_is_explained_by_what_each_condition_hides(run: Command) -> None:
+    shown = run("ls", "lab", "--query", "frames > 1 and name != a", "--explain")
+    assert "2 of 3 clips" in shown.stderr
+    assert re.search(r"name != a +1 +1", shown.stdout)
+    assert re.search(r"frames > 1 +0 +0", shown.stdout)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ("clip,select\na,perfect\nnobody,best\n", ["row 2, select", "'perfect'", "row 3: there is no clip 'nobody'"]),
+        ("clip,select\na,best\nraw/a,good\n", ["row 3: 'raw/a' is also in row 2"]),
+        ("clip,select\na,best,more\n", ["row 2: there are more cells than columns"]),
+        ("name,select\na,best\n", ["needs a column `clip` or `file`"]),
+        ("clip,select\n", ["has no rows"]),
+        ("clip,shoot_day\na,yesterday\n", ["row 2, shoot_day"]),
+        ('clip,select\n"a,best\n', ["cannot be read as a CSV file"]),
+    ],
+)
+def test_a_wrong_table_changes_no_record(
+    run: Command, lab: ProjectHandle, tmp_path: Path, rows: str, told: list[str]
+) -> None:
+    table = tmp_path / "takes.csv"
+    table.write_text(rows)
+    refused = run("record", "lab/raw", "--table", str(table), status=2).stderr
+    assert all(text in refused for text in told), refused
+    assert {clip.item.revision for clip in lab.clips.list()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["ls", "lab", "--query", "frames >"], "query, column 9: the query ends too early"),
+        (["ls", "lab", "--explain"], "--explain needs a query"),
+        (["record", "lab/raw"], "give either values with --set"),
+        (["record", "lab/raw", "--set", "selcet=best"], "there is no field 'selcet'"),
+        (["record", "lab/raw", "--set", "best"], "'best' has no name and value"),
+        (["record", "lab/nothing", "--set", "select=best"], "there are no such clips"),
+    ],
+)
+def test_wrong_queries_and_records_are_refused(run: Command, arguments: list[str], told: str) -> None:
+    status = 1 if "frames >" in arguments else 2
+    assert told in run(*arguments, status=status).stderr
+
+
 @pytest.mark.parametrize(("answer", "status", "left"), [("n\n", 1, ["raw/a", "raw/b", "raw/c"]), ("y\n", 0, [])])
 def test_at_a_terminal_many_items_are_removed_after_a_yes(
     run: Command, lab: ProjectHandle, answer: str, status: int, left: list[str]

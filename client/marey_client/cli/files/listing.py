@@ -12,6 +12,7 @@ from marey_client.cli.failures import WrongUsage
 from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.revisions import require_revision
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.items import Item, Revision
     from marey_schemas.kinds import Kind
+
+
+def _of_summary(name: str) -> Callable[[Item], object]:
+    return lambda item: item.summary.get(name)
+
 
 COLUMNS: dict[str, Callable[[Item], object]] = {
     "kind": lambda item: item.kind,
@@ -30,6 +36,7 @@ COLUMNS: dict[str, Callable[[Item], object]] = {
     "seconds": lambda item: None if (given := item.summary.get("duration_s")) is None else round(given, 3),
     "warnings": lambda item: " ".join(item.summary.get("warnings", ())),
     "tags": lambda item: " ".join(item.tags),
+    **{name: _of_summary(name) for name in ("subject", "action", "take", "shoot_day", "select", "licence")},
     "created": lambda item: item.created_at,
     "updated": lambda item: item.updated_at,
     "id": lambda item: item.id,
@@ -61,6 +68,18 @@ def ls(
     find: Annotated[
         str, typer.Option(help="List only items whose names contain this text, also those in subfolders.")
     ] = "",
+    query: Annotated[
+        str | None,
+        typer.Option(
+            "--query",
+            "-q",
+            help="List only items that a query selects, also those in subfolders, as in "
+            "'subject = 02 and frames > 120'; the reference of queries lists the fields.",
+        ),
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Instead of a list, count the items that each condition of --query hides.")
+    ] = False,
     stale: Annotated[
         bool, typer.Option("--stale", help="List only results of which an input has a newer revision.")
     ] = False,
@@ -81,10 +100,13 @@ def ls(
     address = Address.parse(place)
     if deleted:
         return _show_deleted(context, address, kind, tag, as_json)
+    if explain:
+        return _explain(context, address, kind, query, as_json)
+    everywhere = bool(recursive or find or query)
     shown, order = _columns(columns), _columns(sort.removeprefix("-"), also=("name",))[:1]
     with connect(context) as marey:
-        folders = [] if recursive or find or stale else _folders_in(marey, address)
-        items = _items_in(marey, address, recursive=recursive or bool(find), kinds=kind, tag=tag, find=find)
+        folders = [] if everywhere or stale else _folders_in(marey, address)
+        items = _items_in(marey, address, recursive=everywhere, kinds=kind, tag=tag, find=find, query=query)
         if not folders and not items and marey.project(address.project).collections.at(address.path) is None:
             items = _items_called(marey, address)
         if stale:
@@ -96,9 +118,27 @@ def ls(
         (f"{name}/", *("collection" if column == "kind" else "" for column in shown)) for name in folders
     ]
     for one in items:
-        name = one.path if recursive or find else one.name
+        name = one.path if everywhere else one.name
         rows.append((name, *(COLUMNS[column](one.item) for column in shown)))
     return print_table(("name", *shown), rows, right=[column for column in shown if column in FIGURES])
+
+
+def _explain(
+    context: typer.Context, address: Address, kinds: Sequence[str] | None, query: str | None, as_json: bool
+) -> None:
+    """Print how many items each condition of a query hides; of clips, unless other kinds are given."""
+    if query is None:
+        raise WrongUsage("--explain needs a query: add --query")
+    with connect(context) as marey:
+        project = marey.project(address.project)
+        for kind in map(kind_named, kinds or ["clip"]):
+            explained = project.items(kind).explain(query, collection=address.path or None)
+            if as_json:
+                print_json(explained)
+                continue
+            print_message(f"{explained.selected:,} of {counted(explained.items, str(kind))}")
+            rows = [(one.condition, one.hides, one.alone) for one in explained.conditions]
+            print_table(("condition", "hides", "alone"), rows, right=["hides", "alone"])
 
 
 def _columns(text: str, *, also: Sequence[str] = ()) -> list[str]:
@@ -168,6 +208,7 @@ def _items_in(
     kinds: Sequence[str] | None,
     tag: str | None,
     find: str = "",
+    query: str | None = None,
     deleted: bool = False,
 ) -> list[ItemHandle]:
     from marey_schemas.kinds import Kind
@@ -178,7 +219,7 @@ def _items_in(
     def of_kind(kind: Kind) -> list[ItemHandle]:
         folder = "collection" if recursive else "directly_in"
         filters = {folder: address.path, "tag.in": tag, "q": find or None}
-        found: list[ItemHandle] = list(project.items(kind).list(filters=filters, deleted=deleted))
+        found: list[ItemHandle] = list(project.items(kind).list(query=query, filters=filters, deleted=deleted))
         return sorted(found, key=lambda item: item.path)
 
     with ThreadPoolExecutor(REQUESTS_AT_ONCE) as pool:
