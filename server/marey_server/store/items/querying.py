@@ -207,7 +207,7 @@ COMPARISONS: dict[str, Comparison] = {
     "revision": lambda condition, _: _numbers(item.c.head, condition),
     "created": _time_of(item.c.created_us),
     "updated": _time_of(item.c.updated_us),
-    "frames": _number_of("frames"),
+    "frames": lambda condition, _: _numbers(func.nullif(item.c.frames, 0), condition),
     "duration": _number_of("duration_s"),
     "rate": _number_of("frame_rate_hz"),
     "joints": _number_of("joints"),
