@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from itertools import islice
 
 from marey_schemas.items import Upload, UploadCreate
 from marey_schemas.sizes import MIB
@@ -25,6 +26,8 @@ LONGEST_PAUSE_S = 0.2
 PAUSE_STEP_S = 0.01
 LONG_BODY_BYTES = 4 * MIB
 """Size of a body above which it is stored in pieces, in a transaction each, before it becomes a blob."""
+CHUNKS_PER_WRITE = 4
+"""Number of chunks of a long body that are stored in one transaction."""
 
 
 async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
@@ -35,8 +38,8 @@ async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
         return
     upload = await resource.change(uploads.create_upload, spool.size_bytes, digest=spool.digest)
     try:
-        pieces = spool.chunks()
-        while piece := await resource.compute(next, pieces, b""):
+        chunks = spool.chunks()
+        while piece := b"".join(await resource.compute(list, islice(chunks, CHUNKS_PER_WRITE))):
             upload = await append_piece(resource, upload.id, upload.offset, piece)
         await finish_upload(resource, upload)
     except BaseException:
