@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import logging
 import re
@@ -138,6 +139,14 @@ class Exchange(RequestHandler):
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server has time to answer."""
         return not self._gone and not self.services.draining.is_set()
+
+    async def pause(self, seconds: float) -> bool:
+        """Wait for a time; if the server is stopping, return True at once."""
+        try:
+            await asyncio.wait_for(self.services.draining.wait(), seconds)
+        except TimeoutError:
+            return False
+        return True
 
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
 

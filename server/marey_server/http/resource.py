@@ -230,21 +230,18 @@ class Resource(Exchange):
         if self.principal is not None and self.caller.token is not None:
             self.services.note_use(self.caller.token, self.principal)
 
-    async def pause(self, seconds: float) -> bool:
-        """Wait for a time; if the server is stopping, return True at once."""
-        try:
-            await asyncio.wait_for(self.services.draining.wait(), seconds)
-        except TimeoutError:
-            return False
-        return True
+    async def _wait_for_refusal(self) -> None:
+        """Wait before a refusal is answered, if the event loop is late and this client was refused several times."""
+        if hasattr(self, "caller") and (delay_s := self.services.refusal_brake.delay_s(self.client.key)):
+            self.holding.release()
+            await self.pause(delay_s)
 
     @property
     def answer_form(self) -> AnswerForm:
         """The form in which the client requested the answer."""
         reading = self.request.method in ("GET", "HEAD")
-        return AnswerForm(
-            self.media, self.request.headers.get("If-None-Match") if reading else None, self.operation.status
-        )
+        known = self.request.headers.get("If-None-Match") if reading else None
+        return AnswerForm(self.media, known, self.operation.status)
 
     async def _begin(self, **_path: Any) -> None:
         pass
@@ -284,6 +281,7 @@ class Resource(Exchange):
                 self.request.connection.set_body_timeout(self.services.settings.upload_timeout_s)  # type: ignore[union-attr]
                 await self.begin(**self.path_variables)
         except ApiProblem as error:
+            await self._wait_for_refusal()
             await self.refuse(error)
 
     async def _admit(self) -> None:
@@ -390,6 +388,9 @@ class Resource(Exchange):
         self.performing = True
         try:
             await self._perform(method)
+        except ApiProblem:
+            await self._wait_for_refusal()
+            raise
         finally:
             self.holding.release()
 

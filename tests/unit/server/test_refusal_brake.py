@@ -1,0 +1,66 @@
+"""Refusals are delayed while the event loop is late."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from marey_server.process.refusal_brake import FREE_REFUSALS, LONGEST_S, TOLERATED_S, WINDOW_S, RefusalBrake
+
+
+def in_a_loop(function: Callable[[], Awaitable[None]]) -> Callable[[], None]:
+    """Run a test in an event loop."""
+
+    def run() -> None:
+        asyncio.run(function())  # type: ignore[arg-type]
+
+    run.__name__ = function.__name__
+    return run
+
+
+def refused(brake: RefusalBrake, client: str, times: int) -> list[float]:
+    return [brake.delay_s(client) for _ in range(times)]
+
+
+@in_a_loop
+async def test_nobody_waits_while_the_event_loop_is_on_time() -> None:
+    assert set(refused(RefusalBrake(), "a", 10 * FREE_REFUSALS)) == {0.0}
+
+
+@in_a_loop
+async def test_a_client_waits_after_its_free_refusals_the_longer_the_later_the_loop_is() -> None:
+    brake = RefusalBrake()
+    refused(brake, "a", FREE_REFUSALS)
+    delays = []
+    for late_s in (2 * TOLERATED_S, 3 * TOLERATED_S, 1e3):
+        brake.late_s = late_s
+        delays += refused(brake, "a", 1)
+    assert 0 < delays[0] < delays[1] < delays[2] == LONGEST_S
+    assert refused(brake, "b", FREE_REFUSALS) == [0.0] * FREE_REFUSALS
+
+
+@in_a_loop
+async def test_lateness_is_measured_while_there_are_refusals() -> None:
+    brake = RefusalBrake()
+    brake.delay_s("a")
+    await asyncio.sleep(0)
+    time.sleep(0.3)
+    while not brake.late_s:
+        await asyncio.sleep(0.01)
+    assert brake.late_s > 0.1
+
+
+def test_refusals_are_counted_anew_after_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        brake = RefusalBrake()
+        refused(brake, "a", FREE_REFUSALS + 1)
+        brake.late_s = 1e3
+        later_s = time.monotonic() + WINDOW_S + 1
+        monkeypatch.setattr(time, "monotonic", lambda: later_s)
+        assert refused(brake, "a", FREE_REFUSALS + 1) == [0.0] * FREE_REFUSALS + [LONGEST_S]
+        monkeypatch.undo()
+
+    asyncio.run(main())
