@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from sqlalchemy import update
 from tests.support.store_fixtures import Lab
 from tests.support.tiers import examples
 
@@ -20,6 +21,7 @@ from marey_server.errors import BadRequestProblem
 from marey_server.store import items
 from marey_server.store.database.connections import Database
 from marey_server.store.items import ItemFilters
+from marey_server.store.tables import item as item_table
 
 INFOS: tuple[dict[str, Any], ...] = (
     {"subject": "02", "action": "Walk, slow", "licence": "CC-BY 4.0", "select": "best", "shoot_day": "2025-02-28"},
@@ -188,6 +190,26 @@ def test_fields_of_times_compare_with_the_time_of_the_item(queried: QueriedLab) 
     assert selected(f"created < {day}") == 0
     assert selected(f"created > {day - timedelta(days=1)} and not created > {day + timedelta(days=1)}") == everything
     assert selected(f"created <= {queried.clips[0].created_at.isoformat()}") == everything
+
+
+ODD = ("text", 10**400, {"a": "b"})
+"""Values that a document of a model may put into its summary."""
+
+
+@pytest.mark.parametrize("value", ODD, ids=str)
+def test_odd_values_in_a_summary_break_no_query(queried: QueriedLab, value: object) -> None:
+    names = ("frame_rate_hz", "duration_s", "joints", "warnings", "subject", "shoot_day", "consent_until", "action")
+    odd = queried.clips[0]
+    with queried.database.engine.begin() as connection:
+        changed = update(item_table).where(item_table.c.id == odd.id).values(summary=dict.fromkeys(names, value))
+        connection.execute(changed)
+    for name, field in FIELDS.items():
+        pool = {"text": "walk", "number": "1", "date": "2025-02-28"}[field.type]
+        for operator in OPERATORS[field.type]:
+            condition = {"has": f"has {name}", "in": f"{name} in ({pool})"}.get(operator, f"{name} {operator} {pool}")
+            for text in (condition, f"not {condition}"):
+                items_found = queried.read(items.list_items, "lab", Kind.CLIP, ItemFilters(query=text), limit=100).items
+                assert len(items_found) <= len(queried.clips)
 
 
 def test_a_query_that_cannot_be_read_is_refused_with_its_place(queried: QueriedLab) -> None:

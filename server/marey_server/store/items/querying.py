@@ -7,7 +7,22 @@ from datetime import date, datetime, timedelta
 from string import ascii_lowercase, ascii_uppercase
 from typing import Any
 
-from sqlalchemy import Boolean, ColumnElement, Text, and_, case, exists, false, func, not_, or_, select, true
+from sqlalchemy import (
+    Boolean,
+    ColumnElement,
+    Float,
+    Text,
+    and_,
+    case,
+    exists,
+    false,
+    func,
+    literal_column,
+    not_,
+    or_,
+    select,
+    true,
+)
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
@@ -58,6 +73,30 @@ def _lower_on_postgres(element: _LowerAscii, compiler: SQLCompiler, **options: A
     return f'lower(({compiler.process(element.clauses, **options)}) COLLATE "C")'
 
 
+class _NumberIn(FunctionElement[float]):
+    """A number in the summary; null if there is another value, which a cast to a number would refuse with an error."""
+
+    type = Float()
+    inherit_cache = True
+
+
+@compiles(_NumberIn)
+def _number(element: _NumberIn, compiler: SQLCompiler, **options: Any) -> str:
+    summary, name = (compiler.process(one, **options) for one in element.clauses)
+    at = f"{summary}, '$.' || {name}"
+    return f"CASE WHEN json_type({at}) IN ('integer', 'real') THEN json_extract({at}) END"
+
+
+@compiles(_NumberIn, "postgresql")
+def _number_on_postgres(element: _NumberIn, compiler: SQLCompiler, **options: Any) -> str:
+    summary, name = (compiler.process(one, **options) for one in element.clauses)
+    number = f"({summary} ->> {name})"
+    return (
+        f"CASE WHEN jsonb_typeof({summary} -> {name}) = 'number' AND abs({number}::numeric) < 1e300 "
+        f"THEN {number}::float8 END"
+    )
+
+
 _TO_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
 
 
@@ -94,7 +133,7 @@ def _text_of(name: str) -> Comparison:
 
 
 def _number_of(name: str) -> Comparison:
-    return lambda condition, _: _numbers(item.c.summary[name].as_float(), condition)
+    return lambda condition, _: _numbers(_NumberIn(item.c.summary, literal_column(f"'{name}'")), condition)
 
 
 def _day_of(name: str) -> Comparison:
