@@ -16,9 +16,9 @@ EVERY_S = 0.05
 """Time in seconds between two measurements of the lateness of the event loop."""
 KEPT_SHARE = 0.9
 """Share of the lateness that is kept from one measurement to the next."""
-TOLERATED_S = 0.02
+TOLERATED_S = 0.1
 """Lateness in seconds up to which nobody waits."""
-DELAY_PER_LATENESS = 50.0
+DELAY_PER_LATENESS = 10.0
 LONGEST_S = 5.0
 FREE_REFUSALS = 10
 """Number of refusals of a client in `WINDOW_S` that are never delayed."""
