@@ -147,7 +147,7 @@ def test_no_secret_stands_in_arguments_or_environment(server: FakeServer, start_
         ("refuse", "not-today", False, "this cannot be done"),
         ("segfault", "worker-process-died", True, "SIGSEGV"),
         ("exit", "worker-process-died", True, "status 7"),
-        ("eat", "memory-limit", True, "512 MB"),
+        ("eat", "memory-limit", True, "512 MiB"),
     ],
 )
 def test_each_way_to_fail_is_told_apart_and_the_worker_goes_on(
