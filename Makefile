@@ -52,14 +52,14 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
 
-lint: $(VENV)/.installed-dev ## Style, types and the arrows between rooms
+lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m lint
 
-format: $(VENV)/.installed-dev ## Put the code in house style
+format: $(VENV)/.installed-dev ## Format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

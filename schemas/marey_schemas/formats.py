@@ -144,7 +144,10 @@ FORMATS = (
     ),
     FileFormat(name="json", endings=(".json",), media_type="application/json", writes=("item",)),
 )
-"""All formats, in the order in which the beginning of a file is compared with their patterns."""
+"""All formats, in the order in which the beginning of a file is compared with their patterns.
+
+The pattern of `predecessor` accepts every JSON object, so formats with a narrower pattern come before it.
+"""
 
 _BY_NAME = {one.name: one for one in FORMATS}
 

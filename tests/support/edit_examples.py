@@ -1,5 +1,6 @@
 """One or two examples of every command of an edit, as documents, on the generated walks of `edited_takes`."""
 
+from collections.abc import Callable
 from typing import Any
 
 SOURCE = "other"
@@ -35,6 +36,15 @@ EXAMPLES: dict[str, list[dict[str, Any]]] = {
     ],
     "plant_feet": [{}],
 }
+
+
+FRAMES: dict[str, Callable[[int, dict[str, Any]], int]] = {
+    "trim": lambda frames, given: (given.get("stop") or frames) - given.get("start", 0),
+    "concatenate": lambda frames, given: frames + 180 - (30 if given.get("blend") == "slerp" else 0),
+    "resample": lambda frames, given: int((frames - 1) * 45 / 60) + 1,
+    "retime": lambda frames, given: int((frames - 1) / 0.7) + 1,
+}
+"""Number of frames of all clips that a command makes of a walk of some frames; commands not listed keep the number."""
 
 
 def commands_of_all() -> list[dict[str, Any]]:

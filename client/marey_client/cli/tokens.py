@@ -129,7 +129,10 @@ def list_tokens(
 
 
 def _labels_of(token: Token) -> str:
-    """Return the labels to which a token is bound: nothing if it is not bound, `none` if it allows no label."""
+    """Return the labels to which a token is bound, as text.
+
+    The text is empty if the token is not bound to labels, and `none` if it is bound to an empty set of labels.
+    """
     if token.labels is None:
         return ""
     return " ".join(f"{name}={value}" for name, value in sorted(token.labels.items())) or "none"

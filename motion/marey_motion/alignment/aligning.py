@@ -240,7 +240,7 @@ class _Aligning:
             if not 0 <= cut.frame < clip.frame_count:
                 shown = ", ".join(cut.labels)
                 raise MotionError(
-                    f"the cut is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
+                    f"the frame of the cut is outside the clip, whose frames are 0 to {clip.frame_count - 1}",
                     code="outside-clip",
                     where=f"{shown}, frame {cut.frame}",
                 )

@@ -71,7 +71,10 @@ def _of_keyframes(annotation: Annotation) -> list[Segment]:
 
 
 def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[int | None, int | None]]:
-    """Return pairs of indices of two ordered lists; equal entries at both ends are left out."""
+    """Match the entries of two ordered lists, and return the indices of each pair; None stands for no partner.
+
+    The entries that both lists have in common at their beginning and at their end are not returned.
+    """
     shortest = min(len(before), len(after))
     head = next((place for place in range(shortest) if before[place] != after[place]), shortest)
     tail = next((n for n in range(shortest - head) if before[-1 - n] != after[-1 - n]), shortest - head)

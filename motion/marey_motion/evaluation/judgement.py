@@ -109,7 +109,9 @@ def strain(outcome: TrialResult) -> Strain:
 
 
 def mean_speed_m_s(trial: Trial) -> float:
-    """Compute the mean desired speed over the circle; a trial with switching speed begins the circle at its base speed.
+    """Compute the mean desired speed while a trial follows its circular path.
+
+    If the desired speed alternates, the path begins at the base speed.
 
     Parameters
     ----------

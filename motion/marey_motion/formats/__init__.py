@@ -127,7 +127,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
     Parameters
     ----------
     clip : Clip    the motion
-    file_format : str    "bvh", "npz" or "predecessor"
+    file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
     options    options of the format's writer
 
     Returns

@@ -122,7 +122,7 @@ def union_normaliser(databases: Sequence[MatchingDatabase]) -> Normaliser:
     MotionError    if the databases have different joints, horizons or weights
     """
     if not databases:
-        raise MotionError("no databases were given to fit the normaliser to", code="no-features")
+        raise MotionError("a normaliser needs at least one database, but none was given", code="no-features")
     ordered = sorted(databases, key=database_digest)
     layout = ordered[0].layout
     for other in ordered[1:]:

@@ -75,7 +75,7 @@ def _without_common_start(names: Names) -> Names:
 
 
 def _without_numbers(names: Names) -> Names:
-    """Drop running numbers before or after all names, unless names would repeat without them."""
+    """Remove a number from the end or the beginning of all names, unless two names would then be equal."""
     for number in (_NUMBER_AFTER, _NUMBER_BEFORE):
         plainer = tuple(number.sub("", name) for name in names)
         if all(map(number.search, _marked(names))) and len(set(plainer)) == len(set(names)):

@@ -153,9 +153,10 @@ def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
 
 
 def admit(tx: Transaction, target: BodyTarget) -> None:
-    """Refuse a caller without the declared role in a project, or whose token is not that of the attempt.
+    """Refuse a caller who lacks the role that the operation declares for the project.
 
-    `run_plain` has checked the credential before.
+    If the operation belongs to an attempt of a job, every token but that of the attempt is refused, too. The credential
+    has been checked before by `run_plain`.
     """
     if target.project is not None:
         projects.require(tx, target.project)

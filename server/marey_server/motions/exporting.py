@@ -98,7 +98,8 @@ def find_original(
         if (original := original_of_clip(item_id, info)) is not None:
             return original
     raise NotFoundProblem(
-        "The item has no original file, because it was not imported from one; request another format, such as bvh.",
+        "The item has no original file, because it was not imported from one; request another format, such as json, or "
+        "bvh for a clip.",
         code="no-original",
     )
 

@@ -142,7 +142,10 @@ class Children:
 
     @contextmanager
     def request(self, caller: str) -> Iterator[None]:
-        """Count a request inside the block. Raises `UnavailableProblem` if too many use children or wait for one."""
+        """Count a request of a caller until the `with` statement ends.
+
+        Raises `UnavailableProblem` if too many requests already use a child process or wait for one.
+        """
         with self._changed:
             if self._requests[caller] >= self.limits.requests_each:
                 raise _busy(f"{self._requests[caller]} of your requests")

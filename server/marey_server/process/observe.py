@@ -48,7 +48,10 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
-    """Remove what a client sent from Tornado's messages about malformed requests: a header may contain a token."""
+    """Shorten Tornado's messages about malformed requests to the kind of fault.
+
+    The messages quote what the client sent, and a header may contain a token.
+    """
     if isinstance(record.args, tuple):
         record.args = tuple(_kind_of_fault(arg) if isinstance(arg, Exception) else arg for arg in record.args)
     return True

@@ -250,7 +250,10 @@ def _file_bytes(one: PreparedDocument, sizes: Mapping[str, int]) -> int:
 
 
 def store_variants(tx: Transaction, variants: Sequence[tuple[str, Tree]]) -> None:
-    """Store copies of documents, given by digest, with other bodies but the same arrays and files."""
+    """Store documents that have the arrays and files of existing documents, but other bodies.
+
+    `variants` lists the digest of an existing document and the new body.
+    """
     if not variants:
         return
     digests = [digest_of_body(body) for _, body in variants]

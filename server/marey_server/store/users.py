@@ -132,7 +132,7 @@ def _require_changes(principal: Principal, name: str, request: UserChange) -> bo
         raise ForbiddenProblem("The token does not allow changing this user.", code="insufficient-scope")
     if not is_administrator(principal) and (request.administrator is not None or request.disabled is not None):
         raise ForbiddenProblem(
-            "Only administrators can disable users, and make users administrators.", code="administrators-only"
+            "Only administrators can disable a user or make a user an administrator.", code="administrators-only"
         )
     return itself
 

@@ -218,6 +218,10 @@ def test_an_animator_edits_from_the_command_line(lab: ProjectHandle, run: Comman
     (tmp_path / "edit.json").write_text(run("edit", "show", "lab/edits/longer", "--json").stdout)
     assert "revision 1" in run("edit", "save", "lab/edits/longer", "--file", "edit.json").stdout
 
+    assert "such as json" in run("download", "lab/edits/longer", "-o", "edits", status=1).stderr
+    run("download", "lab/edits/longer", "-o", "edits", "--format", "json")
+    assert "smooth" in (tmp_path / "edits/longer.json").read_text()
+
     told = run("edit", "apply", "lab/walks", "--with", "lab/edits/longer", "--into", "longer", "--tag", "long").stdout
     assert "3 clips" in told
     assert "0 refused" in told

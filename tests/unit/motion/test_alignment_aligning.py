@@ -253,7 +253,7 @@ def short(frames: int) -> SourceExample:
             SourceExample("cut@1", "cut", walk(), (Cut(("contact",), 60),)),
             None,
             "outside-clip",
-            "cut: contact, frame 60: the cut is outside the clip, whose frames are 0 to 59",
+            "cut: contact, frame 60: the frame of the cut is outside the clip, whose frames are 0 to 59",
         ),
         (short(8), TO_FIRST, "alignment-impossible", "short: .*60 frames cannot be aligned with 8"),
         (short(20), AlignOptions(reference="nobody"), "unknown-reference", "nobody: the reference is not one"),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.support.edit_examples import EXAMPLES, SOURCE, commands_of_all
+from tests.support.edit_examples import EXAMPLES, FRAMES, SOURCE, commands_of_all
 from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
 
 from marey_motion.clip import Clip
@@ -54,14 +54,8 @@ def test_every_command_gives_sound_clips_of_the_frames_it_promises(command: dict
         require_sound(one.clip)
         assert set(walk.translated_joints) <= set(one.clip.translated_joints)
     frames = sum(one.clip.frame_count for one in made)
-    name = command["command"]
-    expected = {
-        "trim": (command.get("stop") or walk.frame_count) - command.get("start", 0),
-        "concatenate": walk.frame_count + 180 - (30 if command.get("blend") == "slerp" else 0),
-        "resample": int((walk.frame_count - 1) * 45 / 60) + 1,
-        "retime": int((walk.frame_count - 1) / 0.7) + 1,
-    }
-    assert frames == expected.get(name, walk.frame_count)
+    expected = FRAMES.get(command["command"], lambda frames, _given: frames)
+    assert frames == expected(walk.frame_count, command)
 
 
 @pytest.mark.parametrize("document", [{"command": "mirror"}, ("mirror", {})])

@@ -34,7 +34,7 @@ class Refusals:
     def add(
         self, pin: PinnedInput, error: MotionError | ValidationError | NoSuchThing, *, name: str | None = None
     ) -> None:
-        """Add a refusal; `name` is the name of the missing result if it differs from the input's path."""
+        """Add a refused input. `name` is the name that its result would have had, if that is not the input's path."""
         shown = name or pin.path
         code = "bad-document" if isinstance(error, ValidationError) else error.code
         self._context.log(f"{shown}: {error}")

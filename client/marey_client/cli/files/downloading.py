@@ -53,7 +53,8 @@ def download(
     """Write clips to files: one clip, or all clips in a folder and below.
 
     If a folder has only aligned clips, these are written. After `@`, name a revision of the clip, or a version of the
-    dataset.
+    dataset. Other items, such as edits and evaluations, are written with `--format json`, models and annotations also
+    with `--format predecessor`.
 
     An existing file is replaced; if several clips would have the same file name, the later ones get a number.
     """
@@ -96,11 +97,11 @@ def _exported_at(marey: Marey, address: Address) -> list[_Exported]:
     if single is None and not below:
         below += project.processed.list(collection=address.path)
     if single is None and not below:
-        single = find_revision(marey, address, [Kind.SKELETON, Kind.MODEL, Kind.GRAPH, Kind.ANNOTATION])
+        single = find_revision(marey, address, [one for one in Kind if one not in (Kind.CLIP, Kind.PROCESSED)])
     if single is not None:
         return [_Exported(*single, "", single[0].name)]
     if not below:
-        raise WrongUsage(f"there is no clip at {address}; `marey ls {address.project}` lists the project")
+        raise WrongUsage(f"there is no clip and no item at {address}; `marey ls {address.project}` lists the project")
     return [_Exported(one, None, one.item.collection.removeprefix(address.path).strip("/"), one.name) for one in below]
 
 

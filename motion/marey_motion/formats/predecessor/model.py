@@ -373,7 +373,7 @@ def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleto
     if unknown is not None:
         raise FormatError("the skeleton has no joint of this name", code="joints-mismatch", file=file, joint=unknown)
     if (np.linalg.norm(basis.at_frames @ mean[:, 3:], axis=1) == 0).any():
-        raise FormatError("the mean motion has frames without any rotation", code="model-invalid", file=file)
+        raise FormatError("the mean motion has frames whose rotations are all zero", code="model-invalid", file=file)
     return animated
 
 

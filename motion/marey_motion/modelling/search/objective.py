@@ -155,7 +155,7 @@ class Objective:
 
     @cached_property
     def prices(self) -> Floats:
-        """Weight over tolerance of each constraint, (m,) float64."""
+        """Weight of each constraint divided by its tolerance, (m,) float64."""
         return np.array([one.weight / tolerance_of(one) for one in self.constraints])
 
 

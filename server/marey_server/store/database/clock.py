@@ -51,7 +51,10 @@ class DatabaseClock:
         self._start_monotonic_ns = 0
 
     def now_us(self, connection: Connection) -> int:
-        """Return the time in microseconds since the epoch. Raises `ClockFarAhead` at a start with an unlikely time."""
+        """Return the time in microseconds since the epoch.
+
+        Raises `ClockFarAhead` if the wall clock is implausibly far ahead when the process first asks for the time.
+        """
         if connection.dialect.name == "postgresql":
             now = text("SELECT (extract(epoch FROM clock_timestamp()) * 1000000)::bigint")
             return int(connection.execute(now).scalar_one())

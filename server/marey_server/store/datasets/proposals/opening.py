@@ -41,7 +41,7 @@ def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
 
 
 def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
-    """Return the row of an open proposal, which no other transaction changes until this one ends.
+    """Lock the row of an open proposal until the end of the transaction, and return it.
 
     Raises `NotFoundProblem`, and `ConflictProblem` if the proposal is merged or closed.
     """

@@ -97,7 +97,7 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
     read = {pin["commit"] for pins in found.inputs.values() for pin in pins if "commit" in pin}
     if read and head not in read:
         raise ConflictProblem(
-            f"The job {job_id} has read other versions than the newest commit of the proposal.",
+            f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal.",
             code="job-of-another-commit",
             context={"commits": sorted(read)},
         )
