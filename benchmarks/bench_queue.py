@@ -31,7 +31,7 @@ from marey_motion.rigs import guess_axes, map_joints
 from marey_motion.skeleton import Skeleton
 from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.jobs import CollectionInput, Job, JobCreate
+from marey_schemas.queue.jobs import CollectionInput, Job, JobCreate
 
 CLIPS, FRAMES, JOINTS = 96, 300, 31
 GOAL_POSES_PER_S = 50_000

@@ -33,7 +33,7 @@ from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.encoding.canonical import array_digest
 from marey_schemas.kinds import Kind
-from marey_schemas.model_pipelines import model_pipeline
+from marey_schemas.queue.model_pipelines import model_pipeline
 
 TAKES, KILLS, SEED = 200, 10, 7
 SECONDS, RATE_HZ = 1.2, 60.0

@@ -15,9 +15,9 @@ from pydantic_core import PydanticUndefined
 import marey_server.app  # noqa: F401 - loads every module, and so every class of errors
 from marey_client.cli.app import app
 from marey_motion.importing import checks
-from marey_schemas.job_kinds import job_kinds
 from marey_schemas.queries.fields import FIELDS, OPERATORS
 from marey_schemas.queries.grammar import MOST_CHARACTERS, MOST_COMPARED_VALUES, MOST_CONDITIONS
+from marey_schemas.queue.job_kinds import job_kinds
 from marey_server import errors
 from marey_server.process.settings import Settings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from marey_schemas.jobs import Attempt, Job, JobState
+from marey_schemas.queue.jobs import Attempt, Job, JobState
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey

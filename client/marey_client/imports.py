@@ -26,8 +26,8 @@ from marey_schemas.imports import (
     Refusal,
     skeleton_output,
 )
-from marey_schemas.jobs import Job, JobOutput
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.jobs import Job, JobOutput
 
 FILES_PER_IMPORT = 50
 BYTES_PER_IMPORT = 64 << 20

@@ -23,8 +23,8 @@ from marey_schemas.items import (
     Revision,
     Staleness,
 )
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.jobs import ItemInput
 
 
 class ItemHandle:

@@ -10,7 +10,7 @@ from marey_client.errors import JobUnsuccessful, WaitedTooLong
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport
 from marey_schemas.base import Request
-from marey_schemas.jobs import Attempt, Job, JobCreate, JobInput, JobKind, JobOutput, JobState
+from marey_schemas.queue.jobs import Attempt, Job, JobCreate, JobInput, JobKind, JobOutput, JobState
 
 OnProgress = Callable[[Job], None]
 

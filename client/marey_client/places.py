@@ -9,7 +9,7 @@ from marey_client.handles.datasets import Datasets
 from marey_client.items import ItemHandle, Items
 from marey_schemas.datasets.commits import Entry
 from marey_schemas.items import Item
-from marey_schemas.jobs import CollectionInput, DatasetInput, ExistingInput, ItemInput
+from marey_schemas.queue.jobs import CollectionInput, DatasetInput, ExistingInput, ItemInput
 
 Handle = TypeVar("Handle", bound=ItemHandle)
 

@@ -31,10 +31,17 @@ from marey_client.requests import (
 )
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
-from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EvaluateParams, ModelParams, RetargetParams
-from marey_schemas.jobs import CacheMode, Job, JobCreate
-from marey_schemas.model_pipelines import model_pipeline
-from marey_schemas.pipelines import PipelineCreate
+from marey_schemas.queue.job_params import (
+    AlignParams,
+    AnnotateParams,
+    CutParams,
+    EvaluateParams,
+    ModelParams,
+    RetargetParams,
+)
+from marey_schemas.queue.jobs import CacheMode, Job, JobCreate
+from marey_schemas.queue.model_pipelines import model_pipeline
+from marey_schemas.queue.pipelines import PipelineCreate
 
 
 class ProjectHandle(ProjectItems):

@@ -21,8 +21,8 @@ from marey_client.jobs import Jobs
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.items import Collection, CollectionChange, CollectionCreate, Item
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.jobs import ItemInput
 
 
 class ProjectItems:

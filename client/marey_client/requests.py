@@ -19,7 +19,8 @@ from marey_client.jobs import job_request
 from marey_client.places import Places, as_inputs, items_at
 from marey_client.project_items import ProjectItems
 from marey_schemas.items import LOOP_TAG, Item
-from marey_schemas.job_params import (
+from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.job_params import (
     AlignParams,
     AnnotateParams,
     CutParams,
@@ -28,9 +29,8 @@ from marey_schemas.job_params import (
     ModelParams,
     RetargetParams,
 )
-from marey_schemas.jobs import ItemInput, JobCreate
-from marey_schemas.model_pipelines import ModelPlan
-from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.jobs import ItemInput, JobCreate
+from marey_schemas.queue.model_pipelines import ModelPlan
 
 Clips: TypeAlias = Places[ClipHandle]
 """Clips, folders of clips given by their paths, or several of these."""

@@ -9,9 +9,9 @@ from typing import Any, Literal
 from marey_client.errors import NotFound
 from marey_client.project import ProjectHandle
 from marey_schemas.documents.differences import Difference
-from marey_schemas.job_kinds import job_kinds
-from marey_schemas.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.job_kinds import job_kinds
+from marey_schemas.queue.jobs import ItemInput, Job, JobCreate, JobKind, JobOutput, JobState
 
 RERUNS = "reruns"
 """Folder that receives repeated results, in a folder with the id of the job."""

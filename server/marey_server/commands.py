@@ -19,7 +19,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from marey_schemas.log_lines import usual_form
+from marey_schemas.queue.log_lines import usual_form
 from marey_schemas.wording import without_prefix
 from marey_server.process.settings import Settings
 

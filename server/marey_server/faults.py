@@ -13,7 +13,7 @@ import signal
 import time
 from collections.abc import Iterator
 
-from marey_schemas.worker_protocol import FAULT_VARIABLE
+from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
 
 class _Fault:

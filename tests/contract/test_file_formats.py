@@ -55,7 +55,7 @@ def test_no_two_imported_formats_share_an_ending() -> None:
 
 
 def test_exports_and_imports_accept_what_the_table_has_and_nothing_else() -> None:
-    from marey_schemas.job_params import ExportParams
+    from marey_schemas.queue.job_params import ExportParams
 
     assert ExportParams.model_json_schema()["properties"]["format"]["enum"] == list(EXPORT_FORMATS)
     with pytest.raises(ValueError, match="Input should be"):

@@ -16,8 +16,8 @@ from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import Job, JobState
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.jobs import Job, JobState
 
 pytestmark = pytest.mark.timeout(900)
 

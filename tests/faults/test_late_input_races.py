@@ -8,8 +8,8 @@ import pytest
 from tests.support.interleaving import Step, interleave
 from tests.support.queue_desk import Desk
 
-from marey_schemas.jobs import JobCreate
-from marey_schemas.worker_protocol import CompleteRequest, Lease
+from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.queue.worker_protocol import CompleteRequest, Lease
 from marey_server.errors import ApiProblem
 from marey_server.store.database.connections import Database
 from marey_server.store.jobs import completion, reading, submission

@@ -19,8 +19,8 @@ from marey_motion.clip import Clip
 from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import JobState
-from marey_schemas.pipelines import PipelineCreate
+from marey_schemas.queue.jobs import JobState
+from marey_schemas.queue.pipelines import PipelineCreate
 
 pytestmark = pytest.mark.timeout(900)
 

@@ -25,7 +25,7 @@ from marey_motion.formats import write_motion
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.imports import ImportEntry
-from marey_schemas.jobs import Job, JobCreate, JobState
+from marey_schemas.queue.jobs import Job, JobCreate, JobState
 
 pytestmark = pytest.mark.timeout(900)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from tests.support.queue_desk import Desk
 
-from marey_schemas.worker_protocol import ClaimRequest
+from marey_schemas.queue.worker_protocol import ClaimRequest
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import LeaseLostProblem
 from marey_server.store.database.clock import DatabaseClock

@@ -13,8 +13,8 @@ from sqlalchemy import ColumnElement, func, select, true
 from tests.support.interleaving import Abandoned, Step, interleave
 from tests.support.queue_desk import Desk, output
 
-from marey_schemas.jobs import JobCreate
-from marey_schemas.worker_protocol import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, Lease
+from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.queue.worker_protocol import ClaimRequest, CompleteRequest, FailRequest, Heartbeat, Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ApiProblem, ConflictProblem, LeaseLostProblem
 from marey_server.store import leader

@@ -34,8 +34,8 @@ from marey_motion.formats import write_motion
 from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.address import API
-from marey_schemas.jobs import Job, JobCreate, JobState
-from marey_schemas.worker_protocol import Lease
+from marey_schemas.queue.jobs import Job, JobCreate, JobState
+from marey_schemas.queue.worker_protocol import Lease
 from marey_server.errors import ConflictProblem
 from marey_server.store.database.connections import Database
 

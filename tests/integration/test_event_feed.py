@@ -21,11 +21,11 @@ from tests.support.queue_desk import KINDS
 from tests.support.rest_server import PATIENCE_S, Server, running
 from tests.support.store_fixtures import Lab
 
-from marey_schemas import job_kinds
+from marey_schemas.queue import job_kinds
 from marey_server import commands
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers import events as event_streams
-from marey_server.handlers import leases
+from marey_server.handlers.queue import leases
 from marey_server.process import feed
 from marey_server.store import events
 from marey_server.store.database.connections import Database

@@ -12,7 +12,7 @@ from tests.support.server_process import ServerProcess
 from marey_client import Marey
 from marey_client.errors import JobUnsuccessful
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import FailureReason, JobCreate, JobState, Resources
+from marey_schemas.queue.jobs import FailureReason, JobCreate, JobState, Resources
 
 
 @pytest.fixture

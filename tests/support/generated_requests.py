@@ -27,7 +27,7 @@ from tests.support.furnished_house import CANARY, INVENTED, House, build_house
 from tests.support.rest_server import running
 
 from marey_server.handlers.catalogue import RESOURCES
-from marey_server.handlers.jobs import LONGEST_WAIT_S
+from marey_server.handlers.queue.jobs import LONGEST_WAIT_S
 from marey_server.http.openapi import build_document
 from marey_server.http.routes import RouteTable
 from marey_server.store.database.connections import Database

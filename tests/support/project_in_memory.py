@@ -10,9 +10,9 @@ from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.items import Item
-from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import EvaluateParams
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, NoSuchThing, Task
 
 NOW = "2026-01-01T00:00:00Z"

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from tests.support.database_fixtures import AdjustableClock
 
-from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate, UserCreate
 from marey_schemas.base import Request
-from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import InputSpec, Job, JobCreate, Progress
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import (
+from marey_schemas.queue import job_kinds
+from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.jobs import InputSpec, Job, JobCreate, Progress
+from marey_schemas.queue.worker_protocol import (
     ClaimRequest,
     CompleteAnswer,
     CompleteRequest,

@@ -23,10 +23,10 @@ from typing import Any
 
 from marey_client.errors import Conflict, LeaseLost, MareyError, NotFound
 from marey_schemas.items import PartPlace
-from marey_schemas.job_kinds import find_kind
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
+from marey_schemas.queue.job_kinds import find_kind
+from marey_schemas.queue.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_schemas.sizes import MIB
-from marey_schemas.worker_protocol import CompleteRequest, FailRequest, Lease
 from marey_worker import faults, signatures
 from marey_worker.attempt_api import AttemptApi
 from marey_worker.heartbeats import LeaseKeeper

@@ -16,9 +16,9 @@ from marey_client.paging import pages
 from marey_client.retries import Retries
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.items import Item, PartPlace, PartsRequest
-from marey_schemas.jobs import Progress, TaskResult
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import (
+from marey_schemas.queue.jobs import Progress, TaskResult
+from marey_schemas.queue.worker_protocol import (
     ClaimRequest,
     CompleteRequest,
     FailRequest,

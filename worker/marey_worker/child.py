@@ -16,9 +16,9 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import to_jsonable_python
 
-from marey_schemas.job_kinds import KindDeclaration, find_kind
 from marey_schemas.processes.child_process import READY, connect_to_parent
 from marey_schemas.processes.limits import allow_memory
+from marey_schemas.queue.job_kinds import KindDeclaration, find_kind
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.messages import Done, End, Failed, Run, pack, unpack

@@ -17,8 +17,8 @@ from marey_client.credentials import Credential, resolve
 from marey_client.errors import MareyError, NoCredential
 from marey_client.retries import Retries
 from marey_client.transport import Transport
-from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
-from marey_schemas.log_lines import LogForm, log_to_standard_error, usual_form
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind, job_kinds
+from marey_schemas.queue.log_lines import LogForm, log_to_standard_error, usual_form
 from marey_schemas.sizes import MIB
 from marey_worker.supervisor import Supervisor, WorkerOptions, default_cache
 

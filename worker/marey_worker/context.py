@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, TypeVar
 
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
 from marey_schemas.items import Item, PartPlace
-from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput, StageRequest
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
 from marey_worker.messages import (
     ChildReply,
     FindItems,

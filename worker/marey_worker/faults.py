@@ -12,7 +12,7 @@ import signal
 import time
 from collections import Counter
 
-from marey_schemas.worker_protocol import FAULT_VARIABLE
+from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
 SETTLE_S = 0.2
 """Pause after SIGSTOP, which stops the threads of a process one by one; the calling thread must not continue first."""

@@ -8,8 +8,8 @@ import time
 
 from marey_client.errors import LeaseLost, MareyError
 from marey_schemas.backoff import spread
-from marey_schemas.jobs import Progress
-from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker.attempt_api import AttemptApi
 
 log = logging.getLogger(__name__)

@@ -17,10 +17,10 @@ import msgpack
 from pydantic import TypeAdapter, ValidationError
 
 from marey_schemas.items import PartPlace
-from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
 from marey_schemas.processes.child_process import BadMessage
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import PinnedInput
 
 # From the supervisor
 

@@ -18,9 +18,9 @@ from marey_client.errors import Forbidden, Invalid, LeaseLost, MareyError, Unaut
 from marey_client.retries import ONCE
 from marey_client.transport import Transport
 from marey_schemas.backoff import Backoff
-from marey_schemas.job_kinds import job_kinds
 from marey_schemas.processes.child_process import ChildBroken, ChildProcess
-from marey_schemas.worker_protocol import ClaimRequest, Lease
+from marey_schemas.queue.job_kinds import job_kinds
+from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
 from marey_worker import faults
 from marey_worker.attempt import RunningAttempt, Stop
 from marey_worker.attempt_api import AttemptApi, claim

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
-from marey_client.cli.failures import INTERRUPTED
+from marey_client.cli.terminal.failures import INTERRUPTED
 
 GLOBAL_SWITCHES = ("-v", "--verbose")
 GLOBAL_OPTIONS = ("--server", "--token-file")
@@ -21,7 +21,7 @@ def main() -> None:
 
 def _run() -> None:
     from marey_client.cli.app import app
-    from marey_client.cli.failures import reported
+    from marey_client.cli.terminal.failures import reported
 
     _take_any_text()
     arguments = with_global_options_first(sys.argv[1:])

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, UserName, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.projects import ByteLimit, DefaultLimits, ItemLimit, print_quotas, quota_change
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, UserName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 
 user = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage users (for administrators).")
 

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle

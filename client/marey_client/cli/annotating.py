@@ -9,12 +9,12 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.clip_jobs import print_labelled
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import JOB, Sources, Wait, clips_at, follow, print_ended
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_pairs, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.typed_values import assignment, is_frame, json_or_text, read_json
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_ended
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_pairs, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import assignment, is_frame, json_or_text, read_json
 from marey_schemas.formats import DEFAULT_END_INDEX, DEFAULT_FORM, AnnotationForm, EndIndex
 from marey_schemas.wording import counted
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
 
 
-ANNOTATE = OptionsOf("marey_schemas.job_params:AnnotateParams")
+ANNOTATE = OptionsOf("marey_schemas.queue.job_params:AnnotateParams")
 MERGE = OptionsOf(
     "marey_schemas.editing.annotation_commands:MergeSegment", only=("neighbour",), short={"neighbour": "--with"}
 )

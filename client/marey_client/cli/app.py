@@ -27,7 +27,7 @@ from marey_client.cli import (
 from marey_client.cli.datasets import proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.files import downloading, listing, records, uploading
-from marey_client.cli.invocation import Invocation
+from marey_client.cli.terminal.invocation import Invocation
 
 app = typer.Typer(
     name="marey",

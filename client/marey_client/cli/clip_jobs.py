@@ -7,23 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
-from marey_client.cli.following import JOB, Into, Sources, Wait, clips_at, follow, input_at, print_ended
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_message, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.following import JOB, Into, Sources, Wait, clips_at, follow, input_at, print_ended
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
 
-RETARGET = OptionsOf("marey_schemas.job_params:RetargetParams")
+RETARGET = OptionsOf("marey_schemas.queue.job_params:RetargetParams")
 ALIGN = OptionsOf(
-    "marey_schemas.job_params:AlignParams",
+    "marey_schemas.queue.job_params:AlignParams",
     short={"rate_hz": "--rate", "mirroring": "--mirror"},
     nulls={"slope_limit": "-1"},
 )
 CUT = OptionsOf(
-    "marey_schemas.job_params:CutParams",
+    "marey_schemas.queue.job_params:CutParams",
     short={
         "margin_before_s": "--before",
         "margin_after_s": "--after",
@@ -54,8 +54,8 @@ def retarget(
     as_json: AsJson = False,
 ) -> None:
     """Transfer the motion of clips to another skeleton, as a job."""
-    from marey_schemas.job_params import RetargetParams
     from marey_schemas.kinds import Kind
+    from marey_schemas.queue.job_params import RetargetParams
 
     *addresses, target = addresses_in_one_project([*sources, to])
     with connect(context) as marey:

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import JOB, Into, Sources, Wait, clips_at, follow, print_ended
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_pairs, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.typed_values import Schema, is_frame, parameters_of, read_json, read_value, type_text
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import JOB, Into, Sources, Wait, clips_at, follow, print_ended
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_pairs, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import Schema, is_frame, parameters_of, read_json, read_value, type_text
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 edit = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edit clips with commands.")
 
-EDIT = OptionsOf("marey_schemas.job_params:EditParams", without=("commands",))
+EDIT = OptionsOf("marey_schemas.queue.job_params:EditParams", without=("commands",))
 
 Do = Annotated[
     list[str] | None,

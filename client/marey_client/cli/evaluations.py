@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, find_item, require_item
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import JOB, Sources, Wait, clips_at, follow
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.typed_values import is_frame
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import is_frame
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 WORST_SHOWN = 5
 EVALUATE = OptionsOf(
-    "marey_schemas.job_params:EvaluateParams",
+    "marey_schemas.queue.job_params:EvaluateParams",
     short={
         "speeds_m_s": "--speeds",
         "turn_rates_deg_s": "--turns",
@@ -64,7 +64,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Measure how good locomotion clips are: accuracy, coverage and use, by simulated motion matching."""
-    from marey_schemas.job_params import EvaluateParams
+    from marey_schemas.queue.job_params import EvaluateParams
 
     addresses = addresses_in_one_project(sources)
     if out is not None and not wait:

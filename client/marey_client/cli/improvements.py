@@ -9,11 +9,11 @@ import typer
 
 from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import evaluation_at
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import JOB, Wait, clips_at, follow
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import JOB, Wait, clips_at, follow
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from marey_client.handles.evaluations import EvaluationHandle
     from marey_client.handles.findings import Findings
     from marey_client.marey import Marey
-    from marey_schemas.jobs import ExistingInput, JobCreate
+    from marey_schemas.queue.jobs import ExistingInput, JobCreate
 
 WEIGHT = {"objective": "--weight"}
-COMPARE = OptionsOf("marey_schemas.job_params:CompareParams")
-SUGGEST = OptionsOf("marey_schemas.job_params:SuggestParams", short=WEIGHT)
-OPTIMISE = OptionsOf("marey_schemas.job_params:OptimiseParams", short=WEIGHT)
-SWEEP = OptionsOf("marey_schemas.job_params:SweepParams", short=WEIGHT)
+COMPARE = OptionsOf("marey_schemas.queue.job_params:CompareParams")
+SUGGEST = OptionsOf("marey_schemas.queue.job_params:SuggestParams", short=WEIGHT)
+OPTIMISE = OptionsOf("marey_schemas.queue.job_params:OptimiseParams", short=WEIGHT)
+SWEEP = OptionsOf("marey_schemas.queue.job_params:SweepParams", short=WEIGHT)
 
 SHOWN = 10
 PRINTED_METRICS = (

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.failures import Refused, WrongUsage
-from marey_client.cli.following import SEEDED_JOB, Into, Wait, follow, input_at, print_ended
-from marey_client.cli.invocation import AsJson, JobId, ProjectName, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
-from marey_client.cli.schema_options import Chosen, add_command
-from marey_client.cli.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
+from marey_client.cli.terminal.failures import Refused, WrongUsage
+from marey_client.cli.terminal.following import SEEDED_JOB, Into, Wait, follow, input_at, print_ended
+from marey_client.cli.terminal.invocation import AsJson, JobId, ProjectName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.schema_options import Chosen, add_command
+from marey_client.cli.terminal.typed_values import Schema, assignment, range_text, read_parameter, resolved, type_text
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_client.reruns import ComparedOutput
-    from marey_schemas.jobs import InputSpec, Job, JobInput, JobKind
+    from marey_schemas.queue.jobs import InputSpec, Job, JobInput, JobKind
 
 job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
 
@@ -88,7 +88,7 @@ def submit_job(
     as_json: AsJson = False,
 ) -> None:
     """Submit a job of any kind, and print its result."""
-    from marey_schemas.jobs import JobCreate
+    from marey_schemas.queue.jobs import JobCreate
 
     with connect(context) as marey:
         declared = _kind_of_job(marey, kind)
@@ -125,7 +125,7 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
 
 def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
     """Return an item, or a folder if the input takes several items, or the output of a job."""
-    from marey_schemas.jobs import ItemInput, JobOutputsInput
+    from marey_schemas.queue.jobs import ItemInput, JobOutputsInput
 
     if address.has_id and address.name.startswith("job_"):
         return JobOutputsInput(job=address.name)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import SEEDED_JOB, Wait, follow, input_at
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, input_at
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.formats import DEFAULT_FORMAT, SAMPLE_FORMATS
 from marey_schemas.wording import one_of
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 MODEL = OptionsOf(
-    "marey_schemas.job_params:ModelParams",
+    "marey_schemas.queue.job_params:ModelParams",
     short={
         "spatial_share": "--share",
         "spatial_components": "--components",

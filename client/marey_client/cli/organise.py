@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import FOLDER, Address, Thing, require_apart, the_thing
-from marey_client.cli.failures import Refused, WrongUsage, sentence
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message
 from marey_client.cli.revisions import require_revision
+from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.failures import INTERRUPTED, Refused, WrongUsage
-from marey_client.cli.following import SEEDED_JOB, clips_at
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_refused, print_table, progress
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.typed_values import json_or_text, read_json
+from marey_client.cli.terminal.failures import INTERRUPTED, Refused, WrongUsage
+from marey_client.cli.terminal.following import SEEDED_JOB, clips_at
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table, progress
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import json_or_text, read_json
 
 if TYPE_CHECKING:
     from marey_client.handles.pipelines import PipelineRun
     from marey_client.marey import Marey
-    from marey_schemas.jobs import Job
+    from marey_schemas.queue.jobs import Job
 
 COLUMNS = ("step", "kind", "state", "done", "job", "")
 COUNTED = ("clips", "annotations", "frames", "samples", "nodes")
@@ -30,7 +30,7 @@ REFUSED_SHOWN = 3
 STEPS = ("import", "annotate", "cut", "align", "model", "tree")
 
 
-PROPOSE = OptionsOf("marey_schemas.job_params:AnnotateParams", only=("proposal",), short={"method": "--propose"})
+PROPOSE = OptionsOf("marey_schemas.queue.job_params:AnnotateParams", only=("proposal",), short={"method": "--propose"})
 
 Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until every job has ended.")]
 
@@ -49,7 +49,7 @@ def pipeline(
     as_json: AsJson = False,
 ) -> None:
     """Submit a graph of jobs, and follow them. Results that were computed before are used again."""
-    from marey_schemas.pipelines import PipelineCreate
+    from marey_schemas.queue.pipelines import PipelineCreate
 
     wanted = PipelineCreate.model_validate(read_json(file))
     with connect(context) as marey:

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from marey_client.cli.invocation import AsJson
+from marey_client.cli.terminal.invocation import AsJson
 from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
-from marey_schemas.log_lines import LogForm
+from marey_schemas.queue.log_lines import LogForm
 
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
 
@@ -78,8 +78,8 @@ def worker(
 ) -> None:
     """Run jobs of a server until the worker is stopped. The token must have the scope `work`."""
     from marey_client import embedded
-    from marey_client.cli.invocation import credential_of
-    from marey_client.cli.typed_values import assignment
+    from marey_client.cli.terminal.invocation import credential_of
+    from marey_client.cli.terminal.typed_values import assignment
 
     embedded.work(
         credential_of(context),

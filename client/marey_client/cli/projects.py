@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.failures import ANONYMOUS_HINT
-from marey_client.cli.invocation import AsJson, ProjectName, UserName, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.failures import ANONYMOUS_HINT
+from marey_client.cli.terminal.invocation import AsJson, ProjectName, UserName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 
 if TYPE_CHECKING:
     from marey_schemas.access import QuotaChange, QuotasInUse

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from marey_client.cli.addresses import Address, find_item, require_item
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
-    from marey_schemas.jobs import DatasetInput
     from marey_schemas.kinds import Kind
+    from marey_schemas.queue.jobs import DatasetInput
 
 _REVISION = re.compile(r"(.+)@([1-9][0-9]{0,8})")
 _VERSION = re.compile(r"([^/@]+)@([^/@]+)(?:/(.+))?")
@@ -44,7 +44,7 @@ def find_version(marey: Marey, address: Address) -> DatasetInput | None:
 
     Raises `WrongUsage` if the address has `@`, but names neither a version nor a folder.
     """
-    from marey_schemas.jobs import DatasetInput
+    from marey_schemas.queue.jobs import DatasetInput
 
     if "@" not in address.path or marey.project(address.project).collections.at(address.path) is not None:
         return None

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import SEEDED_JOB, Wait, follow, print_ended
-from marey_client.cli.invocation import AsJson, connect
 from marey_client.cli.models import model_at
-from marey_client.cli.output import print_json, print_message, print_table
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_client.cli.typed_values import read_json
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, print_ended
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.typed_values import read_json
 from marey_schemas.formats import DEFAULT_FORMAT, MOTION_FORMATS
 from marey_schemas.wording import counted, one_of
 
 if TYPE_CHECKING:
     from marey_schemas.search import SearchAnswer
 
-TREE = OptionsOf("marey_schemas.job_params:TreeParams")
+TREE = OptionsOf("marey_schemas.queue.job_params:TreeParams")
 
 SEARCH = OptionsOf("marey_schemas.search:SearchRequest", without=("constraints", "steps", "start", "motion"))
 

@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from marey_client.cli.addresses import Address, require_item
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_table
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
 
 skeleton = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Edit the joint mapping and the joint axes of skeletons."

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.accounts import SECONDS_PER_DAY
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect, credential_of
-from marey_client.cli.output import print_json, print_message, print_table
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect, credential_of
+from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def create_token(
     as_json: AsJson = False,
 ) -> None:
     """Create a token. Its secret is shown only once."""
-    from marey_client.cli.typed_values import assignment
+    from marey_client.cli.terminal.typed_values import assignment
     from marey_schemas.access import TokenCreate
 
     given: dict[str, Any] = {"scopes": tuple(scope)} if scope else {}

@@ -17,8 +17,8 @@ from marey_client.handles.reports import ReportedHandle, saved
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.places import Places, as_inputs
 from marey_schemas.documents.evaluations import COSTS
-from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
-from marey_schemas.jobs import JobCreate
+from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
+from marey_schemas.queue.jobs import JobCreate
 
 
 class EvaluationHandle(ReportedHandle):

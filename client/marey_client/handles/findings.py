@@ -9,7 +9,7 @@ from typing import Any
 from marey_client.blobs import Blobs
 from marey_client.transport import Transport
 from marey_schemas.encoding.codecs import JSON, decode_tree
-from marey_schemas.jobs import Job
+from marey_schemas.queue.jobs import Job
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from types import MappingProxyType
 from marey_client.errors import Conflict, JobUnsuccessful, WaitedTooLong
 from marey_client.jobs import LONGEST_WAIT_S, Jobs
 from marey_client.transport import Transport
-from marey_schemas.jobs import FailureReason, Job, JobOutput, JobState
-from marey_schemas.pipelines import Pipeline, PipelineCreate
+from marey_schemas.queue.jobs import FailureReason, Job, JobOutput, JobState
+from marey_schemas.queue.pipelines import Pipeline, PipelineCreate
 
 OnProgress = Callable[[Mapping[str, Job]], None]
 

@@ -14,8 +14,8 @@ from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.one_or_several import several
 from marey_client.transport import BLOCKS, as_json, read_tree
 from marey_schemas.formats import DEFAULT_FORMAT, DEFAULT_UNIT
-from marey_schemas.job_params import TreeParams
-from marey_schemas.jobs import Job, JobCreate
+from marey_schemas.queue.job_params import TreeParams
+from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.search import SearchAnswer, SearchRequest
 
 Constraint = Mapping[str, Any] | BaseModel

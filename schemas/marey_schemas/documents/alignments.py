@@ -10,8 +10,8 @@ from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.job_params import AlignParams
 from marey_schemas.names import Digest, JointName, Label
+from marey_schemas.queue.job_params import AlignParams
 
 Metres = Annotated[float, Field(allow_inf_nan=False)]
 

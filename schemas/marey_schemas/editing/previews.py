@@ -13,7 +13,7 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.editing.commands import Frames
 from marey_schemas.editing.edits import MOST_COMMANDS, EditCommand
 from marey_schemas.encoding.arrays import ArrayOf
-from marey_schemas.jobs import ItemInput
+from marey_schemas.queue.jobs import ItemInput
 
 
 class EditPreviewRequest(Request):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
-from marey_schemas.worker_protocol import FAULT_VARIABLE
+from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
 
 PASSED_ON = frozenset(
     {

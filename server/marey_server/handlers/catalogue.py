@@ -6,8 +6,6 @@ from marey_server.handlers import (
     blobs,
     collections,
     coverage_streams,
-    datasets,
-    differences,
     documentation,
     edits,
     events,
@@ -15,17 +13,15 @@ from marey_server.handlers import (
     health,
     imports,
     items,
-    jobs,
-    leases,
     parts,
-    pipelines,
     projects,
-    proposals,
     reports,
     samples,
     searches,
     uploads,
 )
+from marey_server.handlers.queue import jobs, leases, pipelines
+from marey_server.handlers.versions import datasets, differences, proposals
 from marey_server.http.resource import Resource
 
 RESOURCES: tuple[type[Resource], ...] = (

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from marey_schemas.imports import ImportAnswer, ImportEntry, ImportRequest
-from marey_schemas.jobs import Job, JobCreate
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, NotFoundProblem, TooLargeProblem
 from marey_server.field_errors import field_errors

@@ -17,8 +17,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from marey_schemas.backoff import Backoff
-from marey_schemas.log_lines import LogForm
 from marey_schemas.processes.environment import clean_environment
+from marey_schemas.queue.log_lines import LogForm
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from functools import partial
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from marey_schemas.log_lines import LogForm, log_to_standard_error
+from marey_schemas.queue.log_lines import LogForm, log_to_standard_error
 
 _SANE_ID = re.compile(r"[A-Za-z0-9._:-]{8,128}")
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30)

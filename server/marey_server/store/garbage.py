@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Table, delete, exists, select
 
-from marey_schemas.jobs import JobState
+from marey_schemas.queue.jobs import JobState
 from marey_schemas.sizes import MIB
 from marey_server import faults
 from marey_server.access.principal import SYSTEM

@@ -16,7 +16,7 @@ from marey_client.errors import JobUnsuccessful
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
 from marey_motion.formats import read_motion, write_bvh
-from marey_schemas.jobs import Job
+from marey_schemas.queue.jobs import Job
 
 pytestmark = pytest.mark.timeout(300)
 

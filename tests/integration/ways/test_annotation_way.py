@@ -12,7 +12,7 @@ from tests.support.command_line import CommandLine
 from marey_client.errors import JobUnsuccessful, PreconditionFailed, RequestFailed
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
-from marey_schemas.jobs import Job
+from marey_schemas.queue.jobs import Job
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -24,7 +24,7 @@ from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.editing.edits import EditDocument
-from marey_schemas.jobs import Job
+from marey_schemas.queue.jobs import Job
 
 pytestmark = pytest.mark.timeout(300)
 

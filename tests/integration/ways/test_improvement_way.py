@@ -15,7 +15,7 @@ from marey_client.errors import JobUnsuccessful
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.project import ProjectHandle
 from marey_schemas.access import Login, Role, UserCreate
-from marey_schemas.jobs import CollectionInput, JobCreate
+from marey_schemas.queue.jobs import CollectionInput, JobCreate
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -22,10 +22,10 @@ from marey_motion.formats.predecessor.encoding import encode_document
 from marey_motion.formats.predecessor.model import read_predecessor_model
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import ItemChange
-from marey_schemas.job_params import ImportParams
-from marey_schemas.jobs import JobCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.job_params import ImportParams
+from marey_schemas.queue.jobs import JobCreate
 
 pytestmark = pytest.mark.timeout(300)
 

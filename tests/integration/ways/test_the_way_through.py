@@ -25,9 +25,9 @@ from marey_schemas.access import Login, ProjectCreate, UserCreate
 from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.imports import ImportFile
 from marey_schemas.items import ItemChange
-from marey_schemas.job_params import ImportParams
-from marey_schemas.jobs import CollectionInput, ItemInput, JobCreate
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.job_params import ImportParams
+from marey_schemas.queue.jobs import CollectionInput, ItemInput, JobCreate
 
 pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope="session")
 

@@ -24,22 +24,22 @@ from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
-from marey_client.cli.failures import Refused, WrongUsage, sentence
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
 from marey_client.cli.files.uploading import _print_entries
-from marey_client.cli.following import follow, print_ended
-from marey_client.cli.invocation import connect
 from marey_client.cli.jobs import _done
-from marey_client.cli.output import print_table
 from marey_client.cli.pipelines import _print_shortfalls
+from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
+from marey_client.cli.terminal.following import follow, print_ended
+from marey_client.cli.terminal.invocation import connect
+from marey_client.cli.terminal.output import print_table
 from marey_client.credentials import Credential, Logins, read_logins, store_login, write_private
 from marey_client.errors import BadCredentialFile, Forbidden, Invalid, NotFound, Unauthenticated
 from marey_client.handles.pipelines import PipelineRun
 from marey_client.marey import Marey
 from marey_schemas.imports import ImportEntry
-from marey_schemas.jobs import Job, JobState, Progress
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.jobs import Job, JobState, Progress
 
 
 def marey(

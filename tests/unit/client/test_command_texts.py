@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from marey_client.cli.edits import parameter_rows, parse_command
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 

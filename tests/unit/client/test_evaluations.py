@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from tests.support.scripted_server import ScriptedServer
 
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.following import show_progress
-from marey_client.cli.typed_values import read_numbers
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.following import show_progress
+from marey_client.cli.terminal.typed_values import read_numbers
 from marey_client.handles.evaluations import clip_rows, record_arrays, trial_rows
-from marey_schemas.jobs import CollectionInput, Job, Progress
+from marey_schemas.queue.jobs import CollectionInput, Job, Progress
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC).isoformat()
 

@@ -7,8 +7,8 @@ import pytest
 from tests.support.scripted_server import ScriptedServer
 
 from marey_client.blobs import digest_of
-from marey_client.cli.failures import WrongUsage
 from marey_client.cli.improvements import OPTIMISE, _print_comparison
+from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_schemas.items import Item
 

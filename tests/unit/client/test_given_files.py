@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.typed_values import read_json
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.typed_values import read_json
 
 
 @pytest.mark.parametrize(

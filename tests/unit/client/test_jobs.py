@@ -9,7 +9,7 @@ from tests.support.scripted_server import ScriptedServer
 
 from marey_client import errors
 from marey_client.explanations import explain
-from marey_schemas.jobs import Attempt, Job
+from marey_schemas.queue.jobs import Attempt, Job
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -12,8 +12,8 @@ from marey_client import errors
 from marey_client.cli.pipelines import follow_run
 from marey_client.explanations import explain
 from marey_client.handles.pipelines import PipelineRun
-from marey_schemas.jobs import Job
-from marey_schemas.pipelines import PipelineCreate
+from marey_schemas.queue.jobs import Job
+from marey_schemas.queue.pipelines import PipelineCreate
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 TWO = PipelineCreate.model_validate(

@@ -14,13 +14,13 @@ from marey_client.cli import jobs
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import ALIGN, CUT
 from marey_client.cli.evaluations import EVALUATE
-from marey_client.cli.failures import WrongUsage
 from marey_client.cli.files.uploading import UPLOAD
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
-from marey_schemas.job_params import AlignParams, EvaluateParams
-from marey_schemas.jobs import JobKind
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.options.imports import ImportOptions
 from marey_schemas.options.modelling import ModelOptions
+from marey_schemas.queue.job_params import AlignParams, EvaluateParams
+from marey_schemas.queue.jobs import JobKind
 from marey_schemas.search_constraints import JointOrientationConstraint, JointPositionConstraint
 from marey_worker.supervisor import WorkerOptions
 

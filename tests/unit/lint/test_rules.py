@@ -139,10 +139,10 @@ def test_long_functions_and_modules_are_found_and_docstrings_do_not_count() -> N
 def test_a_list_that_repeats_words_of_a_vocabulary_is_found() -> None:
     home = "class State(StrEnum):\n    A = 'waiting'\n    B = 'queued'\n    C = 'running'\n    D = 'failed'\n"
     copy = "OPEN = ('waiting', 'queued', 'running')\n"
-    (offence,) = lists.find(house({"marey_schemas.jobs": home, "marey_x.a": copy}))
-    assert "words of marey_schemas.jobs.State" in offence.message
+    (offence,) = lists.find(house({"marey_schemas.queue.jobs": home, "marey_x.a": copy}))
+    assert "words of marey_schemas.queue.jobs.State" in offence.message
     other = "OPEN = ('waiting', 'queued', 'opened')\n"
-    assert not list(lists.find(house({"marey_schemas.jobs": home, "marey_x.a": other})))
+    assert not list(lists.find(house({"marey_schemas.queue.jobs": home, "marey_x.a": other})))
 
 
 def test_a_constant_that_two_modules_declare_is_found() -> None:

@@ -4,8 +4,8 @@ from typing import Any
 
 from marey_motion.evaluation.result_documents import options_from_tree
 from marey_motion.evaluation.scenario import suite_trials
-from marey_schemas.job_params import EvaluateParams
 from marey_schemas.options.evaluation import EvaluationOptions
+from marey_schemas.queue.job_params import EvaluateParams
 
 OF_RELEASE_0_1: dict[str, Any] = {
     "grid": {"speeds_m_s": [0.5, 2.0], "turn_rates_deg_s": [-30.0]},

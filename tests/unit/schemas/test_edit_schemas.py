@@ -10,8 +10,8 @@ from tests.support.edit_examples import commands_of_all
 from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, decode_tree, encode_tree
-from marey_schemas.job_kinds import find_kind
-from marey_schemas.job_params import EditParams
+from marey_schemas.queue.job_kinds import find_kind
+from marey_schemas.queue.job_params import EditParams
 
 
 def edit_of(**given: Any) -> EditDocument:

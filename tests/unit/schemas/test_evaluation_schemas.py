@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.job_params import MOST_EVALUATION_TASKS, MOST_TRIALS, EvaluateParams, count_evaluation_tasks
+from marey_schemas.queue.job_params import MOST_EVALUATION_TASKS, MOST_TRIALS, EvaluateParams, count_evaluation_tasks
 
 
 def test_the_defaults_are_the_published_suite() -> None:

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.job_kinds import MOST_TASKS, find_kind
-from marey_schemas.job_params import OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 from marey_schemas.options.improvement import ObjectiveOptions
+from marey_schemas.queue.job_kinds import MOST_TASKS, find_kind
+from marey_schemas.queue.job_params import OptimiseParams, SuggestParams, SweepParams, count_sweep_tasks
 
 
 def test_a_sweep_has_a_task_for_every_setting_and_never_too_many() -> None:

@@ -7,11 +7,11 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from marey_schemas import job_kinds
-from marey_schemas.job_kinds import BUILT_IN, IMPORT, KindDeclaration, UnknownKindError, find_kind
-from marey_schemas.job_params import RetargetParams
-from marey_schemas.jobs import InputSpec
 from marey_schemas.kinds import Kind
+from marey_schemas.queue import job_kinds
+from marey_schemas.queue.job_kinds import BUILT_IN, IMPORT, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.job_params import RetargetParams
+from marey_schemas.queue.jobs import InputSpec
 
 
 def declare(**fields: object) -> KindDeclaration:
@@ -82,7 +82,7 @@ def test_other_distributions_add_kinds(installed: list[EntryPoint]) -> None:
 
 @pytest.mark.parametrize(
     ("value", "error"),
-    [("marey_schemas.job_kinds:IMPORT", ValueError), ("marey_schemas.job_kinds:BUILT_IN", TypeError)],
+    [("marey_schemas.queue.job_kinds:IMPORT", ValueError), ("marey_schemas.queue.job_kinds:BUILT_IN", TypeError)],
 )
 def test_a_name_that_is_taken_or_a_thing_that_is_no_kind_is_refused(
     installed: list[EntryPoint], value: str, error: type[Exception]
@@ -104,6 +104,6 @@ def test_a_fan_out_needs_an_input_of_many_items() -> None:
 
 def test_the_declarations_import_no_numeric_code() -> None:
     numeric = ("scipy", "numba", "marey_motion")
-    code = f"import sys, marey_schemas.job_kinds; print([name for name in {numeric} if name in sys.modules])"
+    code = f"import sys, marey_schemas.queue.job_kinds; print([name for name in {numeric} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.job_kinds import find_kind
-from marey_schemas.model_pipelines import ModelPlan, model_pipeline
-from marey_schemas.pipelines import job_of_step, order_steps
+from marey_schemas.queue.job_kinds import find_kind
+from marey_schemas.queue.model_pipelines import ModelPlan, model_pipeline
+from marey_schemas.queue.pipelines import job_of_step, order_steps
 
 FILES = {"files": {"files": [{"name": "walk.bvh", "blob": f"sha256:{'0' * 64}"}]}}
 CLIPS = {"clips": [{"collection": "raw"}]}

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marey_schemas.pipelines import MOST_STEPS, PipelineCreate, PipelineError, job_of_step, order_steps
+from marey_schemas.queue.pipelines import MOST_STEPS, PipelineCreate, PipelineError, job_of_step, order_steps
 
 
 def pipeline(steps: dict[str, Any], **shared: Any) -> PipelineCreate:

@@ -6,8 +6,8 @@ import pytest
 from sqlalchemy import select
 from tests.support.queue_desk import Desk
 
-from marey_schemas.jobs import JobCreate
-from marey_schemas.worker_protocol import Lease
+from marey_schemas.queue.jobs import JobCreate
+from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import LeaseLostProblem, UnauthenticatedProblem
 from marey_server.store.jobs import logs

@@ -3,7 +3,7 @@
 import pytest
 from tests.support.queue_desk import Desk
 
-from marey_schemas.worker_protocol import Lease, LogAnswer
+from marey_schemas.queue.worker_protocol import Lease, LogAnswer
 from marey_server.errors import LeaseLostProblem
 from marey_server.store.jobs import logs, reading
 from marey_server.store.jobs.logs import LogOffset, LogPage

@@ -8,10 +8,10 @@ import pytest
 from tests.support.queue_desk import KINDS, SUM, Desk, document
 from tests.support.store_fixtures import skeleton_tree
 
-from marey_schemas import job_kinds
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import InputSpec, JobCreate
 from marey_schemas.kinds import Kind
+from marey_schemas.queue import job_kinds
+from marey_schemas.queue.jobs import InputSpec, JobCreate
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects

@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from marey_schemas.log_lines import JsonFormatter, TextFormatter
+from marey_schemas.queue.log_lines import JsonFormatter, TextFormatter
 from marey_server.process.observe import Metrics, request_id
 
 

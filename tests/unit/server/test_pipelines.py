@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from tests.support.queue_desk import Desk
 
-from marey_schemas.jobs import Job
 from marey_schemas.kinds import Kind
-from marey_schemas.pipelines import PipelineCreate
+from marey_schemas.queue.jobs import Job
+from marey_schemas.queue.pipelines import PipelineCreate
 from marey_server.errors import InvalidProblem
 from marey_server.store import blobs, items
 from marey_server.store.jobs import reading

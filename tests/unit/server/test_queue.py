@@ -7,8 +7,8 @@ import pytest
 from tests.support.queue_desk import Desk
 
 from marey_schemas.access import ProjectCreate
-from marey_schemas.jobs import JobCreate, Progress
-from marey_schemas.worker_protocol import BatchCompletion, ClaimRequest, CompleteRequest
+from marey_schemas.queue.jobs import JobCreate, Progress
+from marey_schemas.queue.worker_protocol import BatchCompletion, ClaimRequest, CompleteRequest
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import projects

@@ -8,11 +8,11 @@ from sqlalchemy import select, update
 from tests.support.queue_desk import SUM, Desk, document
 from tests.support.store_fixtures import declared, requiring
 
-from marey_schemas import job_kinds
 from marey_schemas.access import MemberChange, Role, UserCreate
-from marey_schemas.jobs import JobCreate, JobState, Progress
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import Lease
+from marey_schemas.queue import job_kinds
+from marey_schemas.queue.jobs import JobCreate, JobState, Progress
+from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem, NotFoundProblem
 from marey_server.store import blobs, events, garbage, items, members, users

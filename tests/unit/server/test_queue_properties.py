@@ -14,7 +14,7 @@ from tests.support.queue_desk import Desk
 from tests.support.queue_model import TERMINAL, ModelJob, ModelQueue
 from tests.support.tiers import examples, steps
 
-from marey_schemas.worker_protocol import Lease
+from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, LeaseLostProblem
 from marey_server.store import tables

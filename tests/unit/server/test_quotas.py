@@ -11,7 +11,7 @@ from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.access import ProjectCreate, TokenCreate
-from marey_schemas.jobs import ItemInput, JobCreate
+from marey_schemas.queue.jobs import ItemInput, JobCreate
 from marey_server.errors import QuotaExceededProblem
 from marey_server.process.settings import Settings
 from marey_server.store import projects, uploads

@@ -5,8 +5,8 @@ from sqlalchemy import func, select
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import Lab
 
-from marey_schemas.jobs import ItemInput
-from marey_schemas.worker_protocol import Lease
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.worker_protocol import Lease
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import GoneProblem, NotFoundProblem
 from marey_server.store import events, fsck, retention

@@ -9,7 +9,7 @@ from tests.support.database_fixtures import AdjustableClock
 from tests.support.store_fixtures import Lab
 
 from marey_schemas.access import NewToken, TokenCreate, UserChange, UserCreate
-from marey_schemas.jobs import JobState
+from marey_schemas.queue.jobs import JobState
 from marey_server.access import passwords
 from marey_server.access.principal import ANONYMOUS, SYSTEM, Principal
 from marey_server.access.secret_tokens import issue_attempt_token

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from marey_schemas.access import ProjectCreate
 from marey_schemas.items import ItemCreate, UploadCreate
-from marey_schemas.jobs import JobCreate
+from marey_schemas.queue.jobs import JobCreate
 from marey_server.errors import BadRequestProblem, InvalidProblem
 from marey_server.http.queries import CommaSeparated, PageQuery
 from marey_server.http.validation import decode_body, parse_query, validate_body

@@ -15,9 +15,9 @@ from marey_schemas.documents.alignments import AlignmentInfo
 from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.job_params import AlignParams
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.job_params import AlignParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
 from marey_worker.kinds import align
 

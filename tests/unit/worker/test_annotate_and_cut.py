@@ -10,10 +10,10 @@ from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.job_params import AnnotateParams, CutParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.job_params import AnnotateParams, CutParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused
 from marey_worker.job_io import skeleton_cache
 from marey_worker.kinds import annotate, cut

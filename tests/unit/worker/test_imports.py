@@ -8,8 +8,8 @@ from tests.support.project_in_memory import ProjectInMemory
 
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
-from marey_schemas.job_params import ImportParams
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.job_params import ImportParams
 from marey_worker.kinds import imports
 
 

@@ -12,10 +12,10 @@ from tests.support.project_in_memory import PARAMS, ProjectInMemory, add_clip
 from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
 from marey_schemas.encoding.codecs import JSON, decode_tree
-from marey_schemas.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.job_params import CompareParams, OptimiseParams, SuggestParams, SweepParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import JobRefused, Task
 from marey_worker.job_io import matching_clips
 from marey_worker.kinds import compare, evaluate, optimise, suggest, sweep

@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 
 from marey_client.errors import Unreachable
-from marey_schemas.worker_protocol import LogAnswer
+from marey_schemas.queue.worker_protocol import LogAnswer
 from marey_worker import attempt
 from marey_worker.attempt import LogUploader
 from marey_worker.attempt_api import AttemptApi

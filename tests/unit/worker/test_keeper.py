@@ -11,9 +11,9 @@ import pytest
 from marey_client.errors import LeaseLost, Unavailable, Unreachable
 from marey_client.retries import Retries
 from marey_client.transport import Transport
-from marey_schemas.jobs import Progress, Resources
 from marey_schemas.problems import Problem
-from marey_schemas.worker_protocol import HeartbeatAnswer, Lease
+from marey_schemas.queue.jobs import Progress, Resources
+from marey_schemas.queue.worker_protocol import HeartbeatAnswer, Lease
 from marey_worker import attempt_api, heartbeats
 from marey_worker.attempt_api import AttemptApi
 from marey_worker.heartbeats import LeaseKeeper

@@ -5,7 +5,7 @@ import sys
 
 LOADING = """
 import sys
-from marey_schemas.job_kinds import job_kinds
+from marey_schemas.queue.job_kinds import job_kinds
 from marey_worker.child import load
 load(list(job_kinds()))
 print(*(name for name in ("scipy.stats", "scipy.signal", "sklearn", "matplotlib") if name in sys.modules))
@@ -19,7 +19,7 @@ def test_a_worker_waits_for_no_statistics_and_no_drawing_before_its_first_job() 
 
 COLLECTING = """
 import gc, importlib, sys, weakref
-from marey_schemas.job_kinds import job_kinds
+from marey_schemas.queue.job_kinds import job_kinds
 from marey_worker.child import Garbage, load
 class Thing: pass
 def cycle():

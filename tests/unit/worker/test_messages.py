@@ -10,10 +10,10 @@ import msgpack
 import pytest
 
 from marey_schemas.items import Item, PartPlace
-from marey_schemas.jobs import Progress
 from marey_schemas.kinds import Kind
 from marey_schemas.processes.child_process import BadMessage, ChildProcess
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.jobs import Progress
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.attempt import send_reply
 from marey_worker.messages import ChildReply, Done, Made, PutFile, ReadParts, ReadResults, Run, pack, unpack
 

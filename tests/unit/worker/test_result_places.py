@@ -13,10 +13,17 @@ from tests.support.project_in_memory import ProjectInMemory, add_clip
 
 from marey_motion.gait import generate_gait
 from marey_schemas.documents.annotations import Annotation
-from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, EditParams, ExportParams, RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import (
+    AlignParams,
+    AnnotateParams,
+    CutParams,
+    EditParams,
+    ExportParams,
+    RetargetParams,
+)
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import JobRefused
 from marey_worker.job_io import skeleton_cache
 from marey_worker.job_io.staged_results import StagedResults

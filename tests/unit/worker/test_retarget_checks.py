@@ -13,10 +13,10 @@ from marey_motion.clip import Clip
 from marey_motion.documents import skeleton_to_document
 from marey_motion.gait import game_skeleton, generate_gait
 from marey_motion.moved_bones import FollowedBones, follow_moved_bones
-from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.job_params import RetargetParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.job_io import skeleton_cache
 from marey_worker.kinds import retarget
 

@@ -15,8 +15,8 @@ from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import counted
-from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import EvaluatedSet
 from marey_worker.job_io.matching_clips import ClipSet, build_clips, read_motions, uid_of

@@ -12,7 +12,7 @@ from marey_motion.evaluation.scenario import Trial
 from marey_schemas.documents.reports import StoredFile
 from marey_schemas.encoding.codecs import JSON, encode_tree
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context
 from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_clips, refusing_motion_errors
 

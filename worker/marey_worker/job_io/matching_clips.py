@@ -22,12 +22,12 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import canonical_json, document_digest
 from marey_schemas.items import LOOP_TAG
-from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.options.matching import DatabaseOptions
+from marey_schemas.queue.job_params import EvaluateParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import NAMES_SHOWN, counted
-from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged
 

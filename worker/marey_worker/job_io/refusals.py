@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marey_motion.errors import MotionError
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, NoSuchThing
 
 UNUSABLE = (MotionError, ValidationError, NoSuchThing)

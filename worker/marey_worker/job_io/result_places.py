@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from marey_motion.errors import MotionError
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
-from marey_schemas.worker_protocol import PinnedInput
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from marey_schemas.worker_protocol import StagedOutput
+from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 
 BYTES_PER_STAGE = 2 << 20

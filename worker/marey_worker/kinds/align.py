@@ -19,11 +19,11 @@ from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.job_params import MOST_EXAMPLES, AlignParams
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.options.alignment import MEDOID, NEAREST_MEAN_LENGTH, AlignOptions
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import MOST_EXAMPLES, AlignParams
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present

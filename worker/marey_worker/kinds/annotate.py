@@ -15,12 +15,12 @@ from marey_motion.errors import AnnotationError, UnknownJoint
 from marey_motion.matching.body import MatchingBody
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.job_params import AnnotateParams
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.options.annotations import StepsProposal, WristContactProposal
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import AnnotateParams
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import require_different

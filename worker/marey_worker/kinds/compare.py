@@ -8,7 +8,7 @@ from marey_motion.errors import MotionError
 from marey_motion.evaluation.compare import Comparison, compare_results
 from marey_motion.evaluation.improvement.suggestion_documents import comparison_to_tree
 from marey_reports.evaluation.page import render_comparison
-from marey_schemas.job_params import CompareParams
+from marey_schemas.queue.job_params import CompareParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.evaluated_set import read_result, store_document, store_file
 

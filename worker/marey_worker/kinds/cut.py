@@ -16,11 +16,11 @@ from marey_schemas.documents.annotations import Annotation
 from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import OutputRef, RevisionRef
 from marey_schemas.items import Item
-from marey_schemas.job_params import CutParams
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import CutParams
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces

@@ -18,9 +18,9 @@ from marey_schemas.documents.clips import ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.editing.edits import EditDocument
-from marey_schemas.job_params import EditParams
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import EditParams
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces

@@ -17,10 +17,10 @@ from marey_reports.evaluation.figures import FIGURES, DrawnFigure, draw_figure, 
 from marey_reports.evaluation.page import render_report, verdict
 from marey_schemas.documents.reports import EvaluationReport
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree, encode_tree
-from marey_schemas.job_params import EvaluateParams
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import EvaluationOptions
-from marey_schemas.worker_protocol import StagedOutput
+from marey_schemas.queue.job_params import EvaluateParams
+from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import read_clips, refusing_motion_errors, wanted_clips
 from marey_worker.job_io.stored_reports import store_report

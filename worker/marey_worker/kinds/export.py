@@ -15,10 +15,10 @@ from marey_schemas.documents.reports import StoredFile
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import ZIP_EPOCH
 from marey_schemas.item_files import ItemToExport, item_as_json, original_of_clip
-from marey_schemas.job_params import ExportParams
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.job_params import ExportParams
+from marey_schemas.queue.worker_protocol import PinnedInput
 from marey_schemas.wording import counted
-from marey_schemas.worker_protocol import PinnedInput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import present
 

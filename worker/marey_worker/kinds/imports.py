@@ -12,10 +12,10 @@ from marey_motion.importing.plan import PlannedFile, plan_imports
 from marey_schemas.documents.clips import Check
 from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry
-from marey_schemas.job_params import ImportParams
 from marey_schemas.kinds import Kind
 from marey_schemas.options.imports import ImportOptions
-from marey_schemas.worker_protocol import StagedOutput
+from marey_schemas.queue.job_params import ImportParams
+from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.staged_results import StagedResults
 

@@ -22,10 +22,10 @@ from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.reports import ModelReport
 from marey_schemas.documents.skeletons import SkeletonHierarchy
-from marey_schemas.job_params import ModelParams
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import ModelOptions
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import ModelParams
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.stored_reports import store_report

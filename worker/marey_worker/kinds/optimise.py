@@ -9,7 +9,7 @@ from marey_motion.evaluation.improvement.resimulation import Resimulation
 from marey_motion.evaluation.improvement.selection import joined, same_skeleton, source_of
 from marey_motion.evaluation.improvement.suggestion_documents import optimisation_to_tree
 from marey_motion.matching.database import MatchingDatabase
-from marey_schemas.job_params import OptimiseParams
+from marey_schemas.queue.job_params import OptimiseParams
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.candidates import Candidates, read_candidates
 from marey_worker.job_io.evaluated_set import EvaluatedSet, read_evaluated_set, store_document

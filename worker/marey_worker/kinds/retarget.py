@@ -11,9 +11,9 @@ from marey_motion.errors import MotionError
 from marey_motion.retargeting import RetargetPlan, moved_bones, retarget
 from marey_schemas.documents.clips import Check, ClipInfo, ClipSource, MotionDocument
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.job_params import RetargetParams
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import RetargetParams
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces

@@ -6,7 +6,7 @@ from typing import Any
 
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
 from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
-from marey_schemas.job_params import SuggestParams
+from marey_schemas.queue.job_params import SuggestParams
 from marey_worker.context import Context
 from marey_worker.job_io.candidates import read_candidates
 from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from typing import Any
 
 from marey_motion.evaluation.improvement.sweep import SweepRow, group_influences, sweep_weights, vary_each_group
-from marey_schemas.job_params import SweepParams
 from marey_schemas.options.matching import FeatureWeights
+from marey_schemas.queue.job_params import SweepParams
 from marey_worker.context import Context
 from marey_worker.job_io.evaluated_set import read_evaluated_set, store_document
 from marey_worker.job_io.matching_clips import refusing_motion_errors

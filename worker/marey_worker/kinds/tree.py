@@ -10,11 +10,11 @@ from marey_motion.modelling.search.tree import END_EFFECTORS, build_tree
 from marey_motion.modelling.search.tree_documents import sample_tree_to_tree
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.encoding.canonical import document_digest
-from marey_schemas.job_params import TreeParams
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_params import TreeParams
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.skeleton_cache import Rig, read_rigged

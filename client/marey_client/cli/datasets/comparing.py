@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.datasets.places import NamedVersion, VersionPlace, parse, short
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_table
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
     from marey_client.handles.datasets import DatasetHandle

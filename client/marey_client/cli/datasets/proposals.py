@@ -16,9 +16,9 @@ from marey_client.cli.datasets.combining import (
     resolutions_of,
 )
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.datasets.proposal_states import CheckState, ProposalState, Verdict
 from marey_schemas.kinds import Kind
 

@@ -10,8 +10,8 @@ import typer
 from marey_client.cli.addresses import kind_named
 from marey_client.cli.datasets import combining, comparing, proposals
 from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
-from marey_client.cli.invocation import AsJson, ProjectName, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
+from marey_client.cli.terminal.invocation import AsJson, ProjectName, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

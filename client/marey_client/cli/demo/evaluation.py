@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from marey_client.cli.output import Advance
+from marey_client.cli.terminal.output import Advance
 from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
 

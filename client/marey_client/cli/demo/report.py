@@ -14,12 +14,12 @@ from typing import Any
 import typer
 
 from marey_client.cli.demo.evaluation import DemoEvaluation
-from marey_client.cli.output import print_message, print_rows
+from marey_client.cli.terminal.output import print_message, print_rows
 from marey_client.credentials import ADMIN_TOKEN
 from marey_client.imports import refusal_text
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import Item
-from marey_schemas.jobs import Job
+from marey_schemas.queue.jobs import Job
 
 REASONS_SHOWN = 12
 

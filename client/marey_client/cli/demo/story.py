@@ -16,7 +16,7 @@ from typing import Any
 from marey_client import embedded
 from marey_client.cli.demo.evaluation import evaluate_locomotion
 from marey_client.cli.demo.report import DemoReport, print_report
-from marey_client.cli.output import Advance, print_json, print_message, progress
+from marey_client.cli.terminal.output import Advance, print_json, print_message, progress
 from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import NotFound
 from marey_client.handles.clips import ClipHandle
@@ -28,8 +28,8 @@ from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry
-from marey_schemas.jobs import Job
 from marey_schemas.options.imports import ImportOptions
+from marey_schemas.queue.jobs import Job
 
 PROJECT = "demo"
 TAKES, RESULTS, SKELETON = "takes", "retargeted", "game"

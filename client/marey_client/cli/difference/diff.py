@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message
 from marey_client.cli.revisions import require_revision
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 
 if TYPE_CHECKING:
     from marey_schemas.documents.differences import Difference

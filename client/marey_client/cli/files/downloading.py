@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.failures import Refused, WrongUsage
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, progress
 from marey_client.cli.revisions import find_revision, find_version
+from marey_client.cli.terminal.failures import Refused, WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, progress
 from marey_schemas.formats import EXPORT_FORMATS
 from marey_schemas.wording import counted, one_of
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from marey_client.items import ItemHandle
     from marey_client.marey import Marey
     from marey_client.project import ProjectHandle
-    from marey_schemas.jobs import DatasetInput
+    from marey_schemas.queue.jobs import DatasetInput
 
 
 DOWNLOADS_AT_ONCE = 4
@@ -122,7 +122,7 @@ def _entries_of(project: ProjectHandle, version: DatasetInput) -> list[_Exported
 def _download_all(
     chosen: Sequence[_Exported], output: Path, options: Mapping[str, Any]
 ) -> tuple[list[Path], dict[str, str]]:
-    from marey_client.cli.failures import sentence
+    from marey_client.cli.terminal.failures import sentence
     from marey_client.downloads import TakenPaths, safe_file_name
     from marey_client.errors import RequestFailed
 

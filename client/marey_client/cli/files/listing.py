@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, find_item, kind_named
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.revisions import require_revision
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address
-from marey_client.cli.failures import Refused, WrongUsage, sentence
-from marey_client.cli.invocation import connect
-from marey_client.cli.output import print_message, progress
+from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
+from marey_client.cli.terminal.invocation import connect
+from marey_client.cli.terminal.output import print_message, progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.failures import Refused
-from marey_client.cli.invocation import AsJson, connect
-from marey_client.cli.output import print_json, print_message, progress
-from marey_client.cli.schema_options import Chosen, OptionsOf, add_command
+from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, progress
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:

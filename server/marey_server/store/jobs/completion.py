@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy import and_, bindparam, exists, select, tuple_, update
 
-from marey_schemas.jobs import JobOutput, JobState
-from marey_schemas.worker_protocol import (
+from marey_schemas.queue.jobs import JobOutput, JobState
+from marey_schemas.queue.worker_protocol import (
     BatchCompletion,
     BatchCompletionResult,
     CompleteAnswer,

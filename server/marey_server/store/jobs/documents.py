@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Row, Select, bindparam, func, select
 
-from marey_schemas.jobs import Job, JobState, Progress
+from marey_schemas.queue.jobs import Job, JobState, Progress
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import job, job_dependency, project, user

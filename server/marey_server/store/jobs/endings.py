@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Row, bindparam, update
 
-from marey_schemas.jobs import FailureReason, JobFailure
+from marey_schemas.queue.jobs import FailureReason, JobFailure
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.tables import attempt, job
 from marey_server.store.transaction import Transaction

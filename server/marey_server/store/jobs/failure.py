@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Row, and_, not_, select, update
 
-from marey_schemas.jobs import FailureReason
-from marey_schemas.worker_protocol import FailRequest
+from marey_schemas.queue.jobs import FailureReason
+from marey_schemas.queue.worker_protocol import FailRequest
 from marey_server.errors import AUTHOR_LOST
 from marey_server.store.jobs import staging
 from marey_server.store.jobs.endings import AttemptEnd, end_attempts, end_jobs, failure_document

@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import and_, delete, select, update
 
-from marey_schemas.jobs import FailureReason
+from marey_schemas.queue.jobs import FailureReason
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import RUNNING

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, bindparam, func, or_, select
 
-from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import (
+from marey_schemas.problems import FieldError
+from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.jobs import (
     CollectionInput,
     DatasetInput,
     InputSpec,
@@ -17,7 +18,6 @@ from marey_schemas.jobs import (
     JobInput,
     JobOutputsInput,
 )
-from marey_schemas.problems import FieldError
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.store import datasets

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from sqlalchemy import Row, and_, insert, select, update
 
-from marey_schemas.job_kinds import KindDeclaration, UnknownKindError, find_kind
-from marey_schemas.jobs import FailureReason, InputSpec
+from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.wording import without_prefix
 from marey_server import faults
 from marey_server.store.jobs import layout, result_cache

@@ -8,8 +8,8 @@ from typing import Any
 
 from sqlalchemy import Row
 
-from marey_schemas.job_kinds import KindDeclaration
-from marey_schemas.jobs import JobCreate, Resources
+from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.jobs import JobCreate, Resources
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.endings import Ended

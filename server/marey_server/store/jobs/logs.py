@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from sqlalchemy import Row, insert, select, update
 
-from marey_schemas.jobs import JobState
-from marey_schemas.worker_protocol import LogAnswer
+from marey_schemas.queue.jobs import JobState
+from marey_schemas.queue.worker_protocol import LogAnswer
 from marey_server.errors import ConflictProblem
 from marey_server.store.jobs.fencing import hold, require_attempt
 from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy

@@ -25,9 +25,9 @@ from sqlalchemy import (
 from sqlalchemy.sql.dml import ReturningUpdate
 
 from marey_schemas.access import Role
-from marey_schemas.jobs import Resources
 from marey_schemas.problems import FieldError
-from marey_schemas.worker_protocol import (
+from marey_schemas.queue.jobs import Resources
+from marey_schemas.queue.worker_protocol import (
     PROTOCOL_VERSION,
     ClaimRequest,
     Heartbeat,

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Row, and_, case, func, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.items import Page
-from marey_schemas.jobs import Attempt, Job, JobOutput, JobState, TaskResult
+from marey_schemas.queue.jobs import Attempt, Job, JobOutput, JobState, TaskResult
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem, ForbiddenProblem, NotFoundProblem
 from marey_server.store import events, listing, projects

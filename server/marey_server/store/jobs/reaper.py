@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import Row, and_, select, tuple_, update
 from sqlalchemy.exc import OperationalError
 
-from marey_schemas.worker_protocol import ClaimRequest, Lease
+from marey_schemas.queue.worker_protocol import ClaimRequest, Lease
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.endings import AttemptEnd
 from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_expired_outcome

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import and_, delete, insert, or_, select, update
 
 from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
 from marey_server.store.jobs import staging

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from marey_schemas.job_kinds import KindDeclaration
+from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_server.errors import InvalidProblem
 from marey_server.store import collections
 from marey_server.store.jobs.inputs import Pin, PinnedInputs

@@ -8,8 +8,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Row, Select, select
 
 from marey_schemas.access import Role
-from marey_schemas.job_kinds import UnknownKindError, find_kind
-from marey_schemas.jobs import FailureReason, Job, JobState
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind
+from marey_schemas.queue.jobs import FailureReason, Job, JobState
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem
 from marey_server.store.ids import new_id

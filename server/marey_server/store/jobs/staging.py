@@ -8,11 +8,11 @@ from typing import Any
 
 from sqlalchemy import and_, bindparam, delete, func, insert, select, tuple_, update
 
-from marey_schemas.jobs import ItemInput
 from marey_schemas.kinds import PARTS, Kind
 from marey_schemas.names import is_digest
 from marey_schemas.problems import FieldError
-from marey_schemas.worker_protocol import StagedOutput
+from marey_schemas.queue.jobs import ItemInput
+from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_server import faults
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import blobs, documents

@@ -10,10 +10,17 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 from sqlalchemy import insert, select
 
-from marey_schemas.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
-from marey_schemas.jobs import Job, JobCreate, JobState
-from marey_schemas.pipelines import Pipeline, PipelineCreate, PipelineError, PipelineStep, job_of_step, order_steps
 from marey_schemas.problems import FieldError
+from marey_schemas.queue.job_kinds import MOST_TASKS, KindDeclaration, UnknownKindError, find_kind
+from marey_schemas.queue.jobs import Job, JobCreate, JobState
+from marey_schemas.queue.pipelines import (
+    Pipeline,
+    PipelineCreate,
+    PipelineError,
+    PipelineStep,
+    job_of_step,
+    order_steps,
+)
 from marey_server import faults
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer

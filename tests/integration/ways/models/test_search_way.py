@@ -17,7 +17,7 @@ from marey_client.project import ProjectHandle
 from marey_motion.documents import clip_from_document
 from marey_motion.formats import read_motion
 from marey_motion.kinematics import global_positions
-from marey_schemas.jobs import ItemInput, JobCreate
+from marey_schemas.queue.jobs import ItemInput, JobCreate
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from marey_schemas.base import Request
-from marey_schemas.job_kinds import KindDeclaration
 from marey_schemas.kinds import Kind
-from marey_schemas.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_worker.context import Context, JobRefused
 
 

@@ -9,7 +9,7 @@ from sqlalchemy import Row, delete, insert, select
 from marey_schemas.datasets.proposal_states import CheckState
 from marey_schemas.datasets.proposals import CheckReport, ProposalCheck, Review, ReviewCreate
 from marey_schemas.items import Page
-from marey_schemas.jobs import JobState
+from marey_schemas.queue.jobs import JobState
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.datasets.naming import find_dataset

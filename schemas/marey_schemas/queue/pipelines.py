@@ -7,8 +7,8 @@ from typing import Annotated, Any, Self
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 from marey_schemas.names import CollectionPath, Message
+from marey_schemas.queue.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 
 MOST_STEPS = 32
 

@@ -22,7 +22,7 @@ from marey_schemas.datasets.proposals import (
     ReviewCreate,
 )
 from marey_server.errors import ConflictProblem
-from marey_server.handlers.datasets import MAX_COMMIT_BYTES
+from marey_server.handlers.versions.datasets import MAX_COMMIT_BYTES
 from marey_server.http.declarations import Access, RequestBody, reads, writes
 from marey_server.http.queries import PageQuery
 from marey_server.http.reply import Rendered, Reply

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 from functools import partial
 
-from marey_schemas.sizes import KIB, MIB
-from marey_schemas.worker_protocol import (
+from marey_schemas.queue.worker_protocol import (
     BatchCompleteAnswer,
     BatchCompleteRequest,
     ClaimRequest,
@@ -21,6 +20,7 @@ from marey_schemas.worker_protocol import (
     StageAnswer,
     StageRequest,
 )
+from marey_schemas.sizes import KIB, MIB
 from marey_server.errors import BadRequestProblem
 from marey_server.http.declarations import Access, Bytes, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply

@@ -2,7 +2,7 @@
 
 The options are made when their command runs or shows its help, so that `marey --help` imports no models:
 
-    add_command(app, retarget, params=OptionsOf("marey_schemas.job_params:RetargetParams"))
+    add_command(app, retarget, params=OptionsOf("marey_schemas.queue.job_params:RetargetParams"))
 
 The parameter `params` of `retarget` then gets the given options, validated, as a dict. An option has the name of its
 field; commands add shorter spellings.
@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
-from marey_client.cli.failures import WrongUsage
-from marey_client.cli.typed_values import (
+from marey_client.cli.terminal.failures import WrongUsage
+from marey_client.cli.terminal.typed_values import (
     Schema,
     default_text,
     named_number,

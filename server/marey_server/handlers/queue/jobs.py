@@ -9,8 +9,18 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.items import Event, Page
-from marey_schemas.job_kinds import UnknownKindError, find_kind, job_kinds
-from marey_schemas.jobs import Attempt, Job, JobBatch, JobCreate, JobKind, JobList, JobOutput, JobState, TaskResult
+from marey_schemas.queue.job_kinds import UnknownKindError, find_kind, job_kinds
+from marey_schemas.queue.jobs import (
+    Attempt,
+    Job,
+    JobBatch,
+    JobCreate,
+    JobKind,
+    JobList,
+    JobOutput,
+    JobState,
+    TaskResult,
+)
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
 from marey_server.http.declarations import Access, Bytes, RequestBody, reads, writes

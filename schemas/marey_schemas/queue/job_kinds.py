@@ -12,11 +12,11 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Any, Literal
 
-from marey_schemas import job_params
 from marey_schemas.base import Request
 from marey_schemas.formats import IMPORTED
-from marey_schemas.jobs import InputSpec, JobKind
 from marey_schemas.kinds import PARTS, Kind
+from marey_schemas.queue import job_params
+from marey_schemas.queue.jobs import InputSpec, JobKind
 
 ENTRY_POINT_GROUP = "marey.job_kinds"
 MOST_TASKS = 1000

@@ -8,9 +8,9 @@ from pydantic import Field
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.documents.references import RevisionRef
-from marey_schemas.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, ItemName, Tag
+from marey_schemas.queue.jobs import ItemInput, JobOutput, JobState, Progress, Resources
 
 FAULT_VARIABLE = "MAREY_FAULT"
 """Environment variable by which tests make a server or worker fail at a named place."""

@@ -10,7 +10,7 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marey_client.cli.failures import WrongUsage
+from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from marey_client.cli.addresses import Address
-from marey_client.cli.failures import Refused
-from marey_client.cli.output import Advance, print_json, print_message, print_refused, progress
 from marey_client.cli.revisions import find_revision, find_version
-from marey_client.cli.schema_options import OptionsOf
+from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.output import Advance, print_json, print_message, print_refused, progress
+from marey_client.cli.terminal.schema_options import OptionsOf
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
-    from marey_schemas.jobs import ExistingInput, Job
     from marey_schemas.kinds import Kind
+    from marey_schemas.queue.jobs import ExistingInput, Job
 
-JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("priority", "cache"))
-SEEDED_JOB = OptionsOf("marey_schemas.jobs:JobCreate", only=("seed", "priority", "cache"))
+JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
+SEEDED_JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("seed", "priority", "cache"))
 
 Sources = Annotated[
     list[str],
@@ -44,7 +44,7 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
 
     `pinned` fixes the revision of an item that is named without one.
     """
-    from marey_schemas.jobs import CollectionInput, ItemInput
+    from marey_schemas.queue.jobs import CollectionInput, ItemInput
 
     found = find_revision(marey, address, [kind])
     if found is not None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from marey_schemas.pipelines import Pipeline, PipelineCreate
-from marey_server.handlers.jobs import MAX_SUBMISSION_BYTES
+from marey_schemas.queue.pipelines import Pipeline, PipelineCreate
+from marey_server.handlers.queue.jobs import MAX_SUBMISSION_BYTES
 from marey_server.http.declarations import Access, RequestBody, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource

@@ -5,10 +5,10 @@ from typing import Any, Self
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.job_params import AlignParams, AnnotateParams, CutParams, ImportParams, ModelParams, TreeParams
-from marey_schemas.jobs import ExistingInput, ItemInput
 from marey_schemas.names import CollectionPath, ItemName
-from marey_schemas.pipelines import PipelineCreate, PipelineStep
+from marey_schemas.queue.job_params import AlignParams, AnnotateParams, CutParams, ImportParams, ModelParams, TreeParams
+from marey_schemas.queue.jobs import ExistingInput, ItemInput
+from marey_schemas.queue.pipelines import PipelineCreate, PipelineStep
 
 Inputs = tuple[ExistingInput, ...]
 

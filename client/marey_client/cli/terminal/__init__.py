@@ -1,0 +1,1 @@
+"""Modules that all commands use: options, typed values, output, errors, and waiting for a job."""

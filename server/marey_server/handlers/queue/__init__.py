@@ -1,0 +1,1 @@
+"""Resources of the queue: jobs, pipelines, and the leases of workers."""

@@ -1,0 +1,1 @@
+"""Resources of versions: datasets with their commits and branches, proposals, and differences of revisions."""
