@@ -6,16 +6,19 @@ from collections.abc import Callable
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from sqlalchemy import update
 from tests.support.rest_server import Server
 
 from marey_schemas.access import Role
+from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.store.database.connections import Database
 from marey_server.store.fsck import check_store
 from marey_server.store.tables import dataset_commit, revision, tree_chunk
 from marey_server.store.transaction import Transaction
+from marey_versions.records import revision_content
 
 LAB = "/projects/lab"
 GAITS = f"{LAB}/datasets/gaits"
@@ -444,3 +447,42 @@ def test_the_numbers_of_datasets_and_of_tags_are_limited(
     monkeypatch.setattr("marey_server.store.datasets.naming.MOST_REFS", 1)
     refused(owner.post(f"{LAB}/datasets", json={"name": "other"}), 409, "too-many-datasets")
     refused(owner.post(f"{GAITS}/refs", json={"name": "v1", "kind": "tag"}), 409, "too-many-refs")
+
+
+def contents(client: httpx.Client, project: str = LAB, **request: Any) -> Any:
+    return ok(client.post(f"{project}/contents", json=request))
+
+
+def test_contents_are_the_same_documents_on_every_server(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    parts = clip(item_at(owner, "gaits/a")["id"], 1)
+    parts["motion"]["joints"] = ["Joint a"]
+    made = ok(owner.post(f"{LAB}/clips", json={"name": "c", "collection": "gaits", "parts": parts}), 201)
+    gaits("a clip")
+    entries = {one["path"]: one for one in ok(owner.get(f"{GAITS}/entries"))["items"]}
+    motion = entries["c"]["parts"]["motion"]
+    of_clip, of_skeleton = (revision_content(entries[one]["kind"], entries[one]["parts"]) for one in ("c", "a"))
+    found = contents(owner, revisions=[of_clip, of_skeleton], documents=[{"content": of_clip, "part": "motion"}])
+    assert [one["kind"] for one in found["revisions"]] == ["clip", "skeleton"]
+    assert found["revisions"][0]["parts"] == {"motion": motion}
+    (document,) = found["documents"]
+    assert document["skeleton"] == {"content": of_skeleton}
+    poses = np.array(document["poses"]["data"], dtype=np.float32)
+    assert document_digest({**document, "poses": poses}) == motion
+    assert owner.delete(f"{LAB}/clips/{made['id']}", headers={"If-Match": "*"}).is_success
+    assert contents(owner, documents=[{"content": of_clip, "part": "motion"}])["documents"] == [document]
+
+
+def test_contents_of_other_projects_and_unknown_ones_are_null(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
+    (entry, *_) = ok(owner.get(f"{GAITS}/entries"))["items"]
+    content = revision_content(entry["kind"], entry["parts"])
+    ok(owner.post("/projects", json={"name": "other"}), 201)
+    wanted: dict[str, Any] = {"revisions": [content], "documents": [{"content": content, "part": "hierarchy"}]}
+    assert contents(owner, "/projects/other", **wanted) == {"revisions": [None], "documents": [None]}
+    assert contents(owner, **wanted)["revisions"] != [None]
+    unknown: dict[str, Any] = {
+        "revisions": ["sha256:" + "0" * 64],
+        "documents": [{"content": content, "part": "nothing"}],
+    }
+    assert contents(owner, **unknown) == {"revisions": [None], "documents": [None]}
+    many = ["sha256:" + "0" * 64] * 257
+    refused(owner.post(f"{LAB}/contents", json={"revisions": many}), 422, "invalid-body")

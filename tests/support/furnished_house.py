@@ -60,6 +60,7 @@ BODIES = {
     "CheckReport": {"name": "evaluation", "state": "pending"},
     "ProposalMerge": {"when_green": True},
     "CheckoutRequest": {"version": "spare", "discard": True},
+    "ContentsRequest": {"revisions": [OTHER_DIGEST]},
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
     "ItemRevert": {"revision": 1},

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+from marey_schemas.documents.blob_references import is_array_reference
 from marey_schemas.encoding.canonical import canonical_json
+from marey_schemas.names import is_digest
 from marey_versions.tree.chunks import Value, digest_of
 
 COMMIT_SCHEMA = "marey/commit@1"
@@ -86,19 +88,35 @@ def document_content(body: Any, content_of: Callable[[RevisionKey], str | None])
 
     `content_of` returns the content digest of a revision. If it returns None, the reference remains unchanged.
     """
-    portable = _replaced(body, content_of)
-    return digest_of(_canonical(portable))
+    return digest_of(_canonical(portable_document(body, content_of)))
 
 
-def _replaced(value: Any, content_of: Callable[[RevisionKey], str | None]) -> Any:
+def portable_document(value: Any, content_of: Callable[[RevisionKey], str | None]) -> Any:
+    """Return a document with each reference to a revision replaced by `{"content": digest}`, as other servers need it.
+
+    If `content_of` returns None for a revision, the reference remains unchanged.
+    """
     if isinstance(value, dict):
         reference = _reference(value)
         content = content_of(reference) if reference is not None else None
         if content is not None:
             rest = {key: member for key, member in value.items() if key not in ("item", "revision")}
-            return {**_replaced(rest, content_of), "content": content}
-        return {key: _replaced(member, content_of) for key, member in value.items()}
-    return [_replaced(member, content_of) for member in value] if isinstance(value, list) else value
+            return {**portable_document(rest, content_of), "content": content}
+        return {key: portable_document(member, content_of) for key, member in value.items()}
+    return [portable_document(member, content_of) for member in value] if isinstance(value, list) else value
+
+
+def contents_in(portable: Any) -> Iterator[str]:
+    """Return the content digests of the revisions that a portable document refers to.
+
+    An array, and the record of an imported file (which has the member `blob`), also have a member `content`.
+    """
+    for found in _objects(portable):
+        content = found.get("content")
+        if not isinstance(content, str) or "blob" in found or is_array_reference(found):
+            continue
+        if is_digest(content):
+            yield content
 
 
 def _objects(value: Any) -> Iterator[Mapping[str, Any]]:
@@ -139,6 +157,19 @@ class CommitRecord:
     message: str
     at: str
     """Time of the commit in UTC, such as `2026-11-23T10:00:00.000000Z`."""
+
+    @classmethod
+    def of(cls, document: Any) -> CommitRecord:
+        """Return the commit that a document describes. Raises `ValueError` if it is not the document of a commit."""
+        try:
+            record = cls(*(document[name] for name in ("tree", "parents", "author", "message", "at")))
+            record = replace(record, parents=tuple(record.parents))
+        except (KeyError, TypeError) as error:
+            raise ValueError("it is not the document of a commit") from error
+        texts = (record.tree, *record.parents, record.author, record.message, record.at)
+        if not all(isinstance(one, str) for one in texts) or record.document != document:
+            raise ValueError("it is not the document of a commit")
+        return record
 
     @property
     def document(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from marey_client.cli import (
     skeletons,
     tokens,
 )
-from marey_client.cli.datasets import proposals, versions
+from marey_client.cli.datasets import archives, proposals, versions
 from marey_client.cli.difference import diff
 from marey_client.cli.files import downloading, listing, records, uploading
 from marey_client.cli.terminal.invocation import Invocation
@@ -78,6 +78,7 @@ for register in (
     records,
     diff,
     versions,
+    archives,
     proposals,
     skeletons,
     clip_jobs,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypedDict, Unpack
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
 from marey_client.handles.proposals import Proposals
@@ -24,6 +25,9 @@ from marey_schemas.datasets.merges import (
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefKind, RefMove
 from marey_schemas.datasets.protection import ProtectionRule
 from marey_schemas.kinds import Kind
+
+if TYPE_CHECKING:
+    from marey_client.archives import OnProgress
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,16 @@ class DatasetHandle:
 
     transport: Transport
     url: str
+
+    @property
+    def name(self) -> str:
+        """The name of the dataset."""
+        return self.url.rpartition("/")[2]
+
+    @property
+    def project_url(self) -> str:
+        """The path of the project, relative to the API's root."""
+        return self.url.rpartition("/datasets/")[0]
 
     def read(self) -> Dataset:
         """Return the dataset."""
@@ -199,6 +213,18 @@ class DatasetHandle:
         """
         request = CheckoutRequest(version=version, discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
+
+    def archive(
+        self, path: str | Path, version: str = MAIN, *, on_progress: OnProgress = lambda _what, _done, _all: None
+    ) -> Commit:
+        """Write a version, all versions before it, and everything that they contain to one file.
+
+        The file is complete and checked, or else it does not exist; an attempt that was interrupted is continued by the
+        next one. Return the commit of the version.
+        """
+        from marey_client.archives import write_archive
+
+        return write_archive(self, version, Path(path), on_progress)
 
     # -- branches and tags ---------------------------------------------------------------------------------------------
 

@@ -21,7 +21,7 @@ from marey_server.handlers import (
     uploads,
 )
 from marey_server.handlers.queue import jobs, leases, pipelines
-from marey_server.handlers.versions import datasets, differences, proposals
+from marey_server.handlers.versions import contents, datasets, differences, proposals
 from marey_server.http.resource import Resource
 
 RESOURCES: tuple[type[Resource], ...] = (
@@ -33,6 +33,7 @@ RESOURCES: tuple[type[Resource], ...] = (
     *differences.RESOURCES,
     *datasets.RESOURCES,
     *proposals.RESOURCES,
+    *contents.RESOURCES,
     *annotations.RESOURCES,
     *edits.RESOURCES,
     *exports.RESOURCES,

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from sqlalchemy import bindparam, insert, select
 
+from marey_schemas.documents.blob_references import is_array_reference, members_of, references_of
 from marey_schemas.documents.registry import SCHEMAS
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
-from marey_schemas.names import is_digest
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.field_errors import field_errors
@@ -31,8 +31,6 @@ from marey_server.store.transaction import IN_LIST, Transaction
 OPEN_SCHEMA = "marey/document@1"
 
 _NUL = re.compile(rb"(?<!\\)(?:\\\\)*\\u0000")
-_REFERENCE_KEYS = {"dtype", "shape", "content"}
-_FILE_POINTERS = {"marey/clip-info@1": ("/source/file", "/source/companion")}
 _POINTER_LENGTH = 512
 
 Tree = dict[str, Any]
@@ -127,8 +125,8 @@ def _check(tree: Any, schema: str | None) -> str:
     named = tree.get("schema", schema)
     if schema is not None and schema != OPEN_SCHEMA and named != schema:
         raise InvalidProblem(f"This part must have the schema {schema}, not {named!r}.", code="bad-schema")
-    for pointer, leaf in _members(tree):
-        if _is_reference(leaf):
+    for pointer, leaf in members_of(tree):
+        if is_array_reference(leaf):
             detail = (
                 "Send the array itself (dtype, shape, data); a document cannot refer to the content of another one."
             )
@@ -142,53 +140,6 @@ def _check(tree: Any, schema: str | None) -> str:
             f"The document is not a valid {named}: {errors[0].pointer}: {errors[0].detail}", errors=errors
         ) from error
     return str(named or OPEN_SCHEMA)
-
-
-def _is_reference(value: Any) -> bool:
-    return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
-
-
-_LEAVES = (str, float, int, bool, type(None))
-
-
-def _members(tree: Any) -> list[tuple[str, Any]]:
-    """List the members of a tree with their JSON Pointers, an object or list before its own members.
-
-    Numbers and text in lists are left out, because they have no names and are not references.
-    """
-    found: list[tuple[str, Any]] = []
-
-    def visit(pointer: str, value: Any) -> None:
-        found.append((pointer, value))
-        if type(value) is dict or isinstance(value, Mapping):  # nearly all are; asking for mappings takes far longer
-            for key, member in value.items():
-                at = f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}"
-                if type(member) in _LEAVES:
-                    found.append((at, member))
-                else:
-                    visit(at, member)
-        elif isinstance(value, list | tuple):
-            for index, member in enumerate(value):
-                if type(member) not in _LEAVES:
-                    visit(f"{pointer}/{index}", member)
-
-    visit("", tree)
-    return found
-
-
-def references_of(schema: str, body: Tree) -> tuple[dict[str, Tree], dict[str, str]]:
-    """Return the references of a stored document by JSON Pointer: its array leaves, and digests of blobs it names.
-
-    Blobs are named in the fields that the schema has for them, and in members called `blob`.
-    """
-    fixed = _FILE_POINTERS.get(schema, ())
-    leaves, files = {}, {}
-    for pointer, value in _members(body):
-        if _is_reference(value):
-            leaves[pointer] = value
-        elif isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and is_digest(value):
-            files[pointer] = value
-    return leaves, files
 
 
 def _check_pointers(pointers: list[str]) -> None:
@@ -372,7 +323,7 @@ def _attach_stored(
     for row in tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)}):
         holder, key = _place(bodies[row.document_digest], row.pointer)
         leaf = holder[key]
-        if not _is_reference(leaf):  # the name of a file
+        if not is_array_reference(leaf):  # the name of a file
             continue
         if leaf["content"] not in loaded:
             data = blobs.read_blob(tx, row.blob_digest, 0, row.size_bytes)

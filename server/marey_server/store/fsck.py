@@ -15,11 +15,12 @@ from sqlalchemy import Column, Row, Select, Table, and_, exists, func, select, t
 
 from marey_schemas.datasets.naming import RefKind
 from marey_schemas.datasets.proposal_states import ProposalState
+from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import ArrayError, EncodedArray
 from marey_schemas.encoding.canonical import array_digest, canonical_json
 from marey_schemas.kinds import PARTS, Kind
 from marey_server.access.principal import SYSTEM
-from marey_server.store import documents, quotas
+from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
@@ -133,7 +134,7 @@ def _check_document(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     findings = []
     if digest_of(canonical_json(row.body)) != row.digest:
         findings.append(StoreDefect("document-corrupt", row.digest, "the text has another digest"))
-    arrays, files = documents.references_of(row.schema, row.body)
+    arrays, files = references_of(row.schema, row.body)
     file_bytes = select(func.coalesce(func.sum(blob.c.size_bytes), 0)).where(blob.c.digest.in_(set(files.values())))
     if tx.execute(file_bytes).scalar_one() != row.file_bytes:
         findings.append(StoreDefect("document-reference", row.digest, "the files to which it refers have another size"))

@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.support.chunks_in_memory import ChunksInMemory
 from tests.support.tiers import examples
 
 from marey_versions.origins import PATH, TAGS, FoundOrigin, find_origins
 from marey_versions.records import key_of
 from marey_versions.tree.building import build
-from marey_versions.tree.chunks import Value
+from marey_versions.tree.chunks import ChunksInMemory, Value
 from marey_versions.tree.reading import ChunkReader
 
 A, B = key_of("a", "clip"), key_of("b", "clip")

@@ -7,12 +7,11 @@ from collections.abc import Iterable, Mapping
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.support.chunks_in_memory import ChunksInMemory
 from tests.support.tiers import examples
 
 from marey_versions.tree import difference as differences
 from marey_versions.tree.building import LONGEST, MEAN_ENTRIES, Splitter, build
-from marey_versions.tree.chunks import Branch, ChunkStore, DamagedChunk, Leaf, Value, decode
+from marey_versions.tree.chunks import Branch, ChunksInMemory, ChunkStore, DamagedChunk, Leaf, Value, decode
 from marey_versions.tree.difference import difference
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree

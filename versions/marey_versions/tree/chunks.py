@@ -85,6 +85,18 @@ class ChunkStore(Protocol):
         """Store the bytes of chunks by digest. Storing a chunk again has no effect."""
 
 
+class ChunksInMemory(dict[str, bytes]):
+    """Store of chunks in a dictionary."""
+
+    def load(self, digests: Iterable[str]) -> Mapping[str, bytes]:
+        """Return the bytes of the chunks that the store has."""
+        return {digest: self[digest] for digest in digests if digest in self}
+
+    def save(self, chunks: Mapping[str, bytes]) -> None:
+        """Store the bytes of chunks by digest."""
+        self.update(chunks)
+
+
 def encode(chunk: Chunk) -> tuple[str, bytes]:
     """Return the digest and the bytes of a chunk: canonical JSON with sorted members and without spaces."""
     content: dict[str, Any] = {"schema": SCHEMA, "level": chunk.level}

@@ -23,6 +23,7 @@ from marey_server.store.datasets.naming import (
     read_dataset,
     read_ref,
 )
+from marey_server.store.datasets.portable import load_contents
 
 __all__ = [
     "PreparedCommit",
@@ -38,6 +39,7 @@ __all__ = [
     "list_datasets",
     "list_entries",
     "list_refs",
+    "load_contents",
     "move_branch",
     "prepare_commit",
     "prepare_merge",

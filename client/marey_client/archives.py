@@ -1,0 +1,239 @@
+"""Archives of datasets: one file with a version, all versions before it, and everything that they contain."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from marey_client.blobs import Blobs
+from marey_client.errors import UnexpectedAnswer
+from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
+from marey_schemas.datasets.commits import Commit, Entry
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
+from marey_schemas.documents.blob_references import references_of
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import canonical_json, detach_arrays
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+from marey_versions.archive.checking import check_archive
+from marey_versions.archive.members import ArchiveMember, MemberKind
+from marey_versions.archive.reading import Archive
+from marey_versions.archive.writing import ArchiveWriter
+from marey_versions.records import CommitRecord, contents_in, revision_content
+from marey_versions.tree.chunks import digest_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from marey_client.transport import Transport
+    from marey_schemas.datasets.differences import DatasetDifference
+
+MOST_LISTED = 10_000
+"""Number of differences that are requested at once; versions that differ in more entries are listed whole."""
+
+OnProgress = Callable[[str, int, int | None], None]
+"""Function called with the current activity, the amount done, and the total amount if it is known."""
+
+
+class DatasetReader(Protocol):
+    """Methods of `DatasetHandle` that an archive is made with."""
+
+    @property
+    def transport(self) -> Transport:
+        """The connections to the server."""
+
+    @property
+    def project_url(self) -> str:
+        """The path of the project, relative to the API's root."""
+
+    @property
+    def name(self) -> str:
+        """The name of the dataset."""
+
+    def at(self, version: str) -> Commit:
+        """Return the commit that a version names."""
+
+    def log(self, version: str) -> Iterator[Commit]:
+        """List a version and the versions before it; of the parents of a merge, only the first is followed."""
+
+    def entries(self, version: str) -> Iterator[Entry]:
+        """List the entries of a version."""
+
+    def difference(self, before: str, after: str, *, limit: int) -> DatasetDifference:
+        """Return the entries that differ in two versions."""
+
+
+def write_archive(dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress) -> Commit:
+    """Write an archive of a version, and check it.
+
+    An attempt that was interrupted leaves a file whose name ends in `.part`; the next attempt continues it.
+    """
+    head = dataset.at(version)
+    part = path.with_name(f"{path.name}.part")
+    part.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
+        tempfile.TemporaryDirectory(dir=part.parent) as folder,
+    ):
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head)
+        check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+    return head
+
+
+@dataclass
+class _Making:
+    """Archive in progress."""
+
+    dataset: DatasetReader
+    writer: ArchiveWriter
+    folder: Path
+    """Folder for files on their way from the server into the archive."""
+    on_progress: OnProgress
+    known: set[str] = field(default_factory=set)
+    """Content digests of the revisions that the archive has, or will have."""
+    documents: dict[str, PartOfContent] = field(default_factory=dict)
+    """Where the server has each document of an entry."""
+
+    def run(self, head: Commit) -> None:
+        commits = self._history(head)
+        for done, commit in enumerate(commits):
+            self.on_progress("reading versions", done, len(commits))
+            self._add_commit(commit)
+        self._add_documents(self.documents)
+        self.writer.finish(self.dataset.name, head.digest)
+
+    # -- versions ------------------------------------------------------------------------------------------------------
+
+    def _history(self, head: Commit) -> list[Commit]:
+        """Return a commit and all before it."""
+        found: dict[str, Commit] = {}
+        waiting = [head.digest]
+        while waiting:
+            start = waiting.pop()
+            if start in found:
+                continue
+            for commit in self.dataset.log(start):
+                if commit.digest in found:
+                    break
+                found[commit.digest] = commit
+                waiting += commit.parents[1:]
+        return list(found.values())
+
+    def _add_commit(self, commit: Commit) -> None:
+        """Add a commit and its changes, and note the revisions of its entries."""
+        at = commit.at.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
+        if record.digest != commit.digest:
+            raise UnexpectedAnswer(f"the server's commit {commit.digest} has another content than its digest says")
+        changes = self._changes(commit)
+        for one in changes.values():
+            if one is not None:
+                content = revision_content(one.kind.value, one.parts)
+                self.known.add(content)
+                for part, digest in one.parts.items():
+                    self.documents.setdefault(digest, PartOfContent(content=content, part=part))
+        lines = [canonical_json(_line(key, changes[key])) + b"\n" for key in sorted(changes)]
+        self.writer.add(ArchiveMember(MemberKind.CHANGES, commit.digest), b"".join(lines))
+        self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
+
+    def _changes(self, commit: Commit) -> dict[tuple[str, str], Entry | None]:
+        """Return the entries that differ between a commit and its first parent; None for one that it removed."""
+        if not commit.parents:
+            return {_place(one): one for one in self.dataset.entries(commit.digest)}
+        found = self.dataset.difference(commit.parents[0], commit.digest, limit=MOST_LISTED)
+        if found.complete:
+            gone = {_place(one.before): None for one in found.entries if one.before is not None}
+            return {**gone, **{_place(one.after): one.after for one in found.entries if one.after is not None}}
+        before, after = (
+            {_place(one): one for one in self.dataset.entries(version)}
+            for version in (commit.parents[0], commit.digest)
+        )
+        changed = {place: one for place, one in after.items() if _line(place, before.get(place)) != _line(place, one)}
+        return {**dict.fromkeys(before.keys() - after.keys()), **changed}
+
+    # -- content -------------------------------------------------------------------------------------------------------
+
+    def _add_documents(self, wanted: Mapping[str, PartOfContent]) -> None:
+        """Add documents, given by content digest, each after everything that it refers to."""
+        digests = [one for one in wanted if ArchiveMember(MemberKind.DOCUMENT, one) not in self.writer]
+        total = len(digests)
+        while digests:
+            trees = self._fetch([wanted[digest] for digest in digests[:MOST_CONTENTS]])
+            together = dict(zip(digests, trees, strict=False))
+            self._add_together(together)
+            digests = digests[len(together) :]
+            self.on_progress("reading documents", total - len(digests), total)
+
+    def _add_together(self, trees: Mapping[str, Any]) -> None:
+        arrays: dict[str, EncodedArray] = {}
+
+        def keep(name: str, array: NDArray[Any] | EncodedArray) -> None:
+            arrays[name] = array if isinstance(array, EncodedArray) else EncodedArray.of(array)
+
+        bodies = {digest: detach_arrays(tree, keep) for digest, tree in trees.items()}
+        self._add_revisions({one for body in bodies.values() for one in contents_in(body)} - self.known)
+        for name, array in arrays.items():
+            self.writer.add(ArchiveMember(MemberKind.ARRAY, name), array.data)
+        for digest, body in bodies.items():
+            data = canonical_json(body)
+            if digest_of(data) != digest:
+                raise UnexpectedAnswer(f"the server's document {digest} has another content than its digest says")
+            for file in set(references_of(str(body.get("schema")), body)[1].values()):
+                self._add_file(ArchiveMember(MemberKind.FILE, file))
+            self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
+
+    def _add_revisions(self, contents: Iterable[str]) -> None:
+        """Add revisions that documents refer to, with their documents; they need not be entries."""
+        waiting = sorted(contents)
+        self.known.update(waiting)
+        for start in range(0, len(waiting), MOST_CONTENTS):
+            some = waiting[start : start + MOST_CONTENTS]
+            found = self._ask(ContentsRequest(revisions=tuple(some)))["revisions"]
+            for content, one in zip(some, found, strict=True):
+                if one is None:
+                    raise UnexpectedAnswer(f"a document refers to the content {content}, which the project lacks")
+                self._add_documents(
+                    {digest: PartOfContent(content=content, part=part) for part, digest in one["parts"].items()}
+                )
+                self.writer.add(ArchiveMember(MemberKind.REVISION, content), canonical_json(one))
+
+    def _add_file(self, member: ArchiveMember) -> None:
+        if member in self.writer:
+            return
+        fetched = Blobs(self.dataset.transport).fetch_to(member.digest, self.folder / "file")
+        with fetched.open("rb") as stream:
+            self.writer.add_stream(member, stream, fetched.stat().st_size)
+
+    def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
+        """Return the first documents of a list, at least one."""
+        found: list[Any] = self._ask(ContentsRequest(documents=tuple(places)))["documents"]
+        for place, tree in zip(places, found, strict=False):
+            if not isinstance(tree, dict):
+                raise UnexpectedAnswer(f"the project has no revision with the content {place.content} any more")
+        if not found:
+            raise UnexpectedAnswer("the server's answer has no documents")
+        return found
+
+    def _ask(self, request: ContentsRequest) -> dict[str, Any]:
+        url = f"{self.dataset.project_url}/contents"
+        response = self.dataset.transport.send("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
+        answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=True)
+        return answer
+
+
+def _place(entry: Entry) -> tuple[str, str]:
+    return entry.path, entry.kind.value
+
+
+def _line(place: tuple[str, str], entry: Entry | None) -> dict[str, Any]:
+    """Return the line of a list of changes that says what an entry is now."""
+    path, kind = place
+    if entry is None:
+        return {"path": path, "kind": kind, "removed": True}
+    return {"path": path, "kind": kind, "parts": entry.parts, "tags": sorted(entry.tags)}

@@ -1,0 +1,112 @@
+"""Commands `archive`: a version of a dataset, with its history, as one file."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from marey_client.cli.datasets.places import VersionPlace, parse, short
+from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_pairs, progress
+from marey_schemas.wording import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from marey_versions.archive.reading import Archive
+
+archive = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Archives: a version of a dataset with everything before it, as one file that is checked without a server.",
+)
+
+ArchivePath = Annotated[
+    Path, typer.Argument(metavar="FILE", help="The archive.", exists=True, dir_okay=False, readable=True)
+]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register all commands of archives."""
+    app.add_typer(archive, name="archive")
+
+
+@archive.command("create")
+def create_archive(
+    context: typer.Context,
+    place: VersionPlace,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, such as gaits.tar; it is replaced.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write a version, all versions before it, and everything that they contain to one file, and check it.
+
+    If the command is interrupted, repeat it: it continues with the file that ends in .part.
+    """
+    at = parse(place, version=True)
+    with connect(context) as marey, progress() as advance:
+        made = at.on(marey).archive(file, at.version, on_progress=advance)
+    if as_json:
+        return print_json({"file": str(file), "commit": made.digest, "bytes": file.stat().st_size})
+    size_mb = file.stat().st_size / 1e6
+    return print_message(
+        f"{file} has the version {short(made.digest)} of {at.project}/{at.dataset} ({size_mb:,.1f} MB)"
+    )
+
+
+@archive.command("verify")
+def verify(file: ArchivePath, as_json: AsJson = False) -> None:
+    """Check that an archive is complete, and that nothing in it was changed. No server is needed.
+
+    The commit is printed last: compare it with the one that you expect, because somebody could have made a new archive
+    of other content.
+    """
+    from marey_versions.archive.checking import check_archive
+
+    with _opened(file) as opened, progress() as advance:
+        check_archive(opened, lambda done, total: advance("checking", done, total))
+        entries = sum(1 for _ in opened.versions().entries(opened.manifest.commit))
+        facts = {
+            "dataset": opened.manifest.dataset,
+            "versions": len(opened.history()),
+            "entries": entries,
+            "members": len(opened.members),
+            "commit": opened.manifest.commit,
+        }
+    print_json(facts) if as_json else print_pairs(facts.items())
+
+
+@archive.command("extract")
+def extract(
+    file: ArchivePath,
+    output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """Write the version in an archive to files: each entry as JSON, and clips as the files that they came from.
+
+    No server is needed. An existing file is replaced.
+    """
+    from marey_client.extraction import extract_archive
+
+    with _opened(file) as opened:
+        written = list(extract_archive(opened, output))
+    if as_json:
+        return print_json([str(one) for one in written])
+    return print_message(f"wrote {counted(len(written), 'file')} to {output}")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Archive]:
+    """Open an archive; a file that is not one, or a damaged one, ends the command with an error."""
+    from marey_versions.archive.members import BadArchive
+    from marey_versions.archive.reading import Archive
+
+    try:
+        with path.open("rb") as file:
+            yield Archive(file)
+    except BadArchive as error:
+        print_message(f"{path}: {error}")
+        raise Refused from error

@@ -1,0 +1,76 @@
+"""Extraction of a version from an archive into files that can be read without a server."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from marey_client.downloads import TakenPaths, safe_file_name, saved_atomically
+from marey_schemas.encoding.canonical import attach_arrays
+from marey_schemas.encoding.codecs import JSON, encode_tree
+from marey_schemas.item_files import original_of_clip
+from marey_versions.archive.members import MemberKind
+from marey_versions.archive.reading import Archive
+from marey_versions.records import DatasetEntry, contents_in
+
+ENTRY_SCHEMA = "marey/entry@1"
+
+
+def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
+    """Write the newest version of an archive to a folder, and return the path of each file.
+
+    An entry becomes one JSON document with its parts, and with the revisions that they refer to; a clip also becomes
+    the file that it was imported from. Raises `BadArchive` if the content of a member is not what its name says.
+    """
+    entries = list(archive.versions().entries(archive.manifest.commit))
+    extraction = _Extraction(archive, folder, {one.content: one for one in entries}, TakenPaths())
+    for entry in entries:
+        yield from extraction.write(entry)
+
+
+@dataclass
+class _Extraction:
+    """Extraction in progress."""
+
+    archive: Archive
+    folder: Path
+    entries: Mapping[str, DatasetEntry]
+    """An entry of the version with each content digest."""
+    taken: TakenPaths
+
+    def write(self, entry: DatasetEntry) -> Iterator[Path]:
+        parts = self._documents(entry.parts)
+        tree = {
+            "schema": ENTRY_SCHEMA, "path": entry.path, "kind": entry.kind, "tags": list(entry.tags),
+            "parts": parts, "revisions": {one: self._revision(one) for one in sorted(set(contents_in(parts)))},
+        }  # fmt: skip
+        *folders, name = (safe_file_name(one) for one in entry.path.split("/"))
+        folder = self.folder.joinpath(*folders)
+        yield self._save(folder / f"{name}.{entry.kind}.json", [encode_tree(tree, JSON)])
+        original = original_of_clip(name, parts.get("info"))
+        if original is not None:
+            ending = Path(safe_file_name(original.name)).suffix
+            yield self._save(folder / f"{name}{ending}", self.archive.file(original.digest))
+
+    def _revision(self, content: str) -> dict[str, Any]:
+        if content in self.entries:
+            kind, parts = self.entries[content].kind, self.entries[content].parts
+        else:
+            found = self.archive.tree(MemberKind.REVISION, content)
+            kind, parts = found["kind"], found["parts"]
+        return {"kind": kind, "parts": self._documents(parts)}
+
+    def _documents(self, parts: Mapping[str, str]) -> dict[str, Any]:
+        return {
+            part: attach_arrays(self.archive.tree(MemberKind.DOCUMENT, digest), self.archive.array)
+            for part, digest in parts.items()
+        }
+
+    def _save(self, path: Path, pieces: Iterable[bytes]) -> Path:
+        target = self.taken.take(path)
+        with saved_atomically(target) as file:
+            for piece in pieces:
+                file.write(piece)
+        return target

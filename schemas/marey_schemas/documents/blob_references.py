@@ -1,0 +1,60 @@
+"""References of stored documents to bytes outside of them: arrays, and files.
+
+In a stored document, an array is replaced by `{"dtype", "shape", "content"}`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from marey_schemas.names import is_digest
+
+_REFERENCE_KEYS = {"dtype", "shape", "content"}
+_FILE_POINTERS = {"marey/clip-info@1": ("/source/file", "/source/companion")}
+_LEAVES = (str, float, int, bool, type(None))
+
+
+def is_array_reference(value: Any) -> bool:
+    """Return whether a value is a reference in place of an array."""
+    return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
+
+
+def members_of(tree: Any) -> list[tuple[str, Any]]:
+    """List the members of a tree with their JSON Pointers, an object or list before its own members.
+
+    Numbers and text in lists are left out, because they have no names and are not references.
+    """
+    found: list[tuple[str, Any]] = []
+
+    def visit(pointer: str, value: Any) -> None:
+        found.append((pointer, value))
+        if type(value) is dict or isinstance(value, Mapping):  # nearly all are; asking for mappings takes far longer
+            for key, member in value.items():
+                at = f"{pointer}/{str(key).replace('~', '~0').replace('/', '~1')}"
+                if type(member) in _LEAVES:
+                    found.append((at, member))
+                else:
+                    visit(at, member)
+        elif isinstance(value, list | tuple):
+            for index, member in enumerate(value):
+                if type(member) not in _LEAVES:
+                    visit(f"{pointer}/{index}", member)
+
+    visit("", tree)
+    return found
+
+
+def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Return the references of a stored document by JSON Pointer: its arrays, and the digests of files that it names.
+
+    Files are named in the fields that the schema has for them, and in members called `blob`.
+    """
+    fixed = _FILE_POINTERS.get(schema, ())
+    arrays, files = {}, {}
+    for pointer, value in members_of(body):
+        if is_array_reference(value):
+            arrays[pointer] = value
+        elif isinstance(value, str) and (pointer in fixed or pointer.endswith("/blob")) and is_digest(value):
+            files[pointer] = value
+    return arrays, files

@@ -1,0 +1,72 @@
+"""Content of versions in the form that is the same on every server: no document refers to ids of this one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import select
+
+from marey_schemas.datasets.contents import ContentsRequest
+from marey_server.store import documents, projects
+from marey_server.store.datasets.contents import Contents, find_contents_of
+from marey_server.store.datasets.history import revisions_with
+from marey_server.store.items.reading import MOST_BYTES_AT_ONCE
+from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.tables import document, item
+from marey_server.store.transaction import Transaction
+from marey_versions.records import RevisionKey, portable_document, references_in
+
+
+def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
+    """Load revisions of a project by their content digests, and documents of them with encoded arrays.
+
+    A revision or document that the project does not have is None. If the documents together are too large, those at
+    the end are left out; the first one is always loaded.
+    """
+    project_row = projects.require(tx, project)
+    wanted = {*request.revisions, *(one.content for one in request.documents)}
+    held = {one: RevisionKey(*key) for one, key in revisions_with(tx, project_row.id, wanted).items()}
+    contents = find_contents_of(tx, held.values())
+    return {
+        "revisions": _described(tx, held, contents, request),
+        "documents": _loaded(tx, held, request),
+    }
+
+
+def _described(
+    tx: Transaction, held: Mapping[str, RevisionKey], contents: Contents, request: ContentsRequest
+) -> list[dict[str, Any] | None]:
+    """Return the kind and the content digests of the parts of each revision that was requested."""
+    keys = {one: held[one] for one in request.revisions if one in held}
+    ids = sorted({key.item for key in keys.values()})
+    kinds = {row.id: row.kind for row in tx.execute(select(item.c.id, item.c.kind).where(item.c.id.in_(ids)))}
+    return [
+        {"kind": kinds[keys[one].item], "parts": contents.parts[keys[one]]} if one in keys else None
+        for one in request.revisions
+    ]
+
+
+def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsRequest) -> list[dict[str, Any] | None]:
+    parts = read_part_digests(tx, {held[one.content] for one in request.documents if one.content in held})
+    digests = [parts[held[one.content]].get(one.part) if one.content in held else None for one in request.documents]
+    present = sorted({digest for digest in digests if digest is not None})
+    sizes = {
+        row.digest: row.size_bytes
+        for row in tx.execute(select(document.c.digest, document.c.size_bytes).where(document.c.digest.in_(present)))
+    }
+    chosen = _that_fit(digests, sizes)
+    loaded = documents.load_documents(tx, {digest for digest in chosen if digest is not None})
+    referred = {one for tree in loaded.values() for one in references_in(tree)}
+    contents = find_contents_of(tx, referred)
+    return [None if digest is None else portable_document(loaded[digest], contents.revisions.get) for digest in chosen]
+
+
+def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
+    """Return the first digests of documents that together have at most `MOST_BYTES_AT_ONCE`, and at least one."""
+    size_bytes = 0
+    for place, digest in enumerate(digests):
+        size_bytes += 0 if digest is None else sizes[digest]
+        if place and size_bytes > MOST_BYTES_AT_ONCE:
+            return digests[:place]
+    return digests

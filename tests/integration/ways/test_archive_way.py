@@ -1,0 +1,123 @@
+"""The way of an archive: made of several versions by the commands of the how-to page, checked, extracted."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.support.command_line import CommandLine
+
+from marey_client import archives
+from marey_client.handles.clips import ClipHandle
+from marey_client.project import ProjectHandle
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
+from marey_versions.archive.reading import Archive
+
+pytestmark = pytest.mark.timeout(300)
+
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "archive-a-dataset.md"
+
+
+@pytest.fixture
+def project(lab_of: Callable[..., ProjectHandle], run: CommandLine, tmp_path: Path) -> ProjectHandle:
+    """A project with the dataset `gaits`: a merge of two versions, and a deleted clip that earlier versions have."""
+    for name, step in (("walk", 0.5), ("turn", 0.6), ("fall", 0.7)):
+        (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 1.0)))
+    made = lab_of(*(tmp_path / f"{name}.bvh" for name in ("walk", "turn", "fall")), collection="gaits/raw")
+    gaits = made.datasets.create("gaits", collection="gaits")
+    gaits.commit("First takes")
+    gaits.create_branch("trial")
+    run("tag", "lab/gaits/raw/turn", "--add", "fast")
+    gaits.commit("Tag the turn")
+    gaits.check_out("trial")
+    clip(made, "walk").put_info(clip(made, "walk").info().model_copy(update={"comment": "on trial"}))
+    gaits.commit("Describe the walk", branch="trial")
+    gaits.merge("trial")
+    gaits.check_out()
+    run("rm", "lab/gaits/raw/fall")
+    gaits.commit("Drop the fall")
+    gaits.create_tag("v1")
+    return made
+
+
+def clip(project: ProjectHandle, name: str) -> ClipHandle:
+    """The clip with a name."""
+    (found,) = (one for one in project.clips.list() if one.name == name)
+    return found
+
+
+def test_the_page_makes_checks_and_extracts_an_archive(run: CommandLine, project: ProjectHandle) -> None:
+    create, verify, extract = re.findall(r"^marey .*$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    run(*shlex.split(create)[1:])
+    told = run(*shlex.split(verify)[1:]).stdout.splitlines()
+    head = project.datasets.at("gaits").at("v1")
+    assert told[-1].split() == ["commit", head.digest]
+    assert [line.split()[-1] for line in told[:3]] == ["gaits", "5", "2"]
+    run(*shlex.split(extract)[1:])
+    found = sorted(path.name for path in (run.folder / "gaits/raw").iterdir())
+    assert found == ["turn.bvh", "turn.clip.json", "walk.bvh", "walk.clip.json"]
+    assert (run.folder / "gaits/raw/walk.bvh").read_bytes() == (run.folder / "walk.bvh").read_bytes()
+    walk = json.loads((run.folder / "gaits/raw/walk.clip.json").read_text())
+    assert walk["parts"]["info"]["comment"] == "on trial"
+    assert len(walk["parts"]["motion"]["poses"]["data"]) == len(clip(project, "walk").motion().poses)
+    (skeleton,) = walk["revisions"].values()
+    assert skeleton["parts"]["hierarchy"]["joints"][0]["name"] == "Hips"
+
+
+def test_an_archive_is_continued_where_an_attempt_ended(
+    run: CommandLine, project: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaits = project.datasets.at("gaits")
+    whole, again = run.folder / "whole.tar", run.folder / "again.tar"
+    gaits.archive(whole)
+    asked: list[Any] = []
+    once = archives._Making._ask
+
+    def ask(making: archives._Making, request: Any) -> Any:
+        asked.append(request)
+        if len(asked) == 2:
+            raise ConnectionError("the server went away")
+        return once(making, request)
+
+    monkeypatch.setattr(archives._Making, "_ask", ask)
+    monkeypatch.setattr(archives, "MOST_CONTENTS", 2)
+    with pytest.raises(ConnectionError):
+        gaits.archive(again)
+    assert not again.exists()
+    gaits.archive(again)
+    with whole.open("rb") as one, again.open("rb") as other:
+        assert Archive(one).members.keys() == Archive(other).members.keys()
+    assert not list(run.folder.glob("*.part"))
+
+
+def test_versions_that_differ_in_many_entries_are_listed_whole(
+    run: CommandLine, project: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaits = project.datasets.at("gaits")
+    gaits.archive(run.folder / "one.tar")
+    monkeypatch.setattr(archives, "MOST_LISTED", 1)
+    gaits.archive(run.folder / "other.tar")
+    assert (run.folder / "one.tar").read_bytes() == (run.folder / "other.tar").read_bytes()
+
+
+def test_a_changed_archive_is_refused_with_the_member(run: CommandLine, project: ProjectHandle) -> None:
+    file = run.folder / "gaits.tar"
+    project.datasets.at("gaits").archive(file)
+    with tarfile.open(file) as tar:
+        header = next(one for one in tar if one.name.startswith("documents/"))
+    data = bytearray(file.read_bytes())
+    data[header.offset_data + 2] ^= 1
+    file.write_bytes(data)
+    for command in ("verify", "extract"):
+        told = run("archive", command, file, status=1)
+        assert told.stderr.startswith(f"{file}: ")
+        assert "Traceback" not in told.stderr
+    assert "no archive" in run("archive", "verify", run.folder / "walk.bvh", status=1).stderr
+    assert "does not exist" in run("archive", "verify", "none.tar", status=2).stderr

@@ -1,0 +1,234 @@
+"""Archives: what is written is read again, an interrupted one is continued, and every change is found."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import tarfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.canonical import array_digest, canonical_json
+from marey_versions.archive.checking import check_archive
+from marey_versions.archive.members import MANIFEST, ArchiveMember, BadArchive, MemberKind
+from marey_versions.archive.reading import Archive
+from marey_versions.archive.writing import ArchiveWriter
+from marey_versions.records import CommitRecord, key_of, revision_content
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import ChunksInMemory, Value, digest_of
+
+POSES = np.arange(12, dtype=np.float32).reshape(4, 3)
+ORIGINAL = b"HIERARCHY\n"
+AT = "2026-11-23T10:00:00.000000Z"
+
+
+@dataclass
+class Example:
+    """An archive that is put together member by member."""
+
+    members: dict[ArchiveMember, bytes] = field(default_factory=dict)
+    head: str = ""
+
+    def document(self, tree: dict[str, Any]) -> str:
+        data = canonical_json(tree)
+        self.members[ArchiveMember(MemberKind.DOCUMENT, digest_of(data))] = data
+        return digest_of(data)
+
+    def array(self, values: np.ndarray[Any, Any]) -> dict[str, Any]:
+        encoded, digest = EncodedArray.of(values), array_digest(values)
+        self.members[ArchiveMember(MemberKind.ARRAY, digest)] = encoded.data
+        return {"dtype": encoded.dtype, "shape": list(encoded.shape), "content": digest}
+
+    def revision(self, kind: str, parts: dict[str, str]) -> str:
+        content = revision_content(kind, parts)
+        self.members[ArchiveMember(MemberKind.REVISION, content)] = canonical_json({"kind": kind, "parts": parts})
+        return content
+
+    def commit(self, entries: dict[str, Value], changes: list[dict[str, Any]], *parents: str) -> str:
+        tree = build(ChunksInMemory(), sorted(entries.items()))
+        record = CommitRecord(tree, parents, "ada", "message", AT)
+        self.members[ArchiveMember(MemberKind.COMMIT, record.digest)] = canonical_json(record.document)
+        lines = b"".join(canonical_json(one) + b"\n" for one in changes)
+        self.members[ArchiveMember(MemberKind.CHANGES, record.digest)] = lines
+        self.head = record.digest
+        return record.digest
+
+    def write(self, file: io.BytesIO | None = None) -> io.BytesIO:
+        file = file or io.BytesIO()
+        writer = ArchiveWriter(file)
+        for member, data in self.members.items():
+            writer.add(member, data)
+        writer.finish("gaits", self.head)
+        return file
+
+
+def put(path: str, parts: dict[str, str], *tags: str) -> dict[str, Any]:
+    return {"path": path, "kind": "clip", "parts": parts, "tags": sorted(tags)}
+
+
+def example() -> Example:
+    """Two versions of a clip that refers to a skeleton and names a file; the second one removes another entry."""
+    made = Example()
+    skeleton = made.revision("skeleton", {"hierarchy": made.document({"schema": "marey/skeleton@1", "joints": []})})
+    poses = made.array(POSES)
+    motion = made.document({"schema": "marey/motion@1", "skeleton": {"content": skeleton}, "poses": poses})
+    file = f"sha256:{hashlib.sha256(ORIGINAL).hexdigest()}"
+    made.members[ArchiveMember(MemberKind.FILE, file)] = ORIGINAL
+    info = made.document({"schema": "marey/clip-info@1", "source": {"file": file, "file_name": "walk.bvh"}})
+    walk, other = {"motion": motion, "info": info}, {"motion": motion}
+    both = {"parts": walk, "tags": []}, {"parts": other, "tags": []}
+    first = made.commit(
+        {key_of("a/walk", "clip"): both[0], key_of("b", "clip"): both[1]}, [put("a/walk", walk), put("b", other)]
+    )
+    tagged = {"parts": walk, "tags": ["good"]}
+    removed = {"path": "b", "kind": "clip", "removed": True}
+    made.commit({key_of("a/walk", "clip"): tagged}, [put("a/walk", walk, "good"), removed], first)
+    return made
+
+
+def checked(file: io.BytesIO) -> Archive:
+    archive = Archive(file)
+    check_archive(archive)
+    return archive
+
+
+def test_an_archive_gives_back_versions_documents_arrays_and_files() -> None:
+    archive = checked(example().write())
+    (_, first), (head, second) = archive.history()
+    assert (head, second.parents) == (archive.manifest.commit, (archive.history()[0][0],))
+    versions = archive.versions()
+    assert [one.path for one in versions.entries(archive.history()[0][0])] == ["a/walk", "b"]
+    (entry,) = versions.entries(head)
+    assert (entry.path, entry.tags, first.author) == ("a/walk", ("good",), "ada")
+    motion = archive.tree(MemberKind.DOCUMENT, entry.parts["motion"])
+    assert np.array_equal(archive.array(motion["poses"]["content"]).decode(), POSES)
+    info = archive.tree(MemberKind.DOCUMENT, entry.parts["info"])
+    assert b"".join(archive.file(info["source"]["file"])) == ORIGINAL
+
+
+def test_the_same_members_give_the_same_bytes() -> None:
+    assert example().write().getvalue() == example().write().getvalue()
+
+
+@given(st.integers(min_value=0, max_value=20_000))
+def test_an_archive_that_was_cut_off_anywhere_is_refused_and_continued(length: int) -> None:
+    whole = example().write().getvalue()
+    part = io.BytesIO(whole[:length])
+    end = whole.index(MANIFEST.encode()) + 512
+    if length < end:
+        with pytest.raises(BadArchive):
+            checked(part)
+    example().write(part)
+    assert part.getvalue() == whole
+
+
+def test_a_member_that_is_there_already_is_not_written_again() -> None:
+    file = io.BytesIO()
+    writer = ArchiveWriter(file)
+    member = ArchiveMember(MemberKind.FILE, digest_of(b"x"))
+    writer.add(member, b"x")
+    size = file.tell()
+    writer.add(member, b"x")
+    assert (member in writer, file.tell()) == (True, size)
+
+
+MEMBERS = sorted(example().members)
+
+
+@pytest.mark.parametrize("member", MEMBERS, ids=lambda one: one.kind.value)
+def test_a_missing_member_is_named(member: ArchiveMember) -> None:
+    made = example()
+    del made.members[member]
+    with pytest.raises(BadArchive, match=member.name):
+        checked(made.write())
+
+
+@pytest.mark.parametrize("member", MEMBERS, ids=lambda one: one.kind.value)
+@given(data=st.data())
+def test_a_changed_byte_is_found_and_the_member_named(member: ArchiveMember, data: st.DataObject) -> None:
+    made = example()
+    content = bytearray(made.members[member])
+    place = data.draw(st.integers(0, len(content) - 1))
+    content[place] ^= data.draw(st.integers(1, 255))
+    made.members[member] = bytes(content)
+    if member.kind is MemberKind.ARRAY:
+        try:  # unused bits of a compressed array may change without effect
+            same = np.array_equal(EncodedArray("<f4", POSES.shape, bytes(content)).decode(), POSES)
+        except Exception:
+            same = False
+        if same:
+            return
+    with pytest.raises(BadArchive, match=member.name):
+        checked(made.write())
+
+
+def added_member(made: Example) -> None:
+    made.members[ArchiveMember(MemberKind.FILE, digest_of(b"more"))] = b"more"
+
+
+def broken_text(made: Example) -> None:
+    member = ArchiveMember(MemberKind.CHANGES, made.head)
+    made.members[member] = made.members[member].replace(b"good", b"\\ud800")
+
+
+def other_shape(made: Example) -> None:
+    made.commit({key_of("c", "clip"): {"parts": {"motion": bad_document(made)}, "tags": []}},
+                [put("c", {"motion": bad_document(made)})])  # fmt: skip
+
+
+def bad_document(made: Example) -> str:
+    leaf = made.array(POSES) | {"shape": [3, 4]}
+    return made.document({"schema": "marey/motion@1", "poses": leaf})
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [(added_member, "added later"), (broken_text, "not valid"), (other_shape, "another type or shape")],
+)
+def test_an_archive_with_more_or_other_things_than_its_versions_is_refused(
+    damage: Callable[[Example], None], message: str
+) -> None:
+    made = Example() if damage is other_shape else example()
+    damage(made)
+    with pytest.raises(BadArchive, match=message):
+        checked(made.write())
+
+
+def tar_of(*members: tuple[tarfile.TarInfo, bytes]) -> io.BytesIO:
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode="w:") as tar:
+        for header, data in members:
+            header.size = len(data)
+            tar.addfile(header, io.BytesIO(data))
+    return file
+
+
+def link() -> tarfile.TarInfo:
+    header = tarfile.TarInfo(MEMBERS[0].name)
+    header.type, header.linkname = tarfile.SYMTYPE, "/etc/passwd"
+    return header
+
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        (io.BytesIO(b""), "no archive.json|no archive, or was cut off"),
+        (io.BytesIO(b"GIF89a" * 200), "no archive"),
+        (tar_of((tarfile.TarInfo("../evil"), b"x")), "no member of this name"),
+        (tar_of((link(), b"")), "not a member"),
+        (tar_of((tarfile.TarInfo(MEMBERS[0].name), b"1"), (tarfile.TarInfo(MEMBERS[0].name), b"1")), "two members"),
+        (tar_of((tarfile.TarInfo(MANIFEST), b"[]")), "not the manifest"),
+        (tar_of((tarfile.TarInfo(MANIFEST), b'{"schema":"marey/archive@9","dataset":"d","commit":"c"}')), "update"),
+        (tar_of((tarfile.TarInfo(MANIFEST), b'{"schema":"marey/archive@1","dataset":"d","commit":"c"}')), "digest"),
+    ],
+)
+def test_a_file_that_is_no_archive_is_refused(file: io.BytesIO, message: str) -> None:
+    with pytest.raises(BadArchive, match=message):
+        checked(file)

@@ -1,0 +1,95 @@
+"""Check of a whole archive: every member, and that none is missing or superfluous."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from marey_schemas.documents.blob_references import references_of
+from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
+from marey_versions.archive.reading import Archive
+from marey_versions.records import contents_in, path_and_kind, revision_content
+
+OnProgress = Callable[[int, int], None]
+"""Function called with the number of members that were checked, and the number of all."""
+
+
+@dataclass
+class _Check:
+    """Check in progress."""
+
+    archive: Archive
+    on_progress: OnProgress
+    checked: set[ArchiveMember] = field(default_factory=set)
+    known: set[str] = field(default_factory=set)
+    """Content digests of the revisions that entries contain, or that members describe."""
+    documents: set[str] = field(default_factory=set)
+    """Documents that were found and must be checked."""
+
+    def run(self) -> None:
+        for digest, _ in self.archive.history():
+            self._mark(ArchiveMember(MemberKind.COMMIT, digest))
+            self._changes_of(digest)
+        self.archive.versions()
+        while self.documents:
+            self._document(self.documents.pop())
+        if left := sorted(self.archive.members.keys() - self.checked):
+            raise BadArchive(f"{left[0].name}: no version in the archive contains this member; it was added later")
+
+    def _changes_of(self, commit: str) -> None:
+        self._mark(ArchiveMember(MemberKind.CHANGES, commit))
+        for key, value in self.archive.changes(commit).items():
+            if value is not None:
+                self._revision(revision_content(path_and_kind(key)[1], value["parts"]), value["parts"].values())
+
+    def _revision(self, content: str, documents: Iterable[str]) -> None:
+        self.known.add(content)
+        self.documents.update(one for one in documents if ArchiveMember(MemberKind.DOCUMENT, one) not in self.checked)
+
+    def _document(self, digest: str) -> None:
+        tree = self.archive.tree(MemberKind.DOCUMENT, digest)
+        self._mark(ArchiveMember(MemberKind.DOCUMENT, digest))
+        arrays, files = references_of(str(tree.get("schema")) if isinstance(tree, dict) else "", tree)
+        for leaf in arrays.values():
+            self._array(leaf, digest)
+        for one in set(files.values()):
+            self._file(one)
+        for content in set(contents_in(tree)) - self.known:
+            self._referenced(content)
+
+    def _referenced(self, content: str) -> None:
+        member = ArchiveMember(MemberKind.REVISION, content)
+        found = self.archive.tree(MemberKind.REVISION, content)
+        self._mark(member)
+        if not isinstance(found, dict) or not isinstance(found.get("parts"), dict):
+            raise BadArchive(f"{member.name}: it does not describe a revision")
+        self._revision(content, found["parts"].values())
+
+    def _array(self, leaf: Mapping[str, Any], document: str) -> None:
+        member = ArchiveMember(MemberKind.ARRAY, str(leaf["content"]))
+        if member not in self.checked:
+            array = self.archive.array(member.digest)
+            if leaf != {"dtype": array.dtype, "shape": list(array.shape), "content": member.digest}:
+                name = ArchiveMember(MemberKind.DOCUMENT, document).name
+                raise BadArchive(f"{name}: it says that {member.name} has another type or shape than it has")
+            self._mark(member)
+
+    def _file(self, digest: str) -> None:
+        member = ArchiveMember(MemberKind.FILE, digest)
+        if member not in self.checked:
+            for _ in self.archive.file(digest):
+                pass
+            self._mark(member)
+
+    def _mark(self, member: ArchiveMember) -> None:
+        self.checked.add(member)
+        self.on_progress(len(self.checked), len(self.archive.members))
+
+
+def check_archive(archive: Archive, on_progress: OnProgress = lambda _done, _all: None) -> None:
+    """Check that an archive contains its commit and everything below it, unchanged, and nothing else.
+
+    Raises `BadArchive`, which names the member.
+    """
+    _Check(archive, on_progress).run()

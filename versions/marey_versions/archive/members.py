@@ -1,0 +1,101 @@
+"""Names of the members of an archive, and the checks that their bytes are what the names say."""
+
+from __future__ import annotations
+
+import json
+import re
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, ArrayError, EncodedArray
+from marey_schemas.encoding.blocks import BlockError, read_spec
+from marey_schemas.encoding.canonical import array_digest, canonical_json
+from marey_schemas.sizes import MIB
+from marey_versions.tree.chunks import digest_of
+
+SCHEMA = "marey/archive@1"
+MANIFEST = "archive.json"
+"""Name of the last member. An archive without it was not written to its end."""
+MOST_BYTES = 256 * MIB
+"""Greatest size of a member that is read into memory; only files may be larger."""
+
+
+class BadArchive(Exception):
+    """The file is not an archive, or not a whole one; the message names the member."""
+
+
+class MemberKind(StrEnum):
+    """Kind of a member, and the name of its folder in the archive."""
+
+    COMMIT = "commits"
+    CHANGES = "changes"
+    """Entries that differ between a commit and its first parent, named by the commit."""
+    REVISION = "revisions"
+    """Kind and content digests of the parts of a revision that documents refer to."""
+    DOCUMENT = "documents"
+    ARRAY = "arrays"
+    FILE = "files"
+
+    @property
+    def ending(self) -> str:
+        """The end of the names of members of this kind."""
+        return _ENDINGS.get(self, ".json")
+
+
+_ENDINGS = {MemberKind.CHANGES: ".jsonl", MemberKind.ARRAY: ".blocks", MemberKind.FILE: ""}
+_NAME = re.compile(r"([a-z]+)/([0-9a-f]{64})([.a-z]*)")
+
+
+class ArchiveMember(NamedTuple):
+    """ArchiveMember of an archive: its kind, and the digest that names its content."""
+
+    kind: MemberKind
+    digest: str
+
+    @property
+    def name(self) -> str:
+        """The name in the archive."""
+        return f"{self.kind.value}/{self.digest.removeprefix('sha256:')}{self.kind.ending}"
+
+    @classmethod
+    def of_name(cls, name: str) -> ArchiveMember:
+        """Return the member with a name. Raises `BadArchive` for a name that no member has."""
+        found = _NAME.fullmatch(name)
+        try:
+            member = None if found is None else cls(MemberKind(found[1]), f"sha256:{found[2]}")
+        except ValueError:
+            member = None
+        if member is None or member.name != name:
+            raise BadArchive(f"{name}: an archive has no member of this name")
+        return member
+
+
+def canonical_tree(member: ArchiveMember, data: bytes) -> Any:
+    """Return the tree in a member of JSON. Raises `BadArchive` if its digest differs or its text is not canonical."""
+    require_digest(member, digest_of(data))
+    try:
+        tree = json.loads(data)
+        same = canonical_json(tree) == data
+    except (ValueError, RecursionError, TypeError) as error:
+        raise BadArchive(f"{member.name}: it is not JSON: {error}") from error
+    if not same:
+        raise BadArchive(f"{member.name}: the JSON is not in canonical form")
+    return tree
+
+
+def stored_array(member: ArchiveMember, data: bytes) -> EncodedArray:
+    """Return the array in a member. Raises `BadArchive` if it cannot be decoded or is another array."""
+    try:
+        spec = read_spec(data)
+        array = EncodedArray(spec.dtype, spec.shape, data)
+        decoded = array.decode(max_bytes=MAX_ARRAY_BYTES)
+    except (ArrayError, BlockError) as error:
+        raise BadArchive(f"{member.name}: {error}") from error
+    require_digest(member, array_digest(decoded))
+    return EncodedArray(spec.dtype, spec.shape, data, decoded)
+
+
+def require_digest(member: ArchiveMember, digest: str) -> None:
+    """Raise `BadArchive` if the content of a member has another digest than its name says."""
+    if digest != member.digest:
+        raise BadArchive(f"{member.name}: the content has the digest {digest}; it was changed or damaged")

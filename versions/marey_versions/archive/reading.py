@@ -1,0 +1,206 @@
+"""Reading and checking of archives."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tarfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.names import is_digest
+from marey_versions.archive.members import (
+    MANIFEST,
+    MOST_BYTES,
+    SCHEMA,
+    ArchiveMember,
+    BadArchive,
+    MemberKind,
+    canonical_tree,
+    require_digest,
+    stored_array,
+)
+from marey_versions.records import CommitRecord, DatasetEntry, entry_of, key_of
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import ChunksInMemory, Value
+from marey_versions.tree.editing import change
+from marey_versions.tree.reading import Tree
+
+_PIECE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Content of the last member of an archive."""
+
+    dataset: str
+    """Name that the dataset had on its server."""
+    commit: str
+    """The commit that the archive was made of."""
+
+
+class Archive:
+    """Open archive; members are read, and compared with their digests, when they are asked for.
+
+    Raises `BadArchive` if the file is not a complete archive or has members that no archive has.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.members: dict[ArchiveMember, tuple[int, int]] = {}
+        """Position and size in bytes of each member."""
+        self.manifest = self._read_headers()
+
+    def _read_headers(self) -> Manifest:
+        manifest: Manifest | None = None
+        self._file.seek(0)
+        try:
+            with tarfile.open(fileobj=self._file, mode="r:") as tar:
+                for header in tar:
+                    if not header.isreg() or manifest is not None:
+                        raise BadArchive(f"{header.name}: it is not a member of an archive")
+                    if header.name == MANIFEST:
+                        manifest = _manifest(self._bytes(MANIFEST, header.offset_data, header.size))
+                    else:
+                        self._add(ArchiveMember.of_name(header.name), header)
+        except tarfile.TarError as error:
+            raise BadArchive(f"the file is no archive, or was cut off: {error}") from error
+        if manifest is None:
+            raise BadArchive(f"the archive has no {MANIFEST}: it was not written to its end, or was cut off")
+        return manifest
+
+    def _add(self, member: ArchiveMember, header: tarfile.TarInfo) -> None:
+        if member in self.members:
+            raise BadArchive(f"{member.name}: the archive has two members of this name")
+        self.members[member] = (header.offset_data, header.size)
+
+    # -- members -------------------------------------------------------------------------------------------------------
+
+    def tree(self, kind: MemberKind, digest: str) -> Any:
+        """Return the tree in a commit, revision or document."""
+        member = ArchiveMember(kind, digest)
+        return canonical_tree(member, self._read(member))
+
+    def array(self, digest: str) -> EncodedArray:
+        """Return an array, which has been decoded."""
+        member = ArchiveMember(MemberKind.ARRAY, digest)
+        return stored_array(member, self._read(member))
+
+    def file(self, digest: str) -> Iterator[bytes]:
+        """Return the bytes of a file in pieces. Raises `BadArchive` after the last one if they are not its bytes."""
+        member = ArchiveMember(MemberKind.FILE, digest)
+        position, left = self._place(member)
+        hashed = hashlib.sha256()
+        while left:
+            self._file.seek(position)
+            piece = self._file.read(min(left, _PIECE_BYTES))
+            if not piece:
+                raise BadArchive(f"{member.name}: the archive was cut off")
+            hashed.update(piece)
+            position, left = position + len(piece), left - len(piece)
+            yield piece
+        require_digest(member, f"sha256:{hashed.hexdigest()}")
+
+    def commit(self, digest: str) -> CommitRecord:
+        """Return a commit."""
+        try:
+            return CommitRecord.of(self.tree(MemberKind.COMMIT, digest))
+        except ValueError as error:
+            raise BadArchive(f"{ArchiveMember(MemberKind.COMMIT, digest).name}: {error}") from error
+
+    def changes(self, digest: str) -> dict[str, Value | None]:
+        """Return the entries that differ between a commit and its first parent by key; None for one that it removed."""
+        member = ArchiveMember(MemberKind.CHANGES, digest)
+        try:
+            lines = [json.loads(line) for line in self._read(member).splitlines()]
+            return {key_of(str(one["path"]), str(one["kind"])): _value(one) for one in lines}
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise BadArchive(f"{member.name}: it is not a list of changes: {error!r}") from error
+
+    def _read(self, member: ArchiveMember) -> bytes:
+        return self._bytes(member.name, *self._place(member))
+
+    def _place(self, member: ArchiveMember) -> tuple[int, int]:
+        if member not in self.members:
+            raise BadArchive(f"{member.name}: the archive has no such member")
+        return self.members[member]
+
+    def _bytes(self, name: str, position: int, size_bytes: int) -> bytes:
+        if size_bytes > MOST_BYTES:
+            raise BadArchive(f"{name}: it has {size_bytes:,} bytes; at most {MOST_BYTES:,} are read")
+        here = self._file.tell()
+        self._file.seek(position)
+        data = self._file.read(size_bytes)
+        self._file.seek(here)
+        if len(data) < size_bytes:
+            raise BadArchive(f"{name}: the archive was cut off")
+        return data
+
+    # -- versions ------------------------------------------------------------------------------------------------------
+
+    def history(self) -> list[tuple[str, CommitRecord]]:
+        """Return the commit of the manifest and all before it, each after its parents."""
+        records: dict[str, CommitRecord] = {}
+        ordered: dict[str, None] = {}
+        path = [self.manifest.commit]
+        while path:
+            digest = path[-1]
+            if digest in records:
+                ordered[path.pop()] = None
+            else:
+                records[digest] = self.commit(digest)
+                path += [one for one in records[digest].parents if one not in records]
+        return [(digest, records[digest]) for digest in ordered]
+
+    def versions(self) -> Versions:
+        """Compute the entries of all versions. Raises `BadArchive` if they are not those that a commit names."""
+        store = ChunksInMemory()
+        empty = build(store, ())
+        roots: dict[str, str] = {}
+        for digest, record in self.history():
+            before = roots[record.parents[0]] if record.parents else empty
+            name, changes = ArchiveMember(MemberKind.CHANGES, digest).name, self.changes(digest)
+            try:
+                root = change(store, before, changes)
+            except (TypeError, ValueError) as error:
+                raise BadArchive(f"{name}: an entry is not valid: {error}") from error
+            if root != record.tree:
+                raise BadArchive(f"{name}: the entries are not those that the commit names; they were changed")
+            roots[digest] = root
+        return Versions(store, roots)
+
+
+@dataclass(frozen=True)
+class Versions:
+    """Entries of the versions in an archive."""
+
+    _store: ChunksInMemory
+    _roots: Mapping[str, str]
+
+    def entries(self, commit: str) -> Iterator[DatasetEntry]:
+        """Return the entries of a version by path."""
+        return (entry_of(key, value) for key, value in Tree(self._store, self._roots[commit]).entries())
+
+
+def _manifest(data: bytes) -> Manifest:
+    try:
+        tree = json.loads(data)
+        schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise BadArchive(f"{MANIFEST}: it is not the manifest of an archive") from error
+    if schema != SCHEMA:
+        raise BadArchive(f"{MANIFEST}: this version of Marey reads {SCHEMA}, not {str(schema)[:80]!r}; update it")
+    if not is_digest(manifest.commit):
+        raise BadArchive(f"{MANIFEST}: {manifest.commit[:80]!r} is not the digest of a commit")
+    return manifest
+
+
+def _value(line: Mapping[str, Any]) -> Value | None:
+    if line.get("removed"):
+        return None
+    parts, tags = dict(line["parts"]), list(line["tags"])
+    if not all(isinstance(one, str) for one in (*parts, *parts.values(), *tags)):
+        raise ValueError("the parts and tags of an entry are texts")
+    return {"parts": parts, "tags": tags}

@@ -1,0 +1,73 @@
+"""Writing of archives, which can be interrupted and continued."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+from collections import Counter
+from collections.abc import Sequence
+from typing import BinaryIO
+
+from marey_schemas.encoding.canonical import canonical_json
+from marey_versions.archive.members import MANIFEST, SCHEMA, ArchiveMember
+
+
+class ArchiveWriter:
+    """Writer of an archive to a file, whose complete members from an earlier attempt are kept.
+
+    Members have no times, owners or permissions, so that the file depends on its content alone.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._held, end = _complete_members(file)
+        file.seek(end)
+        file.truncate()
+        self._tar = tarfile.open(fileobj=file, mode="w:", format=tarfile.PAX_FORMAT)  # noqa: SIM115
+
+    def __contains__(self, member: ArchiveMember) -> bool:
+        """Return whether the archive has a member already."""
+        return member.name in self._held
+
+    def add(self, member: ArchiveMember, data: bytes) -> None:
+        """Add a member. Adding it again has no effect."""
+        self.add_stream(member, io.BytesIO(data), len(data))
+
+    def add_stream(self, member: ArchiveMember, stream: BinaryIO, size_bytes: int) -> None:
+        """Add a member whose bytes are read from a stream. Adding it again has no effect."""
+        if member.name not in self._held:
+            self._write(member.name, stream, size_bytes)
+
+    def finish(self, dataset: str, commit: str) -> None:
+        """Add the manifest, which says that the archive is complete, and end the file."""
+        counts = Counter(name.partition("/")[0] for name in self._held)
+        manifest = {"schema": SCHEMA, "dataset": dataset, "commit": commit, "members": dict(sorted(counts.items()))}
+        data = canonical_json(manifest)
+        self._write(MANIFEST, io.BytesIO(data), len(data))
+        self._tar.close()
+
+    def _write(self, name: str, stream: BinaryIO, size_bytes: int) -> None:
+        header = tarfile.TarInfo(name)
+        header.size = size_bytes
+        self._tar.addfile(header, stream)
+        self._held.add(name)
+
+
+def _complete_members(file: BinaryIO) -> tuple[set[str], int]:
+    """Return the names of the members that an unfinished archive has, and the position after the last one."""
+    size_bytes = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    found: list[tuple[str, int]] = []
+    try:
+        with tarfile.open(fileobj=file, mode="r:") as tar:
+            for header in tar:
+                end = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+                if end > size_bytes or header.name == MANIFEST:
+                    break
+                found.append((header.name, end))
+    except tarfile.TarError:
+        pass  # the file ends within a header, or has none yet: what was found before it is complete
+    return {name for name, _ in found}, _end_of(found)
+
+
+def _end_of(found: Sequence[tuple[str, int]]) -> int:
+    return found[-1][1] if found else 0
