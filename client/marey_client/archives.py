@@ -22,7 +22,7 @@ from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
-from marey_versions.records import CommitRecord, contents_in, revision_content
+from marey_versions.records import TIME_OF_COMMIT, CommitRecord, contents_in, revision_content
 from marey_versions.tree.chunks import digest_of
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ class _Making:
 
     def _add_commit(self, commit: Commit) -> None:
         """Add a commit and its changes, and note the revisions of its entries."""
-        at = commit.at.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
             raise UnexpectedAnswer(f"the server's commit {commit.digest} has another content than its digest says")

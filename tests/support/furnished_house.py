@@ -12,10 +12,14 @@ from sqlalchemy import update
 from tests.support.rest_server import People
 from tests.support.who_may import PEOPLE
 
+from marey_schemas.encoding.canonical import document_digest
 from marey_server.access.principal import SYSTEM
 from marey_server.handlers.catalogue import RESOURCES
 from marey_server.http.routes import Route, RouteTable
 from marey_server.store.tables import token
+from marey_versions.records import revision_content
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import ChunksInMemory
 
 CANARY = "canary-5e0f2b"
 ROUTES = tuple(RouteTable(None, RESOURCES))
@@ -30,6 +34,7 @@ MOTION = {
 }
 SECRET_BYTES = f"{CANARY} bytes".encode()
 SECRET_DIGEST = f"sha256:{hashlib.sha256(SECRET_BYTES).hexdigest()}"
+EMPTY_TREE = build(ChunksInMemory(), ())
 OTHER_BYTES = b"bytes of anybody"
 OTHER_DIGEST = f"sha256:{hashlib.sha256(OTHER_BYTES).hexdigest()}"
 MULTIPART = b"--b\r\nContent-Disposition: form-data; name=files; filename=x.bvh\r\n\r\nno motion\r\n--b--\r\n"
@@ -61,6 +66,24 @@ BODIES = {
     "ProposalMerge": {"when_green": True},
     "CheckoutRequest": {"version": "spare", "discard": True},
     "ContentsRequest": {"revisions": [OTHER_DIGEST]},
+    "ReceivedRevisions": {
+        "revisions": [
+            {
+                "content": revision_content("skeleton", {"hierarchy": document_digest(HIERARCHY)}),
+                "kind": "skeleton",
+                "path": "received",
+                "parts": {"hierarchy": HIERARCHY},
+            }
+        ]
+    },
+    "ReceivedCommit": {
+        "tree": EMPTY_TREE,
+        "parents": [],
+        "author": CANARY,
+        "message": "m",
+        "at": "2026-11-23T10:00:00.000000Z",
+        "changes": [],
+    },
     "PartsRequest": {"parts": [{"kind": "clip", "item": "item_of_nobody", "revision": 1, "part": "info"}]},
     "ItemChange": {"name": "renamed"},
     "ItemRevert": {"revision": 1},

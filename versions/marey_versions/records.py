@@ -18,6 +18,8 @@ from marey_schemas.names import is_digest
 from marey_versions.tree.chunks import Value, digest_of
 
 COMMIT_SCHEMA = "marey/commit@1"
+TIME_OF_COMMIT = "%Y-%m-%dT%H:%M:%S.%fZ"
+"""Format of the time of a commit, which is in UTC."""
 
 _SEPARATOR = "\t"
 """Character between path and kind in a key. Paths cannot contain it, and it sorts before every character of a path."""
@@ -106,17 +108,37 @@ def portable_document(value: Any, content_of: Callable[[RevisionKey], str | None
     return [portable_document(member, content_of) for member in value] if isinstance(value, list) else value
 
 
+def local_document(value: Any, revision_of: Callable[[str], RevisionKey | None]) -> Any:
+    """Return a portable document with each `{"content": digest}` replaced by a revision, as one server stores it.
+
+    If `revision_of` returns None for a digest, the reference remains unchanged. Arrays may be of any type.
+    """
+    if isinstance(value, dict):
+        content = _content_of(value)
+        found = None if content is None else revision_of(content)
+        if found is not None:
+            rest = {key: member for key, member in value.items() if key != "content"}
+            return {**local_document(rest, revision_of), "item": found.item, "revision": found.revision}
+        return {key: local_document(member, revision_of) for key, member in value.items()}
+    return [local_document(member, revision_of) for member in value] if isinstance(value, list) else value
+
+
 def contents_in(portable: Any) -> Iterator[str]:
     """Return the content digests of the revisions that a portable document refers to.
 
     An array, and the record of an imported file (which has the member `blob`), also have a member `content`.
     """
     for found in _objects(portable):
-        content = found.get("content")
-        if not isinstance(content, str) or "blob" in found or is_array_reference(found):
-            continue
-        if is_digest(content):
+        if (content := _content_of(found)) is not None:
             yield content
+
+
+def _content_of(found: Mapping[str, Any]) -> str | None:
+    """Return the content digest of the revision that an object of a portable document refers to, None for others."""
+    content = found.get("content")
+    if not isinstance(content, str) or "blob" in found or is_array_reference(found):
+        return None
+    return content if is_digest(content) else None
 
 
 def _objects(value: Any) -> Iterator[Mapping[str, Any]]:

@@ -6,9 +6,10 @@ import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypedDict, Unpack
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypedDict, Unpack
 
 from marey_client.access import ANY_STATE
+from marey_client.errors import NotFound, RequestFailed
 from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
@@ -28,6 +29,11 @@ from marey_schemas.kinds import Kind
 
 if TYPE_CHECKING:
     from marey_client.archives import OnProgress
+    from marey_versions.archive.reading import Archive
+
+
+def _silent(_what: str, _done: int, _total: int | None) -> None:
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,30 @@ class Datasets:
         """List the datasets by name."""
         return pages(self.transport, Dataset, self.url)
 
+    def import_archive(
+        self, path: str | Path, name: str, *, into: str = MAIN, on_progress: OnProgress = _silent
+    ) -> ImportedVersion:
+        """Check an archive, and record its versions in a dataset, which is created if it does not exist.
+
+        The versions keep their digests. The branch `into` moves to the newest version if it has no commits, or only
+        commits that the version follows; it is created if it does not exist. If it has other commits, it does not move:
+        merge the version. No folder changes.
+
+        Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing.
+        """
+        from marey_versions.archive.checking import check_archive
+        from marey_versions.archive.reading import Archive
+
+        with Path(path).open("rb") as file:
+            archive = Archive(file)
+            check_archive(archive, lambda done, of: on_progress("checking", done, of))
+            handle = self.at(name)
+            try:
+                handle.read()
+            except NotFound:
+                handle = self.create(name, collection=name)
+            return handle.receive(archive, into=into, on_progress=on_progress)
+
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
         return DatasetHandle(self.transport, f"{self.url}/{name}")
@@ -72,6 +102,13 @@ class PickOptions(TypedDict, total=False):
     """Whether the result is only computed, not recorded."""
     expected: str
     """Commit that must be the newest one of the branch."""
+
+
+class ImportedVersion(NamedTuple):
+    """Newest version of an archive that was imported, and the branch that is at it now, None if there is none."""
+
+    commit: Commit
+    branch: str | None
 
 
 @dataclass(frozen=True)
@@ -214,9 +251,7 @@ class DatasetHandle:
         request = CheckoutRequest(version=version, discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
 
-    def archive(
-        self, path: str | Path, version: str = MAIN, *, on_progress: OnProgress = lambda _what, _done, _all: None
-    ) -> Commit:
+    def archive(self, path: str | Path, version: str = MAIN, *, on_progress: OnProgress = _silent) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
         The file is complete and checked, or else it does not exist; an attempt that was interrupted is continued by the
@@ -225,6 +260,31 @@ class DatasetHandle:
         from marey_client.archives import write_archive
 
         return write_archive(self, version, Path(path), on_progress)
+
+    def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
+        """Record the versions of an archive that was checked; `Datasets.import_archive` describes the rest."""
+        from marey_client.receiving import send_versions
+
+        ref = next((one for one in self.refs() if one.name == into), None)
+        empty = ref is not None and ref.commit is None
+        made = send_versions(self, archive, on_progress, begins=into if empty else None)
+        if ref is None:
+            self.create_branch(into, made.digest)
+        moved = ref is None or empty or self._fast_forward(into, made.digest)
+        return ImportedVersion(made, into if moved else None)
+
+    def _fast_forward(self, branch: str, commit: str) -> bool:
+        """Move a branch to a commit that follows its newest one; return whether the branch is at the commit now."""
+        if self.at(branch).digest == commit:
+            return True
+        try:
+            preview = self.merge(commit, into=branch, preview=True)
+        except RequestFailed:  # nothing to merge, or no single common version: a person must decide
+            return False
+        if preview.base != preview.ours:
+            return False
+        merged = self.merge(commit, into=branch, expected=preview.ours)
+        return merged.commit is not None and merged.commit.digest == commit
 
     # -- branches and tags ---------------------------------------------------------------------------------------------
 

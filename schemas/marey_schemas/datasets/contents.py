@@ -1,23 +1,30 @@
-"""Requests for the content of versions by digest."""
+"""Content of versions by digest: requests for it, and versions that come from elsewhere."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
-from marey_schemas.base import Request
-from marey_schemas.names import Digest
+from marey_schemas.base import Answer, Request
+from marey_schemas.datasets.commits import EntryPath
+from marey_schemas.datasets.naming import RefName
+from marey_schemas.kinds import Kind
+from marey_schemas.names import Digest, Message, Tag
 
 MOST_CONTENTS = 256
 """Greatest number of revisions, and of documents, in one request."""
+MOST_RECEIVED_CHANGES = 200_000
+"""Greatest number of entries that a commit from elsewhere may change."""
+
+PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 class PartOfContent(Request):
     """Address of a document: a part of the revisions with a content digest."""
 
     content: Digest = Field(description="Content digest of the revision.")
-    part: Annotated[str, StringConstraints(min_length=1, max_length=64)]
+    part: PartName
 
 
 class ContentsRequest(Request):
@@ -25,3 +32,53 @@ class ContentsRequest(Request):
 
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
     documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)
+
+
+class ReceivedRevision(Request):
+    """Revision from an archive or another server."""
+
+    content: Digest = Field(description="Content digest, which the server compares with that of the documents.")
+    kind: Kind
+    path: EntryPath | None = Field(
+        description="Path of an entry that has the revision; null: no entry has it, but another revision refers to it."
+    )
+    parts: dict[PartName, Any] = Field(
+        min_length=1,
+        description='Documents in which references to revisions are `{"content": digest}`. In place of a document, '
+        '`{"content": digest}` alone means the same part of a revision that the project has.',
+    )
+
+
+class ReceivedRevisions(Request):
+    """Revisions from an archive or another server, each after those that it refers to."""
+
+    revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
+
+
+class StoredRevisions(Answer):
+    """Number of revisions that a request has added; the project had the others already."""
+
+    added: int
+
+
+class ReceivedChange(Request):
+    """Entry that differs between a commit and its first parent."""
+
+    path: EntryPath
+    kind: Kind
+    parts: dict[PartName, Digest] | None = Field(description="Content digest of each part; null: it was removed.")
+    tags: tuple[Tag, ...] = Field((), max_length=64)
+
+
+class ReceivedCommit(Request):
+    """Commit from an archive or another server; it keeps its digest."""
+
+    tree: Digest
+    parents: tuple[Digest, ...] = Field(max_length=2)
+    author: Annotated[str, StringConstraints(min_length=1, max_length=64)]
+    message: Message
+    at: Annotated[str, StringConstraints(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z$")]
+    changes: tuple[ReceivedChange, ...] = Field(max_length=MOST_RECEIVED_CHANGES)
+    begins: RefName | None = Field(
+        None, description="Branch without commits that begins at this commit; null: no branch moves."
+    )

@@ -10,11 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.support.command_line import CommandLine
 
-from marey_client import archives
+from marey_client import archives, receiving
+from marey_client.errors import RequestFailed
 from marey_client.handles.clips import ClipHandle
+from marey_client.handles.datasets import DatasetHandle
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
 from marey_motion.gait import generate_gait
@@ -54,7 +57,7 @@ def clip(project: ProjectHandle, name: str) -> ClipHandle:
 
 
 def test_the_page_makes_checks_and_extracts_an_archive(run: CommandLine, project: ProjectHandle) -> None:
-    create, verify, extract = re.findall(r"^marey .*$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    create, verify, extract, *imported = re.findall(r"^marey .*$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     run(*shlex.split(create)[1:])
     told = run(*shlex.split(verify)[1:]).stdout.splitlines()
     head = project.datasets.at("gaits").at("v1")
@@ -69,6 +72,83 @@ def test_the_page_makes_checks_and_extracts_an_archive(run: CommandLine, project
     assert len(walk["parts"]["motion"]["poses"]["data"]) == len(clip(project, "walk").motion().poses)
     (skeleton,) = walk["revisions"].values()
     assert skeleton["parts"]["hierarchy"]["joints"][0]["name"] == "Hips"
+    for command in imported:
+        run(*shlex.split(command)[1:])
+    studio = other_project(project, "studio")
+    assert studio.datasets.at("gaits").at() == head
+    assert [one.digest for one in studio.datasets.at("gaits").log()] == [one.digest for one in gaits_of(project).log()]
+    assert (clip(studio, "walk").info().comment, clip(studio, "turn").item.tags) == ("on trial", ("fast",))
+    assert np.array_equal(clip(studio, "walk").motion().poses, clip(project, "walk").motion().poses)
+    assert {one.item.collection for one in studio.clips.list()} == {"gaits/raw"}
+    with pytest.raises(RequestFailed, match="Nothing has changed"):
+        studio.datasets.at("gaits").commit("The folder has the entries of the version")
+    run(*shlex.split(imported[1])[1:])
+    studio.delete()
+
+
+def gaits_of(project: ProjectHandle) -> DatasetHandle:
+    return project.datasets.at("gaits")
+
+
+def other_project(project: ProjectHandle, name: str) -> ProjectHandle:
+    return ProjectHandle(project.transport, name)
+
+
+def test_an_import_continues_and_sends_what_is_missing_only(
+    run: CommandLine, project: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = run.folder / "first.tar", run.folder / "second.tar"
+    gaits_of(project).archive(first, "main~1")
+    gaits_of(project).archive(second)
+    run("project", "create", "away")
+    away = other_project(project, "away")
+    copy = away.datasets.create("gaits", collection="gaits")
+    once = receiving._Import._send_commit
+
+    def fail(_sending: Any, record: Any, *more: Any) -> None:
+        if record.message == "Tag the turn":
+            raise ConnectionError("the server went away")
+        once(_sending, record, *more)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(receiving._Import, "_send_commit", fail)
+        with pytest.raises(ConnectionError):
+            away.datasets.import_archive(first, "gaits")
+    assert copy.ref("main").commit is None
+    assert away.datasets.import_archive(first, "gaits").branch == "main"
+    sent: list[int] = []
+    send = receiving._Import._send
+
+    def count(sending: Any, contents: list[str]) -> None:
+        sent.append(len(contents))
+        send(sending, contents)
+
+    monkeypatch.setattr(receiving._Import, "_send", count)
+    assert away.datasets.import_archive(second, "gaits") == (gaits_of(project).at(), "main")
+    assert sent == []  # the newest version only drops a clip
+    away.delete()
+
+
+def test_a_branch_with_other_versions_does_not_move_and_is_merged(run: CommandLine, project: ProjectHandle) -> None:
+    file = run.folder / "gaits.tar"
+    gaits_of(project).archive(file, "main~1")
+    run("project", "create", "away")
+    away = other_project(project, "away")
+    run("archive", "import", file, "away/gaits")
+    copy = gaits_of(away)
+    copy.check_out()
+    turn = clip(away, "turn")
+    turn.put_info(turn.info().model_copy(update={"comment": "ours"}))
+    mine = copy.commit("Describe the turn")
+    gaits_of(project).archive(file)
+    told = run("archive", "import", file, "away/gaits").stderr
+    assert copy.at() == mine
+    command = told[told.index("marey dataset merge") :]
+    run(*shlex.split(command)[1:])
+    copy.check_out()
+    assert {one.name for one in away.clips.list()} == {"walk", "turn"}
+    assert clip(away, "turn").info().comment == "ours"
+    away.delete()
 
 
 def test_an_archive_is_continued_where_an_attempt_ended(
@@ -115,6 +195,11 @@ def test_a_changed_archive_is_refused_with_the_member(run: CommandLine, project:
     data = bytearray(file.read_bytes())
     data[header.offset_data + 2] ^= 1
     file.write_bytes(data)
+    run("project", "create", "away")
+    told = run("archive", "import", file, "away/gaits", status=1)
+    assert header.name in told.stderr
+    assert not list(other_project(project, "away").datasets.list())
+    other_project(project, "away").delete()
     for command in ("verify", "extract"):
         told = run("archive", command, file, status=1)
         assert told.stderr.startswith(f"{file}: ")

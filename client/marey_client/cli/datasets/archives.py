@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.datasets.places import VersionPlace, parse, short
+from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
 from marey_client.cli.terminal.failures import Refused
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, progress
@@ -96,6 +96,35 @@ def extract(
     if as_json:
         return print_json([str(one) for one in written])
     return print_message(f"wrote {counted(len(written), 'file')} to {output}")
+
+
+@archive.command("import")
+def import_archive(
+    context: typer.Context,
+    file: ArchivePath,
+    place: DatasetPlace,
+    branch: Annotated[str, typer.Option(help="Branch that is to have the version.")] = "main",
+    as_json: AsJson = False,
+) -> None:
+    """Check an archive, and record its versions in a dataset, which is created if it does not exist.
+
+    The versions keep their digests, authors and times. What the server has is not sent again. No folder changes: check
+    the version out to get its clips. If the branch has versions that the archive does not have, it does not move; merge
+    the imported version into it.
+    """
+    at = parse(place)
+    with connect(context) as marey, _opened(file), progress() as advance:
+        datasets = marey.project(at.project).datasets
+        made = datasets.import_archive(file, at.dataset, into=branch, on_progress=advance)
+    if as_json:
+        return print_json({"commit": made.commit.digest, "branch": made.branch})
+    name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
+    if made.branch is None:
+        return print_message(
+            f"{name} has the version {digits}; {branch} has other versions and did not move: marey dataset merge "
+            f"{name}@{digits} --into {branch}"
+        )
+    return print_message(f"{made.branch} of {name} is at {digits}; marey dataset checkout {name}@{made.branch}")
 
 
 @contextmanager

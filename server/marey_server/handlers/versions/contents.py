@@ -1,12 +1,17 @@
-"""Resource that returns the content of versions by digest, for archives and other servers."""
+"""Resources that exchange versions with archives and other servers."""
 
 from __future__ import annotations
 
-from marey_schemas.datasets.contents import ContentsRequest
-from marey_server.http.declarations import Access, Document, reads
+from marey_schemas.datasets.commits import Commit
+from marey_schemas.datasets.contents import ContentsRequest, ReceivedCommit, ReceivedRevisions, StoredRevisions
+from marey_schemas.sizes import MIB
+from marey_server.handlers.items import MAX_DOCUMENT_BYTES
+from marey_server.http.declarations import Access, Document, RequestBody, reads, writes
 from marey_server.http.reply import Rendered, Reply
 from marey_server.http.resource import Resource
 from marey_server.store import datasets
+
+MAX_RECEIVED_BYTES = 64 * MIB
 
 
 class ProjectContents(Resource):
@@ -28,4 +33,49 @@ class ProjectContents(Resource):
         return await self.render_document(Reply(found))
 
 
-RESOURCES: tuple[type[Resource], ...] = (ProjectContents,)
+class ReceivedContents(Resource):
+    """Revisions from archives and other servers."""
+
+    path = "/projects/{project}/datasets/{dataset}/contents"
+    tag = "ProjectDatasets"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(ReceivedRevisions, max_bytes=MAX_DOCUMENT_BYTES),
+        answer=StoredRevisions,
+    )
+    async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
+        """Store revisions, so that commits from elsewhere can refer to them.
+
+        A revision must come after those that it refers to, which are named by their content digests. The revision of
+        an entry gets an item that is deleted at once; a checkout of a version with the entry restores the item. Other
+        revisions get items in the folder `imported`.
+        """
+        local = await self.look_up(datasets.find_local, project, body.revisions)
+        drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
+        return await self.answer(datasets.store_revisions, project, dataset, drafts)
+
+
+class ReceivedCommits(Resource):
+    """Commits from archives and other servers."""
+
+    path = "/projects/{project}/datasets/{dataset}/received-commits"
+    tag = "ProjectDatasets"
+
+    @writes(
+        access=Access.CONTRIBUTOR,
+        body=RequestBody(ReceivedCommit, max_bytes=MAX_RECEIVED_BYTES),
+        answer=Commit,
+        status=201,
+    )
+    async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
+        """Record a commit from elsewhere, with its author and time, so that it keeps its digest.
+
+        The server applies the changes to the first parent, and refuses the commit if its tree differs from the result.
+        No branch moves, except one without commits that is to begin at the commit. Merge the commit to move another.
+        """
+        prepared = await self.look_up(datasets.prepare_receipt, project, dataset, body)
+        return await self.answer(datasets.record_receipt, project, dataset, body, prepared)
+
+
+RESOURCES: tuple[type[Resource], ...] = (ProjectContents, ReceivedContents, ReceivedCommits)

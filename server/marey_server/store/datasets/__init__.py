@@ -24,6 +24,13 @@ from marey_server.store.datasets.naming import (
     read_ref,
 )
 from marey_server.store.datasets.portable import load_contents
+from marey_server.store.datasets.receiving import (
+    find_local,
+    prepare_receipt,
+    prepare_revisions,
+    record_receipt,
+    store_revisions,
+)
 
 __all__ = [
     "PreparedCommit",
@@ -35,6 +42,7 @@ __all__ = [
     "delete_dataset",
     "delete_ref",
     "entries_of_kind",
+    "find_local",
     "list_commits",
     "list_datasets",
     "list_entries",
@@ -44,6 +52,8 @@ __all__ = [
     "prepare_commit",
     "prepare_merge",
     "prepare_pick",
+    "prepare_receipt",
+    "prepare_revisions",
     "protect_branch",
     "read_commit",
     "read_dataset",
@@ -51,4 +61,6 @@ __all__ = [
     "read_ref",
     "record_commit",
     "record_merge",
+    "record_receipt",
+    "store_revisions",
 ]

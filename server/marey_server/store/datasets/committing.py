@@ -28,7 +28,7 @@ from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
-from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
+from marey_versions.records import TIME_OF_COMMIT, CommitRecord, DatasetEntry, RevisionKey, key_of
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
@@ -105,20 +105,20 @@ def record_commit(
     recorded = prepared.recorded or recorded_as(tx, found.id, prepared.write_id)
     if recorded is not None:
         return read_commit(tx, project, name, recorded)
-    mover = mover or Mover(_author(tx), project_row.role)
+    mover = mover or Mover(author_of(tx), project_row.role)
     store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)
     digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.of_folder:
         tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
-    _move_branch(tx, prepared, digest, mover)
+    move_branch_to(tx, prepared, digest, mover)
     tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
     faults.point("dataset_commit.before_commit")
     tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
     return read_commit(tx, project, name, digest)
 
 
-def _move_branch(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
+def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
     """Move a branch to a commit that follows the newest one that the branch had when the move was prepared."""
     moved = (
         update(dataset_ref)
@@ -175,27 +175,35 @@ def branch_moved(branch: str, head: str | None) -> ConflictProblem:
 
 
 def _insert(tx: Transaction, prepared: PreparedCommit, author: str) -> str:
-    at = datetime_of(tx.now_us).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    at = datetime_of(tx.now_us).strftime(TIME_OF_COMMIT)
     record = CommitRecord(prepared.tree, prepared.parents, author, prepared.message, at)
+    insert_commit(tx, prepared.dataset_id, record, entries=prepared.entries, write_id=prepared.write_id)
+    return record.digest
+
+
+def insert_commit(
+    tx: Transaction, dataset_id: str, record: CommitRecord, *, entries: int, write_id: str | None = None
+) -> None:
+    """Store a commit whose tree and parents are stored; `entries` is the number of its entries."""
     above = select(dataset_commit.c.generation).where(
-        dataset_commit.c.dataset_id == prepared.dataset_id, dataset_commit.c.digest.in_(prepared.parents)
+        dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.digest.in_(record.parents)
     )
     row = {
-        "dataset_id": prepared.dataset_id, "digest": record.digest, "tree": record.tree, "author": record.author,
-        "message": record.message, "at": record.at, "entries": prepared.entries, "write_id": prepared.write_id,
+        "dataset_id": dataset_id, "digest": record.digest, "tree": record.tree, "author": record.author,
+        "message": record.message, "at": record.at, "entries": entries, "write_id": write_id,
         "generation": max((number + 1 for number in tx.execute(above).scalars()), default=0),
     }  # fmt: skip
     tx.execute(insert(dataset_commit).values(**row))
     places = [
-        {"dataset_id": prepared.dataset_id, "digest": record.digest, "position": place, "parent": parent}
-        for place, parent in enumerate(prepared.parents)
+        {"dataset_id": dataset_id, "digest": record.digest, "position": place, "parent": parent}
+        for place, parent in enumerate(record.parents)
     ]
     if places:
         tx.execute(insert(commit_parent), places)
-    return record.digest
 
 
-def _author(tx: Transaction) -> str:
+def author_of(tx: Transaction) -> str:
+    """Return the name of the caller as the author of a commit."""
     name = tx.execute(select(user.c.name).where(user.c.id == tx.principal.user_id)).scalar()
     return str(name or tx.principal.actor)
 

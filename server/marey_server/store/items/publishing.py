@@ -41,11 +41,13 @@ def publish(
     *,
     author_id: str | None,
     job_id: str | None = None,
+    refer_to_deleted: bool = False,
 ) -> list[Published]:
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
     `{"output": name}` in a document refers to another draft and is replaced by its item and revision; the
-    `model_digest` of a tree may name the model of its own draft. Content that is stored already creates no new
+    `model_digest` of a tree may name the model of its own draft. With `refer_to_deleted`, documents may refer to items
+    that are deleted. Content that is stored already creates no new
     revision. The caller has authorised the write.
 
     Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
@@ -53,7 +55,7 @@ def publish(
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
         raise InvalidProblem("Two results in the request have the same name.", code="duplicate-output")
-    publication = _Publication(tx, project_row, author_id, job_id)
+    publication = _Publication(tx, project_row, author_id, job_id, refer_to_deleted)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
     quotas.hold(tx, project_row.id, publication.added)
@@ -165,13 +167,14 @@ class _Publication:
     project: ProjectRow
     author_id: str | None
     job_id: str | None
+    refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
     added: dict[str | None, Held] = field(default_factory=dict)
     """New items and bytes, by the creator of the items."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._references = references.ReferenceCheck(self.tx, self.project)
+        self._references = references.ReferenceCheck(self.tx, self.project, to_deleted=self.refer_to_deleted)
 
     def add(self, group: Sequence[_Loaded]) -> None:
         """Publish drafts that have the same kind, the same `reuse`, and different places."""

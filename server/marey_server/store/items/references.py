@@ -74,10 +74,14 @@ def resolved(tree: Any, done: Mapping[str, Published]) -> Any:
 
 
 class ReferenceCheck:
-    """Check of the references in parts of items; looks up each revision once."""
+    """Check of the references in parts of items; looks up each revision once.
 
-    def __init__(self, tx: Transaction, project_row: ProjectRow) -> None:
+    With `to_deleted`, documents may refer to items that are deleted.
+    """
+
+    def __init__(self, tx: Transaction, project_row: ProjectRow, *, to_deleted: bool = False) -> None:
         self._tx = tx
+        self._to_deleted = to_deleted
         self._project_id = project_row.id
         self._seen: dict[tuple[str, int, Kind, str], Tree] = {}
 
@@ -153,11 +157,12 @@ class ReferenceCheck:
                 item.c.id == item_id,
                 item.c.project_id == self._project_id,
                 item.c.kind == kind.value,
-                item.c.deleted_us.is_(None),
                 revision_part.c.number == number,
                 revision_part.c.part == part,
             )
         )
+        if not self._to_deleted:
+            statement = statement.where(item.c.deleted_us.is_(None))
         body: Tree | None = self._tx.execute(statement).scalar()
         return body
 

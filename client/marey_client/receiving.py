@@ -1,0 +1,232 @@
+"""Import of archives into datasets: revisions and commits that the server lacks are sent, and keep their digests."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from marey_client.blobs import Blobs
+from marey_client.errors import NotFound
+from marey_client.transport import BLOCKS, Transport, as_json, read_model
+from marey_schemas.datasets.commits import Commit
+from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, ReceivedChange, ReceivedCommit
+from marey_schemas.documents.blob_references import references_of
+from marey_schemas.encoding.canonical import attach_arrays
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree
+from marey_schemas.kinds import Kind
+from marey_schemas.sizes import MIB
+from marey_versions.archive.members import ArchiveMember, MemberKind
+from marey_versions.archive.reading import Archive
+from marey_versions.records import CommitRecord, contents_in, path_and_kind, revision_content
+from marey_versions.tree.chunks import Value
+
+MOST_BYTES_SENT = 16 * MIB
+"""Size of the documents from which on a request contains no further revision."""
+
+OnProgress = Callable[[str, int, int | None], None]
+"""Function called with the current activity, the amount done, and the total amount if it is known."""
+
+
+class ReceivingDataset(Protocol):
+    """Members of `DatasetHandle` that an import needs."""
+
+    @property
+    def transport(self) -> Transport:
+        """The connections to the server."""
+
+    @property
+    def project_url(self) -> str:
+        """The path of the project, relative to the API's root."""
+
+    @property
+    def url(self) -> str:
+        """The path of the dataset, relative to the API's root."""
+
+    def at(self, version: str) -> Commit:
+        """Return the commit that a version names."""
+
+
+def send_versions(
+    dataset: ReceivingDataset, archive: Archive, on_progress: OnProgress, *, begins: str | None = None
+) -> Commit:
+    """Record the versions of an archive in a dataset, with their digests; return the newest one.
+
+    No branch moves, but the branch `begins`, which must not have commits, begins at the newest version. If an import is
+    interrupted, the next one sends only what is missing.
+    """
+    return _Import(dataset, archive, on_progress).run(begins)
+
+
+class _Revision(NamedTuple):
+    """Revision in an archive, with the path of an entry that has it, if there is one."""
+
+    kind: str
+    parts: Mapping[str, str]
+    path: str | None
+
+
+@dataclass
+class _Import:
+    """Import in progress."""
+
+    dataset: ReceivingDataset
+    archive: Archive
+    on_progress: OnProgress
+    revisions: dict[str, _Revision] = field(default_factory=dict)
+    """Revisions of entries, by content digest."""
+    held: set[str] = field(default_factory=set)
+    """Content digests of the revisions that the project has."""
+    homes: dict[str, str] = field(default_factory=dict)
+    """For the content digest of a document, the content digest of a revision with this document."""
+
+    def run(self, begins: str | None) -> Commit:
+        history = self.archive.history()
+        changes = {digest: self.archive.changes(digest) for digest, _ in history}
+        known = self._known(history)
+        for digest in known:
+            self._note(self._put(changes[digest]))
+        for done, (digest, record) in enumerate(history):
+            self.on_progress("sending versions", done, len(history))
+            if digest not in known:
+                self._ensure(self._put(changes[digest]))
+                self._send_commit(record, changes[digest], None)
+        head = self.archive.manifest.commit
+        if begins is not None:
+            self._send_commit(self.archive.commit(head), changes[head], begins)
+        return self.dataset.at(head)
+
+    def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:
+        """Return the digests of the commits that the dataset has; it also has all before each of them."""
+        known: set[str] = set()
+        for digest, record in reversed(history):
+            if digest not in known and not self._has(digest):
+                continue
+            known.update((digest, *record.parents))
+        return known
+
+    def _has(self, commit: str) -> bool:
+        try:
+            return self.dataset.at(commit).digest == commit
+        except NotFound:
+            return False
+
+    def _put(self, changes: Mapping[str, Value | None]) -> list[str]:
+        """Return the content digests of the entries that were added or changed, and note their revisions."""
+        found = []
+        for key, value in changes.items():
+            if value is not None:
+                path, kind = path_and_kind(key)
+                found.append(revision_content(kind, value["parts"]))
+                self.revisions.setdefault(found[-1], _Revision(kind, value["parts"], path))
+        return found
+
+    # -- revisions -----------------------------------------------------------------------------------------------------
+
+    def _ensure(self, contents: Iterable[str]) -> None:
+        """Send the revisions that the project lacks, each after those that it refers to."""
+        missing = self._missing(sorted(set(contents) - self.held))
+        documents = (digest for one in missing for digest in self._revision(one).parts.values())
+        referred = {content for digest in documents for content in contents_in(self._document(digest))}
+        if further := referred - self.held - set(missing):
+            self._ensure(further)
+        for together in self._batches(missing):
+            self._send(together)
+
+    def _missing(self, contents: list[str]) -> list[str]:
+        """Return the revisions that the project lacks, and note the others as held."""
+        missing = []
+        for start in range(0, len(contents), MOST_CONTENTS):
+            some = contents[start : start + MOST_CONTENTS]
+            body = as_json(ContentsRequest(revisions=tuple(some)))
+            url = f"{self.dataset.project_url}/contents"
+            response = self.dataset.transport.send("POST", url, content=body, headers={"Accept": BLOCKS})
+            found = decode_tree(response.content, MSGPACK)["revisions"]
+            missing += [content for content, one in zip(some, found, strict=True) if one is None]
+        self._note(set(contents) - set(missing))
+        return missing
+
+    def _note(self, contents: Iterable[str]) -> None:
+        for content in contents:
+            self.held.add(content)
+            self.homes.update(dict.fromkeys(self._revision(content).parts.values(), content))
+
+    def _revision(self, content: str) -> _Revision:
+        if content not in self.revisions:
+            found = self.archive.tree(MemberKind.REVISION, content)
+            self.revisions[content] = _Revision(found["kind"], found["parts"], None)
+        return self.revisions[content]
+
+    def _document(self, digest: str) -> Any:
+        return self.archive.tree(MemberKind.DOCUMENT, digest)
+
+    def _batches(self, contents: list[str]) -> Iterator[list[str]]:
+        """Divide revisions into requests of a moderate size."""
+        batch: list[str] = []
+        size_bytes = 0
+        for content in contents:
+            batch.append(content)
+            size_bytes += sum(map(self._size_bytes, self._revision(content).parts.values()))
+            if size_bytes > MOST_BYTES_SENT or len(batch) == MOST_CONTENTS:
+                yield batch
+                batch, size_bytes = [], 0
+        if batch:
+            yield batch
+
+    def _size_bytes(self, document: str) -> int:
+        if document in self.homes:
+            return 0
+        arrays, _ = references_of("", self._document(document))
+        members = [ArchiveMember(MemberKind.ARRAY, leaf["content"]) for leaf in arrays.values()]
+        members.append(ArchiveMember(MemberKind.DOCUMENT, document))
+        return sum(self.archive.members[member][1] for member in members)
+
+    def _send(self, contents: list[str]) -> None:
+        sent = []
+        for content in contents:
+            one = self._revision(content)
+            parts = {part: self._part(digest) for part, digest in one.parts.items()}
+            sent.append({"content": content, "kind": one.kind, "path": one.path, "parts": parts})
+        self.dataset.transport.send_tree("POST", f"{self.dataset.url}/contents", {"revisions": sent})
+        self._note(contents)
+
+    def _part(self, digest: str) -> Any:
+        """Return a document as the server receives it, or the revision from which it can take the document."""
+        if digest in self.homes:
+            return {"content": self.homes[digest]}
+        tree = self._document(digest)
+        self._send_files(set(references_of(str(tree.get("schema")), tree)[1].values()))
+        return attach_arrays(tree, self.archive.array)
+
+    def _send_files(self, digests: set[str]) -> None:
+        blobs = Blobs(self.dataset.transport)
+        for digest in sorted(blobs.missing(digests)) if digests else ():
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "file"
+                with path.open("wb") as file:
+                    file.writelines(self.archive.file(digest))
+                blobs.put_file(path, digest=digest)
+
+    # -- commits -------------------------------------------------------------------------------------------------------
+
+    def _send_commit(self, record: CommitRecord, changes: Mapping[str, Value | None], begins: str | None) -> None:
+        request = ReceivedCommit(
+            tree=record.tree,
+            parents=record.parents,
+            author=record.author,
+            message=record.message,
+            at=record.at,
+            changes=tuple(_change(key, value) for key, value in changes.items()),
+            begins=begins,
+        )
+        url = f"{self.dataset.url}/received-commits"
+        read_model(Commit, self.dataset.transport.send("POST", url, content=as_json(request)))
+
+
+def _change(key: str, value: Value | None) -> ReceivedChange:
+    path, kind = path_and_kind(key)
+    if value is None:
+        return ReceivedChange(path=path, kind=Kind(kind), parts=None)
+    return ReceivedChange(path=path, kind=Kind(kind), parts=value["parts"], tags=tuple(value["tags"]))

@@ -1,0 +1,219 @@
+"""Versions from archives and other servers: their revisions and commits, which keep their digests.
+
+The revision of an entry gets an item that is deleted at once, so that no folder changes; a checkout restores it at its
+place. A revision that is no entry, such as the skeleton of clips, gets an item in the folder `IMPORTED`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sqlalchemy import Row, select
+
+from marey_schemas.datasets.commits import Commit
+from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision, StoredRevisions
+from marey_schemas.wording import counted
+from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.store import items, projects
+from marey_server.store.datasets.chunks import StoredChunks, store_chunks
+from marey_server.store.datasets.committing import PreparedCommit, author_of, head_of, insert_commit, move_branch_to
+from marey_server.store.datasets.contents import find_contents_of, store_contents
+from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
+from marey_server.store.datasets.naming import find_dataset
+from marey_server.store.datasets.protection import Mover
+from marey_server.store.documents import PreparedDocument
+from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import dataset_commit
+from marey_server.store.transaction import Transaction
+from marey_versions.records import CommitRecord, RevisionKey, contents_in, key_of, local_document, revision_content
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import Value
+from marey_versions.tree.editing import change
+from marey_versions.tree.reading import Tree
+
+MISSING_CONTENTS = "missing-contents"
+"""Code of the error for revisions that the project does not have; `context.contents` lists their digests."""
+
+
+IMPORTED = "imported"
+"""Folder of the items of revisions that are not entries, with one folder for each kind."""
+
+
+@dataclass(frozen=True)
+class LocalRevisions:
+    """Revisions of the project that a request refers to, by content digest."""
+
+    held: Mapping[str, RevisionKey]
+    documents: Mapping[str, Mapping[str, str]]
+    """Digest of the document of each part."""
+
+
+def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevision]) -> LocalRevisions:
+    """Find the revisions that a request contains or refers to. Raises `ConflictProblem` if the project lacks one."""
+    project_row = projects.require(tx, project)
+    wanted = {content for one in received for content in contents_in(one.parts)}
+    found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
+    _require_all(wanted - found.keys())
+    parts = read_part_digests(tx, set(found.values()))
+    held = {content: RevisionKey(*key) for content, key in found.items()}
+    return LocalRevisions(held, {content: parts[key] for content, key in held.items()})
+
+
+def prepare_revisions(received: Sequence[ReceivedRevision], local: LocalRevisions) -> dict[str, Draft]:
+    """Check and encode the revisions that the project does not have; return their drafts by content digest."""
+    return {one.content: _draft(one, local) for one in received if one.content not in local.held}
+
+
+def _draft(one: ReceivedRevision, local: LocalRevisions) -> Draft:
+    parts: dict[str, PreparedDocument | StoredDocument] = {}
+    for part, tree in one.parts.items():
+        if isinstance(tree, dict) and tree.keys() == {"content"}:
+            parts[part] = StoredDocument(_stored(one, part, str(tree["content"]), local))
+        else:
+            parts[part] = items.prepare_part(one.kind, part, local_document(tree, local.held.get))
+    shown = one.kind.value if one.path is None else one.path.rpartition("/")[2][:200]
+    return Draft(
+        name_in_batch=one.content, kind=one.kind, parts=dict(parts), reuse="new",
+        item_name=f"{shown} {one.content.removeprefix('sha256:')[:12]}",
+        collection="" if one.path is not None else f"{IMPORTED}/{one.kind.plural}",
+    )  # fmt: skip
+
+
+def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevisions) -> str:
+    digest = local.documents.get(content, {}).get(part)
+    if digest is None:
+        raise InvalidProblem(
+            f"The revision {content} has no part {part!r} that {one.path!r} could use.", code="no-part"
+        )
+    return digest
+
+
+def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
+    """Store revisions, given by content digest; items of entries are deleted at once.
+
+    Raises `InvalidProblem` if the documents of a revision have another content digest.
+    """
+    project_row = projects.require(tx, project)
+    folder = find_dataset(tx, project_row, name).path or ""
+    lacking = drafts.keys() - revisions_with(tx, project_row.id, drafts).keys()
+    of_entries = {content for content in lacking if not drafts[content].collection}
+    chosen = [
+        replace(draft, collection=folder) if content in of_entries else draft
+        for content, draft in drafts.items()
+        if content in lacking
+    ]
+    made = items.publish(tx, project_row, chosen, author_id=tx.principal.user_id, refer_to_deleted=True)
+    keys = {one.name: RevisionKey(one.item, one.revision) for one in made}
+    contents = find_contents_of(tx, keys.values())
+    for content, key in keys.items():
+        if contents.revisions[key] != content:
+            raise InvalidProblem(
+                f"The documents of the revision {content} have the content digest {contents.revisions[key]}.",
+                code="other-content",
+            )
+    store_contents(tx, contents)
+    for one in made:
+        if one.name in of_entries:
+            items.delete_item(tx, project, one.kind, one.item, expected_rev=None)
+    return StoredRevisions(added=len(made))
+
+
+@dataclass(frozen=True)
+class PreparedReceipt:
+    """Commit from elsewhere, whose tree was computed and is the one that it names."""
+
+    record: CommitRecord
+    entries: int
+    chunks: Mapping[str, bytes]
+
+
+def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedCommit) -> PreparedReceipt:
+    """Compute the tree of a commit from elsewhere.
+
+    Raises `ConflictProblem` if the dataset lacks a parent or the project a revision, and `InvalidProblem` if the
+    changes do not give the tree that the commit names.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    record = CommitRecord(request.tree, request.parents, request.author, request.message, request.at)
+    if _is_known(tx, found, record.digest):
+        return PreparedReceipt(record, 0, {})
+    _require_parents(tx, found, record)
+    changes = {key_of(one.path, one.kind): _value(one.parts, one.tags) for one in request.changes}
+    contents = {revision_content(one.kind, one.parts) for one in request.changes if one.parts is not None}
+    _require_all(contents - revisions_with(tx, project_row.id, contents).keys())
+    store = StoredChunks(tx)
+    before = tree_of(tx, found.id, record.parents[0]) if record.parents else build(store, ())
+    tree = change(store, before, changes)
+    if tree != record.tree:
+        raise InvalidProblem(
+            f"The changes give a version with the tree {tree}, but the commit names {record.tree}.", code="other-tree"
+        )
+    return PreparedReceipt(record, len(Tree(store, tree)), store.new)
+
+
+def _value(parts: Mapping[str, str] | None, tags: Iterable[str]) -> Value | None:
+    return None if parts is None else {"parts": dict(parts), "tags": sorted(tags)}
+
+
+def record_receipt(
+    tx: Transaction, project: str, name: str, request: ReceivedCommit, prepared: PreparedReceipt
+) -> Commit:
+    """Record a commit from elsewhere; recording it again has no effect.
+
+    If the request names a branch without commits, it begins at the commit. Raises `ConflictProblem` if the branch has
+    commits, and the errors of `require_move`.
+    """
+    project_row = projects.require(tx, project)
+    found = find_dataset(tx, project_row, name)
+    digest = prepared.record.digest
+    if not _is_known(tx, found, digest):
+        _require_parents(tx, found, prepared.record)
+        store_chunks(tx, prepared.chunks)
+        insert_commit(tx, found.id, prepared.record, entries=prepared.entries)
+        tx.emit("commit.received", found.id, project_id=project_row.id, commit=digest)
+    if request.begins is not None:
+        _begin(tx, project_row, found, request.begins, digest)
+    return read_commit(tx, project, name, digest)
+
+
+def _begin(tx: Transaction, project_row: ProjectRow, found: Row[Any], branch: str, digest: str) -> None:
+    head = head_of(tx, found.id, branch, None)
+    if head == digest:
+        return
+    mover = Mover(author_of(tx), project_row.role)
+    move_branch_to(tx, PreparedCommit(found.id, branch, None, (), "", None), digest, mover)
+    tx.emit("branch.moved", found.id, project_id=project_row.id, branch=branch, commit=digest)
+
+
+def _is_known(tx: Transaction, found: Row[Any], digest: str) -> bool:
+    return bool(_known(tx, found, [digest]))
+
+
+def _require_parents(tx: Transaction, found: Row[Any], record: CommitRecord) -> None:
+    if missing := sorted(set(record.parents) - _known(tx, found, record.parents)):
+        raise ConflictProblem(
+            f"The dataset does not have the parent {missing[0]} of the commit; send it first.",
+            code="missing-parents",
+            context={"commits": missing},
+        )
+
+
+def _known(tx: Transaction, found: Row[Any], digests: Sequence[str]) -> set[str]:
+    """Return those of `digests` that are commits of a dataset."""
+    of_dataset = (dataset_commit.c.dataset_id == found.id, dataset_commit.c.digest.in_(digests))
+    return set(tx.execute(select(dataset_commit.c.digest).where(*of_dataset)).scalars())
+
+
+def _require_all(missing: Iterable[str]) -> None:
+    """Raise `ConflictProblem` if revisions are missing."""
+    if lacking := sorted(missing):
+        raise ConflictProblem(
+            f"The project lacks {counted(len(lacking), 'revision')} that the request refers to; send them first.",
+            code=MISSING_CONTENTS,
+            context={"contents": lacking[:1000]},
+        )

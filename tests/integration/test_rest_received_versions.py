@@ -1,0 +1,178 @@
+"""Versions from elsewhere over HTTP: revisions and commits keep their digests, or are refused and change nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from marey_schemas.encoding.canonical import document_digest
+from marey_server.store.database.connections import Database
+from marey_server.store.fsck import check_store
+from marey_versions.records import CommitRecord, key_of, revision_content
+from marey_versions.tree.building import build
+from marey_versions.tree.chunks import ChunksInMemory
+
+LAB = "/projects/lab"
+GAITS = f"{LAB}/datasets/gaits"
+POSES = np.array([[0, 1, 0, 1, 0, 0, 0]], dtype=np.float32)
+AT = "2020-01-02T03:04:05.000006Z"
+
+
+def ok(response: httpx.Response, status: int = 200) -> Any:
+    assert response.status_code == status, response.text
+    return response.json()
+
+
+def refused(response: httpx.Response, status: int, code: str) -> Any:
+    assert (response.status_code, response.json().get("code")) == (status, code), response.text
+    return response.json()
+
+
+def hierarchy(joint: str) -> dict[str, Any]:
+    return {"schema": "marey/skeleton@1", "joints": [{"name": joint, "parent": -1, "offset": [0, 1, 0]}]}
+
+
+def skeleton(joint: str, path: str | None = "rig") -> dict[str, Any]:
+    """A received skeleton with one joint."""
+    content = revision_content("skeleton", {"hierarchy": document_digest(hierarchy(joint))})
+    return {"content": content, "kind": "skeleton", "path": path, "parts": {"hierarchy": hierarchy(joint)}}
+
+
+def clip(joint: str, used: str) -> dict[str, Any]:
+    """A received clip with one frame, on the skeleton with this content."""
+    motion: dict[str, Any] = {
+        "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": [joint], "skeleton": {"content": used},
+        "poses": {"dtype": "<f4", "shape": [1, 7], "data": POSES.tolist()},
+    }  # fmt: skip
+    content = revision_content("clip", {"motion": document_digest({**motion, "poses": POSES})})
+    return {"content": content, "kind": "clip", "path": "walk", "parts": {"motion": motion}}
+
+
+def parts_of(one: dict[str, Any]) -> dict[str, str]:
+    return {part: document_digest(tree) for part, tree in one["parts"].items()}
+
+
+def commit(entries: dict[str, dict[str, Any]], *parents: str, before: dict[str, dict[str, Any]] | None = None) -> Any:
+    """A received commit whose version has these entries, given by path; its first parent has those of `before`."""
+    before = before or {}
+    values = {key_of(path, one["kind"]): {"parts": parts_of(one), "tags": []} for path, one in entries.items()}
+    tree = build(ChunksInMemory(), sorted(values.items()))
+    record = CommitRecord(tree, parents, "somebody elsewhere", "Their work", AT)
+    changes: list[dict[str, Any]] = [
+        {"path": path, "kind": one["kind"], "parts": parts_of(one)}
+        for path, one in entries.items()
+        if before.get(path) != one
+    ]
+    changes += [{"path": path, "kind": before[path]["kind"], "parts": None} for path in before.keys() - entries.keys()]
+    body = {"tree": tree, "parents": parents, "author": record.author, "message": record.message, "at": AT}
+    return {**body, "changes": changes}, record.digest
+
+
+@pytest.fixture
+def client(owner: httpx.Client) -> httpx.Client:
+    """The owner of `lab`, which has the dataset `gaits` without commits."""
+    ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)
+    return owner
+
+
+def send(client: httpx.Client, *revisions: dict[str, Any]) -> Any:
+    return ok(client.post(f"{GAITS}/contents", json={"revisions": revisions}))
+
+
+def receive(client: httpx.Client, body: Any, **more: Any) -> Any:
+    return ok(client.post(f"{GAITS}/received-commits", json={**body, **more}), 201)
+
+
+def items_of(client: httpx.Client, kind: str = "skeletons") -> list[str]:
+    return [f"{one['collection']}/{one['name']}" for one in ok(client.get(f"{LAB}/{kind}"))["items"]]
+
+
+def test_commits_from_elsewhere_keep_digest_author_and_time(client: httpx.Client) -> None:
+    one, two = skeleton("Hips"), skeleton("Root")
+    assert send(client, one, two) == {"added": 2}
+    assert send(client, one, two) == {"added": 0}
+    assert items_of(client) == []
+    first, digest = commit({"a/rig": one})
+    assert receive(client, first)["digest"] == digest
+    second, newest = commit({"a/rig": two, "b": one}, digest, before={"a/rig": one})
+    made = receive(client, second, begins="main")
+    assert (made["digest"], made["author"], made["at"]) == (newest, "somebody elsewhere", "2020-01-02T03:04:05.000006Z")
+    assert receive(client, second, begins="main") == made
+    assert [one["digest"] for one in ok(client.get(f"{GAITS}/commits"))["items"]] == [newest, digest]
+    assert [one["path"] for one in ok(client.get(f"{GAITS}/entries"))["items"]] == ["a/rig", "b"]
+    ok(client.post(f"{GAITS}/checkout", json={"version": "main"}))
+    assert sorted(items_of(client)) == ["gaits/a/rig", "gaits/b"]
+
+
+def test_a_revision_that_is_no_entry_gets_an_item_that_stays(client: httpx.Client) -> None:
+    used = skeleton("Hips", path=None)
+    send(client, used)
+    (name,) = items_of(client)
+    assert name.startswith("imported/skeletons/skeleton ")
+
+
+def test_a_part_that_the_project_has_is_taken_from_there(client: httpx.Client) -> None:
+    one = skeleton("Hips")
+    send(client, one)
+    mapping = {"schema": "marey/skeleton-mapping@1", "joints": {"Hips": "hips"}}
+    digests = {"hierarchy": document_digest(hierarchy("Hips")), "mapping": document_digest(mapping)}
+    parts = {"hierarchy": {"content": one["content"]}, "mapping": mapping}
+    two = {"content": revision_content("skeleton", digests), "kind": "skeleton", "path": "rig", "parts": parts}
+    assert send(client, two) == {"added": 1}
+    absent = {**two, "content": "sha256:" + "1" * 64, "parts": {"mapping": {"content": one["content"]}}}
+    refused(client.post(f"{GAITS}/contents", json={"revisions": [absent]}), 422, "no-part")
+
+
+def test_what_is_not_what_it_says_is_refused_and_changes_nothing(client: httpx.Client, database: Database) -> None:
+    one, two = skeleton("Hips"), skeleton("Root")
+    send(client, one)
+    forged = {**two, "content": "sha256:" + "1" * 64}
+    refused(client.post(f"{GAITS}/contents", json={"revisions": [two, forged]}), 422, "other-content")
+    unknown = clip("Hips", "sha256:" + "2" * 64)
+    told = refused(client.post(f"{GAITS}/contents", json={"revisions": [unknown]}), 409, "missing-contents")
+    assert told["context"]["contents"] == ["sha256:" + "2" * 64]
+    body, digest = commit({"a": one})
+    other, _ = commit({"a": two})
+    url = f"{GAITS}/received-commits"
+    told = refused(client.post(url, json=other), 409, "missing-contents")
+    assert told["context"]["contents"] == [two["content"]]
+    refused(client.post(url, json={**body, "tree": other["tree"]}), 422, "other-tree")
+    refused(client.post(url, json={**body, "parents": ["sha256:" + "3" * 64]}), 409, "missing-parents")
+    refused(client.post(url, json={**body, "at": "yesterday"}), 422, "invalid-body")
+    refused(client.post(url, json={**body, "begins": "nowhere"}), 404, "no-version")
+    refused(client.get(f"{GAITS}/commits/{digest}"), 404, "no-version")
+    assert items_of(client) == []
+    assert not list(check_store(database))
+
+
+def test_a_branch_with_commits_does_not_begin_elsewhere(client: httpx.Client) -> None:
+    one = skeleton("Hips")
+    send(client, one)
+    first, digest = commit({"a": one})
+    receive(client, first, begins="main")
+    second, _ = commit({"a": one, "b": one})
+    refused(client.post(f"{GAITS}/received-commits", json={**second, "begins": "main"}), 409, "branch-moved")
+    assert ok(client.get(f"{GAITS}/commits/main"))["digest"] == digest
+
+
+def test_a_clip_refers_to_the_skeleton_of_this_project(client: httpx.Client) -> None:
+    used = skeleton("Hips")
+    walk = clip("Hips", used["content"])
+    send(client, used)
+    assert send(client, walk) == {"added": 1}
+    body, _ = commit({"rig": used})
+    motion = {"motion": document_digest({**walk["parts"]["motion"], "poses": POSES})}
+    values = {
+        key_of("rig", "skeleton"): {"parts": parts_of(used), "tags": []},
+        key_of("walk", "clip"): {"parts": motion, "tags": []},
+    }
+    tree = build(ChunksInMemory(), sorted(values.items()))
+    changes = [*body["changes"], {"path": "walk", "kind": "clip", "parts": motion}]
+    receive(client, {**body, "tree": tree, "changes": changes}, begins="main")
+    ok(client.post(f"{GAITS}/checkout", json={"version": "main"}))
+    ((found,), (rig,)) = (ok(client.get(f"{LAB}/{kind}"))["items"] for kind in ("clips", "skeletons"))
+    read = ok(client.get(f"{LAB}/clips/{found['id']}/parts/motion"))
+    assert read["skeleton"] == {"item": rig["id"], "revision": 1}
