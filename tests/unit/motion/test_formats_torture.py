@@ -30,7 +30,7 @@ CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
 @pytest.mark.parametrize(
     ("make", "outcome"),
     [
-        (big.short_lines, f"read {big.SIZE // 18}"),
+        pytest.param(big.short_lines, f"read {big.SIZE // 18}", marks=pytest.mark.slow),
         pytest.param(big.long_numbers, f"read {big.SIZE // 207}", marks=pytest.mark.slow),
         (big.endless_hierarchy, "format-limit"),
         (big.one_line, "frame-width"),

@@ -60,6 +60,7 @@ def test_the_same_model_gives_the_same_bytes(subject: ModelSubject, figures: Map
     }
 
 
+@pytest.mark.slow
 def test_threads_draw_the_same_figures_at_once(subject: ModelSubject, figures: Mapping[str, DrawnFigure]) -> None:
     with ThreadPoolExecutor(3) as pool:
         drawn = list(pool.map(lambda _: draw_alignment_figures(subject.examples), range(3)))

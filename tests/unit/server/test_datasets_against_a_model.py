@@ -380,7 +380,7 @@ def move_whatever_the_head_is(patch: pytest.MonkeyPatch) -> None:
         which = (dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch)
         tx.execute(update(dataset_ref).where(*which).values(digest=digest))
 
-    patch.setattr(committing, "_move_branch", move)
+    patch.setattr(committing, "move_branch_to", move)
 
 
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
