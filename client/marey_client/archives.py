@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from marey_client.blobs import Blobs
-from marey_client.errors import UnexpectedAnswer
+from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
 from marey_schemas.datasets.commits import Commit, Entry
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
@@ -19,7 +20,7 @@ from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.canonical import canonical_json, detach_arrays
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_versions.archive.checking import check_archive
-from marey_versions.archive.members import ArchiveMember, MemberKind
+from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
 from marey_versions.records import TIME_OF_COMMIT, CommitRecord, contents_in, revision_content
@@ -66,24 +67,44 @@ class DatasetReader(Protocol):
         """Return the entries that differ in two versions."""
 
 
-def write_archive(dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress) -> Commit:
-    """Write an archive of a version, and check it.
+def write_archive(
+    dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress, *, since: str | None = None
+) -> Commit:
+    """Write an archive of a version, and check it. With `since`, leave out this version and all before it.
 
-    An attempt that was interrupted leaves a file whose name ends in `.part`; the next attempt continues it.
+    An attempt that was interrupted leaves a file whose name ends in `.part`; the next attempt continues it. Raises
+    `ArchiveInUse` if another process writes it, and `NothingToArchive`.
     """
     head = dataset.at(version)
-    part = path.with_name(f"{path.name}.part")
+    base = None if since is None else dataset.at(since)
+    digits = (one.digest.removeprefix("sha256:")[:12] for one in (head, base) if one is not None)
+    part = path.with_name(f"{path.name}.{'-'.join(digits)}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
     with (
         os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
         tempfile.TemporaryDirectory(dir=part.parent) as folder,
     ):
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head)
-        check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
+        _lock(file, part)
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head, base)
+        try:
+            check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
+        except BadArchive as error:
+            part.unlink()
+            raise UnexpectedAnswer(
+                f"the archive was damaged while it was written; repeat the command: {error}"
+            ) from error
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
     return head
+
+
+def _lock(file: BinaryIO, path: Path) -> None:
+    """Keep other processes from writing the file until it is closed."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise ArchiveInUse(f"another process is writing {path}; wait until it ends") from error
 
 
 @dataclass
@@ -99,20 +120,26 @@ class _Making:
     """Content digests of the revisions that the archive has, or will have."""
     documents: dict[str, PartOfContent] = field(default_factory=dict)
     """Where the server has each document of an entry."""
+    earlier: dict[str, PartOfContent] = field(default_factory=dict)
+    """Where the server has the document that was replaced by one of `documents`."""
 
-    def run(self, head: Commit) -> None:
-        commits = self._history(head)
+    def run(self, head: Commit, base: Commit | None) -> None:
+        before = {} if base is None else self._history(base, {})
+        commits = [one for one in self._history(head, before).values() if one.digest not in before]
+        if not commits:
+            raise NothingToArchive(f"there is nothing to archive: {head.digest} is not after the version to leave out")
         for done, commit in enumerate(commits):
             self.on_progress("reading versions", done, len(commits))
-            self._add_commit(commit)
+            self._add_commit(commit, unchanged=base is not None)
         self._add_documents(self.documents)
-        self.writer.finish(self.dataset.name, head.digest)
+        parents = {parent for commit in commits for parent in commit.parents}
+        self.writer.finish(self.dataset.name, head.digest, sorted(parents & before.keys()))
 
     # -- versions ------------------------------------------------------------------------------------------------------
 
-    def _history(self, head: Commit) -> list[Commit]:
-        """Return a commit and all before it."""
-        found: dict[str, Commit] = {}
+    def _history(self, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
+        """Return a commit, those before it, and the `known` ones, at which the search ends."""
+        found = dict(known)
         waiting = [head.digest]
         while waiting:
             start = waiting.pop()
@@ -123,39 +150,56 @@ class _Making:
                     break
                 found[commit.digest] = commit
                 waiting += commit.parents[1:]
-        return list(found.values())
+        return found
 
-    def _add_commit(self, commit: Commit) -> None:
-        """Add a commit and its changes, and note the revisions of its entries."""
+    def _add_commit(self, commit: Commit, *, unchanged: bool) -> None:
+        """Add a commit and its changes, and note the revisions of its entries.
+
+        With `unchanged`, leave out the documents that an entry had in the first parent already.
+        """
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
             raise UnexpectedAnswer(f"the server's commit {commit.digest} has another content than its digest says")
         changes = self._changes(commit)
-        for one in changes.values():
-            if one is not None:
-                content = revision_content(one.kind.value, one.parts)
-                self.known.add(content)
-                for part, digest in one.parts.items():
-                    self.documents.setdefault(digest, PartOfContent(content=content, part=part))
-        lines = [canonical_json(_line(key, changes[key])) + b"\n" for key in sorted(changes)]
+        lines = []
+        for place, change in sorted(changes.items()):
+            earlier = change.before if unchanged else None
+            line = _line(place, change.after, {} if earlier is None else change.unchanged)
+            lines.append(canonical_json(line) + b"\n")
+            if change.after is not None:
+                self._note(change.after, earlier)
         self.writer.add(ArchiveMember(MemberKind.CHANGES, commit.digest), b"".join(lines))
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
-    def _changes(self, commit: Commit) -> dict[tuple[str, str], Entry | None]:
-        """Return the entries that differ between a commit and its first parent; None for one that it removed."""
+    def _note(self, entry: Entry, earlier: Entry | None) -> None:
+        """Note the revision of an entry, and where its documents are; those of the `earlier` entry are not needed."""
+        content = _content(entry)
+        self.known.add(content)
+        for part, digest in entry.parts.items():
+            before = None if earlier is None else earlier.parts.get(part)
+            if digest != before:
+                self.documents.setdefault(digest, PartOfContent(content=content, part=part))
+            if earlier is not None and before not in (None, digest):
+                self.earlier[digest] = PartOfContent(content=_content(earlier), part=part)
+
+    def _changes(self, commit: Commit) -> dict[tuple[str, str], _EntryPair]:
+        """Return the entries that differ between a commit and its first parent, by path and kind."""
         if not commit.parents:
-            return {_place(one): one for one in self.dataset.entries(commit.digest)}
+            return {_place(one): _EntryPair(one, None) for one in self.dataset.entries(commit.digest)}
         found = self.dataset.difference(commit.parents[0], commit.digest, limit=MOST_LISTED)
         if found.complete:
-            gone = {_place(one.before): None for one in found.entries if one.before is not None}
-            return {**gone, **{_place(one.after): one.after for one in found.entries if one.after is not None}}
+            gone = {_place(one.before): _EntryPair(None, None) for one in found.entries if one.before is not None}
+            now = {
+                _place(one.after): _EntryPair(one.after, one.before) for one in found.entries if one.after is not None
+            }
+            return {**gone, **now}
         before, after = (
             {_place(one): one for one in self.dataset.entries(version)}
             for version in (commit.parents[0], commit.digest)
         )
-        changed = {place: one for place, one in after.items() if _line(place, before.get(place)) != _line(place, one)}
-        return {**dict.fromkeys(before.keys() - after.keys()), **changed}
+        both = {place: _EntryPair(after.get(place), before.get(place)) for place in before.keys() | after.keys()}
+        return {place: one for place, one in both.items() if _line(place, one.before) != _line(place, one.after)}
 
     # -- content -------------------------------------------------------------------------------------------------------
 
@@ -184,9 +228,17 @@ class _Making:
             data = canonical_json(body)
             if digest_of(data) != digest:
                 raise UnexpectedAnswer(f"the server's document {digest} has another content than its digest says")
-            for file in set(references_of(str(body.get("schema")), body)[1].values()):
+            for file in self._files(digest, body):
                 self._add_file(ArchiveMember(MemberKind.FILE, file))
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
+
+    def _files(self, digest: str, body: Any) -> set[str]:
+        """Return the digests of the files that a document names, and the document of the earlier version does not."""
+        named = _files_in(body)
+        if named and digest in self.earlier:
+            (before,) = self._fetch([self.earlier[digest]])
+            named -= _files_in(before)
+        return named
 
     def _add_revisions(self, contents: Iterable[str]) -> None:
         """Add revisions that documents refer to, with their documents; they need not be entries."""
@@ -227,13 +279,37 @@ class _Making:
         return answer
 
 
+class _EntryPair(NamedTuple):
+    """Entry before and after a commit; None if it does not exist."""
+
+    after: Entry | None
+    before: Entry | None
+
+    @property
+    def unchanged(self) -> dict[str, str]:
+        """The parts that the commit did not change, with the content digest of the revision before."""
+        if self.after is None or self.before is None:
+            return {}
+        parts = self.after.parts.items() & self.before.parts.items()
+        return {part: _content(self.before) for part, _ in parts}
+
+
+def _files_in(document: Mapping[str, Any]) -> set[str]:
+    return set(references_of(str(document.get("schema")), document)[1].values())
+
+
+def _content(entry: Entry) -> str:
+    return revision_content(entry.kind.value, entry.parts)
+
+
 def _place(entry: Entry) -> tuple[str, str]:
     return entry.path, entry.kind.value
 
 
-def _line(place: tuple[str, str], entry: Entry | None) -> dict[str, Any]:
+def _line(place: tuple[str, str], entry: Entry | None, unchanged: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Return the line of a list of changes that says what an entry is now."""
     path, kind = place
     if entry is None:
         return {"path": path, "kind": kind, "removed": True}
-    return {"path": path, "kind": kind, "parts": entry.parts, "tags": sorted(entry.tags)}
+    line = {"path": path, "kind": kind, "parts": entry.parts, "tags": sorted(entry.tags)}
+    return {**line, "unchanged": dict(unchanged)} if unchanged else line

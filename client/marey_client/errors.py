@@ -45,6 +45,18 @@ class DigestMismatch(MareyError):
     """The received bytes do not have the requested digest."""
 
 
+class ArchiveInUse(MareyError):
+    """Another process is writing the archive."""
+
+
+class EarlierVersionsMissing(MareyError):
+    """The archive builds on a version that the dataset does not have."""
+
+
+class NothingToArchive(MareyError):
+    """The version that an archive leaves out has all commits of the version that it was to contain."""
+
+
 class FileChanged(MareyError):
     """A file changed while it was being sent."""
 

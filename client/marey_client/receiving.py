@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from marey_client.blobs import Blobs
-from marey_client.errors import NotFound
+from marey_client.errors import EarlierVersionsMissing, NotFound
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, ReceivedChange, ReceivedCommit
@@ -19,9 +19,8 @@ from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_schemas.kinds import Kind
 from marey_schemas.sizes import MIB
 from marey_versions.archive.members import ArchiveMember, MemberKind
-from marey_versions.archive.reading import Archive
+from marey_versions.archive.reading import Archive, EntryChange
 from marey_versions.records import CommitRecord, contents_in, path_and_kind, revision_content
-from marey_versions.tree.chunks import Value
 
 MOST_BYTES_SENT = 16 * MIB
 """Size of the documents from which on a request contains no further revision."""
@@ -60,6 +59,16 @@ def send_versions(
     return _Import(dataset, archive, on_progress).run(begins)
 
 
+def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
+    """Raise `EarlierVersionsMissing` if the archive builds on a commit for which `has` returns False."""
+    for commit in archive.manifest.base:
+        if not has(commit):
+            raise EarlierVersionsMissing(
+                f"the archive has only the versions after {commit}, which the dataset does not have; import an archive "
+                "with this version first"
+            )
+
+
 class _Revision(NamedTuple):
     """Revision in an archive, with the path of an entry that has it, if there is one."""
 
@@ -83,6 +92,7 @@ class _Import:
     """For the content digest of a document, the content digest of a revision with this document."""
 
     def run(self, begins: str | None) -> Commit:
+        require_base(self.archive, self._has)
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
         known = self._known(history)
@@ -113,12 +123,13 @@ class _Import:
         except NotFound:
             return False
 
-    def _put(self, changes: Mapping[str, Value | None]) -> list[str]:
+    def _put(self, changes: Mapping[str, EntryChange]) -> list[str]:
         """Return the content digests of the entries that were added or changed, and note their revisions."""
         found = []
-        for key, value in changes.items():
+        for key, (value, unchanged) in changes.items():
             if value is not None:
                 path, kind = path_and_kind(key)
+                self.homes.update({value["parts"][part]: content for part, content in unchanged.items()})
                 found.append(revision_content(kind, value["parts"]))
                 self.revisions.setdefault(found[-1], _Revision(kind, value["parts"], path))
         return found
@@ -128,7 +139,7 @@ class _Import:
     def _ensure(self, contents: Iterable[str]) -> None:
         """Send the revisions that the project lacks, each after those that it refers to."""
         missing = self._missing(sorted(set(contents) - self.held))
-        documents = (digest for one in missing for digest in self._revision(one).parts.values())
+        documents = {digest for one in missing for digest in self._revision(one).parts.values()} - self.homes.keys()
         referred = {content for digest in documents for content in contents_in(self._document(digest))}
         if further := referred - self.held - set(missing):
             self._ensure(further)
@@ -211,22 +222,22 @@ class _Import:
 
     # -- commits -------------------------------------------------------------------------------------------------------
 
-    def _send_commit(self, record: CommitRecord, changes: Mapping[str, Value | None], begins: str | None) -> None:
+    def _send_commit(self, record: CommitRecord, changes: Mapping[str, EntryChange], begins: str | None) -> None:
         request = ReceivedCommit(
             tree=record.tree,
             parents=record.parents,
             author=record.author,
             message=record.message,
             at=record.at,
-            changes=tuple(_change(key, value) for key, value in changes.items()),
+            changes=tuple(_received(key, change) for key, change in changes.items()),
             begins=begins,
         )
         url = f"{self.dataset.url}/received-commits"
         read_model(Commit, self.dataset.transport.send("POST", url, content=as_json(request)))
 
 
-def _change(key: str, value: Value | None) -> ReceivedChange:
+def _received(key: str, change: EntryChange) -> ReceivedChange:
     path, kind = path_and_kind(key)
-    if value is None:
+    if change.value is None:
         return ReceivedChange(path=path, kind=Kind(kind), parts=None)
-    return ReceivedChange(path=path, kind=Kind(kind), parts=value["parts"], tags=tuple(value["tags"]))
+    return ReceivedChange(path=path, kind=Kind(kind), parts=change.value["parts"], tags=tuple(change.value["tags"]))

@@ -67,8 +67,10 @@ class Datasets:
         commits that the version follows; it is created if it does not exist. If it has other commits, it does not move:
         merge the version. No folder changes.
 
-        Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing.
+        Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
+        `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.
         """
+        from marey_client.receiving import require_base
         from marey_versions.archive.checking import check_archive
         from marey_versions.archive.reading import Archive
 
@@ -79,6 +81,7 @@ class Datasets:
             try:
                 handle.read()
             except NotFound:
+                require_base(archive, lambda _commit: False)
                 handle = self.create(name, collection=name)
             return handle.receive(archive, into=into, on_progress=on_progress)
 
@@ -251,15 +254,23 @@ class DatasetHandle:
         request = CheckoutRequest(version=version, discard=discard)
         return self.transport.post(CheckoutAnswer, f"{self.url}/checkout", request, repeatable=False)
 
-    def archive(self, path: str | Path, version: str = MAIN, *, on_progress: OnProgress = _silent) -> Commit:
+    def archive(
+        self,
+        path: str | Path,
+        version: str = MAIN,
+        *,
+        since: str | None = None,
+        on_progress: OnProgress = _silent,
+    ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
         The file is complete and checked, or else it does not exist; an attempt that was interrupted is continued by the
-        next one. Return the commit of the version.
+        next one. With `since`, leave out this version and all before it; such an archive can be imported where that
+        version is. Return the commit of the version. Raises `NothingToArchive`.
         """
         from marey_client.archives import write_archive
 
-        return write_archive(self, version, Path(path), on_progress)
+        return write_archive(self, version, Path(path), on_progress, since=since)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
         """Record the versions of an archive that was checked; `Datasets.import_archive` describes the rest."""

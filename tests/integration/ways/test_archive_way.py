@@ -6,7 +6,7 @@ import json
 import re
 import shlex
 import tarfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,15 @@ def project(lab_of: Callable[..., ProjectHandle], run: CommandLine, tmp_path: Pa
     gaits.commit("Drop the fall")
     gaits.create_tag("v1")
     return made
+
+
+@pytest.fixture
+def away(project: ProjectHandle, run: CommandLine) -> Iterator[ProjectHandle]:
+    """An empty project, which is deleted after the test."""
+    run("project", "create", "away")
+    made = other_project(project, "away")
+    yield made
+    made.delete()
 
 
 def clip(project: ProjectHandle, name: str) -> ClipHandle:
@@ -95,13 +104,11 @@ def other_project(project: ProjectHandle, name: str) -> ProjectHandle:
 
 
 def test_an_import_continues_and_sends_what_is_missing_only(
-    run: CommandLine, project: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+    run: CommandLine, project: ProjectHandle, away: ProjectHandle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second = run.folder / "first.tar", run.folder / "second.tar"
     gaits_of(project).archive(first, "main~1")
     gaits_of(project).archive(second)
-    run("project", "create", "away")
-    away = other_project(project, "away")
     copy = away.datasets.create("gaits", collection="gaits")
     once = receiving._Import._send_commit
 
@@ -126,14 +133,35 @@ def test_an_import_continues_and_sends_what_is_missing_only(
     monkeypatch.setattr(receiving._Import, "_send", count)
     assert away.datasets.import_archive(second, "gaits") == (gaits_of(project).at(), "main")
     assert sent == []  # the newest version only drops a clip
-    away.delete()
 
 
-def test_a_branch_with_other_versions_does_not_move_and_is_merged(run: CommandLine, project: ProjectHandle) -> None:
+def test_an_archive_of_later_versions_is_small_and_imported_where_the_earlier_ones_are(
+    run: CommandLine, project: ProjectHandle, away: ProjectHandle
+) -> None:
+    whole, later = run.folder / "whole.tar", run.folder / "later.tar"
+    gaits_of(project).archive(whole, "v1")
+    walk = clip(project, "walk")
+    walk.put_info(walk.info().model_copy(update={"comment": "later"}))
+    head = gaits_of(project).commit("Describe the walk again")
+    run("archive", "create", "lab/gaits", later, "--since", "v1")
+    told = run("archive", "verify", later).stdout
+    assert f"without   {gaits_of(project).at('v1').digest}" in told
+    assert later.stat().st_size < 20_000
+    assert "only the versions after" in run("archive", "import", later, "away/gaits", status=1).stderr
+    run("archive", "import", whole, "away/gaits")
+    run("archive", "import", later, "away/gaits")
+    assert gaits_of(away).at() == head
+    gaits_of(away).check_out()
+    assert clip(away, "walk").info().comment == "later"
+    assert np.array_equal(clip(away, "walk").motion().poses, clip(project, "walk").motion().poses)
+    assert "nothing to archive" in run("archive", "create", "lab/gaits@v1", later, "--since", "main", status=1).stderr
+
+
+def test_a_branch_with_other_versions_does_not_move_and_is_merged(
+    run: CommandLine, project: ProjectHandle, away: ProjectHandle
+) -> None:
     file = run.folder / "gaits.tar"
     gaits_of(project).archive(file, "main~1")
-    run("project", "create", "away")
-    away = other_project(project, "away")
     run("archive", "import", file, "away/gaits")
     copy = gaits_of(away)
     copy.check_out()
@@ -148,7 +176,6 @@ def test_a_branch_with_other_versions_does_not_move_and_is_merged(run: CommandLi
     copy.check_out()
     assert {one.name for one in away.clips.list()} == {"walk", "turn"}
     assert clip(away, "turn").info().comment == "ours"
-    away.delete()
 
 
 def test_an_archive_is_continued_where_an_attempt_ended(
@@ -187,7 +214,9 @@ def test_versions_that_differ_in_many_entries_are_listed_whole(
     assert (run.folder / "one.tar").read_bytes() == (run.folder / "other.tar").read_bytes()
 
 
-def test_a_changed_archive_is_refused_with_the_member(run: CommandLine, project: ProjectHandle) -> None:
+def test_a_changed_archive_is_refused_with_the_member(
+    run: CommandLine, project: ProjectHandle, away: ProjectHandle
+) -> None:
     file = run.folder / "gaits.tar"
     project.datasets.at("gaits").archive(file)
     with tarfile.open(file) as tar:
@@ -195,11 +224,9 @@ def test_a_changed_archive_is_refused_with_the_member(run: CommandLine, project:
     data = bytearray(file.read_bytes())
     data[header.offset_data + 2] ^= 1
     file.write_bytes(data)
-    run("project", "create", "away")
     told = run("archive", "import", file, "away/gaits", status=1)
     assert header.name in told.stderr
-    assert not list(other_project(project, "away").datasets.list())
-    other_project(project, "away").delete()
+    assert not list(away.datasets.list())
     for command in ("verify", "extract"):
         told = run("archive", command, file, status=1)
         assert told.stderr.startswith(f"{file}: ")

@@ -60,12 +60,12 @@ class Example:
         self.head = record.digest
         return record.digest
 
-    def write(self, file: io.BytesIO | None = None) -> io.BytesIO:
+    def write(self, file: io.BytesIO | None = None, base: tuple[str, ...] = ()) -> io.BytesIO:
         file = file or io.BytesIO()
         writer = ArchiveWriter(file)
         for member, data in self.members.items():
             writer.add(member, data)
-        writer.finish("gaits", self.head)
+        writer.finish("gaits", self.head, base)
         return file
 
 
@@ -111,6 +111,41 @@ def test_an_archive_gives_back_versions_documents_arrays_and_files() -> None:
     assert np.array_equal(archive.array(motion["poses"]["content"]).decode(), POSES)
     info = archive.tree(MemberKind.DOCUMENT, entry.parts["info"])
     assert b"".join(archive.file(info["source"]["file"])) == ORIGINAL
+
+
+def later_part() -> tuple[Example, dict[str, Any]]:
+    """An archive of the second version alone, in which the entry keeps a part, and the line of its change."""
+    whole = example()
+    made = Example(head=whole.head)
+    line = put("a/walk", {"motion": digest_of(b"motion"), "info": made.document({"schema": "marey/clip-info@1"})})
+    line["unchanged"] = {"motion": digest_of(b"revision before")}
+    made.members[ArchiveMember(MemberKind.COMMIT, whole.head)] = whole.members[
+        ArchiveMember(MemberKind.COMMIT, whole.head)
+    ]
+    made.members[ArchiveMember(MemberKind.CHANGES, whole.head)] = canonical_json(line) + b"\n"
+    return made, line
+
+
+def test_an_archive_may_have_only_the_later_part_of_a_history() -> None:
+    made, line = later_part()
+    base = Archive(example().write()).history()[0][0]
+    archive = checked(made.write(base=(base,)))
+    assert [digest for digest, _ in archive.history()] == [made.head]
+    (change,) = archive.changes(made.head).values()
+    assert change.unchanged == line["unchanged"]
+    with pytest.raises(BadArchive, match=f"only the versions after {base}"):
+        archive.versions()
+    with pytest.raises(BadArchive, match="commits/"):
+        checked(made.write())
+
+
+def test_a_whole_archive_lacks_no_part() -> None:
+    made, line = later_part()
+    made.commit({key_of("a/walk", "clip"): {"parts": line["parts"], "tags": []}}, [line])
+    del made.members[next(one for one in made.members if one.kind is MemberKind.COMMIT and one.digest != made.head)]
+    del made.members[next(one for one in made.members if one.kind is MemberKind.CHANGES and one.digest != made.head)]
+    with pytest.raises(BadArchive, match="refers to an earlier archive"):
+        checked(made.write())
 
 
 def test_the_same_members_give_the_same_bytes() -> None:
@@ -210,6 +245,10 @@ def tar_of(*members: tuple[tarfile.TarInfo, bytes]) -> io.BytesIO:
     return file
 
 
+def manifest(schema: str) -> tuple[tarfile.TarInfo, bytes]:
+    return tarfile.TarInfo(MANIFEST), canonical_json({"schema": schema, "dataset": "d", "commit": "c", "base": []})
+
+
 def link() -> tarfile.TarInfo:
     header = tarfile.TarInfo(MEMBERS[0].name)
     header.type, header.linkname = tarfile.SYMTYPE, "/etc/passwd"
@@ -225,8 +264,14 @@ def link() -> tarfile.TarInfo:
         (tar_of((link(), b"")), "not a member"),
         (tar_of((tarfile.TarInfo(MEMBERS[0].name), b"1"), (tarfile.TarInfo(MEMBERS[0].name), b"1")), "two members"),
         (tar_of((tarfile.TarInfo(MANIFEST), b"[]")), "not the manifest"),
-        (tar_of((tarfile.TarInfo(MANIFEST), b'{"schema":"marey/archive@9","dataset":"d","commit":"c"}')), "update"),
-        (tar_of((tarfile.TarInfo(MANIFEST), b'{"schema":"marey/archive@1","dataset":"d","commit":"c"}')), "digest"),
+        (
+            tar_of(manifest("marey/archive@9")),
+            "update",
+        ),
+        (
+            tar_of(manifest("marey/archive@1")),
+            "digest",
+        ),
     ],
 )
 def test_a_file_that_is_no_archive_is_refused(file: io.BytesIO, message: str) -> None:

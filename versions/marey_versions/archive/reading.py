@@ -7,7 +7,7 @@ import json
 import tarfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.names import is_digest
@@ -39,6 +39,17 @@ class Manifest:
     """Name that the dataset had on its server."""
     commit: str
     """The commit that the archive was made of."""
+    base: tuple[str, ...]
+    """Commits that the archive builds on, without having them; empty if it has the whole history."""
+
+
+class EntryChange(NamedTuple):
+    """Change of an entry between a commit and its first parent."""
+
+    value: Value | None
+    """The entry now; None if the commit removed it."""
+    unchanged: Mapping[str, str]
+    """Parts whose documents the archive lacks, with the content digest of an earlier revision that has them."""
 
 
 class Archive:
@@ -110,12 +121,12 @@ class Archive:
         except ValueError as error:
             raise BadArchive(f"{ArchiveMember(MemberKind.COMMIT, digest).name}: {error}") from error
 
-    def changes(self, digest: str) -> dict[str, Value | None]:
-        """Return the entries that differ between a commit and its first parent by key; None for one that it removed."""
+    def changes(self, digest: str) -> dict[str, EntryChange]:
+        """Return the entries that differ between a commit and its first parent, by key."""
         member = ArchiveMember(MemberKind.CHANGES, digest)
         try:
             lines = [json.loads(line) for line in self._read(member).splitlines()]
-            return {key_of(str(one["path"]), str(one["kind"])): _value(one) for one in lines}
+            return {key_of(str(one["path"]), str(one["kind"])): _change(one) for one in lines}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadArchive(f"{member.name}: it is not a list of changes: {error!r}") from error
 
@@ -141,7 +152,7 @@ class Archive:
     # -- versions ------------------------------------------------------------------------------------------------------
 
     def history(self) -> list[tuple[str, CommitRecord]]:
-        """Return the commit of the manifest and all before it, each after its parents."""
+        """Return the commit of the manifest and those before it that the archive has, each after its parents."""
         records: dict[str, CommitRecord] = {}
         ordered: dict[str, None] = {}
         path = [self.manifest.commit]
@@ -151,19 +162,27 @@ class Archive:
                 ordered[path.pop()] = None
             else:
                 records[digest] = self.commit(digest)
-                path += [one for one in records[digest].parents if one not in records]
+                path += [one for one in records[digest].parents if one not in records and one not in self.manifest.base]
         return [(digest, records[digest]) for digest in ordered]
 
     def versions(self) -> Versions:
-        """Compute the entries of all versions. Raises `BadArchive` if they are not those that a commit names."""
+        """Compute the entries of all versions.
+
+        Raises `BadArchive` if they are not those that a commit names, and for an archive that has only the later part
+        of a history.
+        """
+        if self.manifest.base:
+            earlier = self.manifest.base[0]
+            raise BadArchive(f"{MANIFEST}: it has only the versions after {earlier}; import it where that one is")
         store = ChunksInMemory()
         empty = build(store, ())
         roots: dict[str, str] = {}
         for digest, record in self.history():
             before = roots[record.parents[0]] if record.parents else empty
-            name, changes = ArchiveMember(MemberKind.CHANGES, digest).name, self.changes(digest)
+            name = ArchiveMember(MemberKind.CHANGES, digest).name
+            changes = self.changes(digest)
             try:
-                root = change(store, before, changes)
+                root = change(store, before, {key: one.value for key, one in changes.items()})
             except (TypeError, ValueError) as error:
                 raise BadArchive(f"{name}: an entry is not valid: {error}") from error
             if root != record.tree:
@@ -187,20 +206,22 @@ class Versions:
 def _manifest(data: bytes) -> Manifest:
     try:
         tree = json.loads(data)
-        schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]))
+        base = tuple(map(str, tree["base"]))
+        schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]), base)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise BadArchive(f"{MANIFEST}: it is not the manifest of an archive") from error
     if schema != SCHEMA:
         raise BadArchive(f"{MANIFEST}: this version of Marey reads {SCHEMA}, not {str(schema)[:80]!r}; update it")
-    if not is_digest(manifest.commit):
-        raise BadArchive(f"{MANIFEST}: {manifest.commit[:80]!r} is not the digest of a commit")
+    for digest in (manifest.commit, *base):
+        if not is_digest(digest):
+            raise BadArchive(f"{MANIFEST}: {digest[:80]!r} is not the digest of a commit")
     return manifest
 
 
-def _value(line: Mapping[str, Any]) -> Value | None:
+def _change(line: Mapping[str, Any]) -> EntryChange:
     if line.get("removed"):
-        return None
-    parts, tags = dict(line["parts"]), list(line["tags"])
-    if not all(isinstance(one, str) for one in (*parts, *parts.values(), *tags)):
+        return EntryChange(None, {})
+    parts, tags, unchanged = dict(line["parts"]), list(line["tags"]), dict(line.get("unchanged", {}))
+    if not all(isinstance(one, str) for one in (*parts, *parts.values(), *tags, *unchanged, *unchanged.values())):
         raise ValueError("the parts and tags of an entry are texts")
-    return {"parts": parts, "tags": tags}
+    return EntryChange({"parts": parts, "tags": tags}, unchanged)

@@ -37,10 +37,16 @@ class ArchiveWriter:
         if member.name not in self._held:
             self._write(member.name, stream, size_bytes)
 
-    def finish(self, dataset: str, commit: str) -> None:
-        """Add the manifest, which says that the archive is complete, and end the file."""
+    def finish(self, dataset: str, commit: str, base: Sequence[str] = ()) -> None:
+        """Add the manifest, which says that the archive is complete, and end the file.
+
+        `base` lists the commits that the archive builds on, without having them.
+        """
         counts = Counter(name.partition("/")[0] for name in self._held)
-        manifest = {"schema": SCHEMA, "dataset": dataset, "commit": commit, "members": dict(sorted(counts.items()))}
+        manifest = {
+            "schema": SCHEMA, "dataset": dataset, "commit": commit, "base": sorted(base),
+            "members": dict(sorted(counts.items())),
+        }  # fmt: skip
         data = canonical_json(manifest)
         self._write(MANIFEST, io.BytesIO(data), len(data))
         self._tar.close()

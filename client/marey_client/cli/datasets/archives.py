@@ -40,6 +40,13 @@ def create_archive(
     context: typer.Context,
     place: VersionPlace,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, such as gaits.tar; it is replaced.")],
+    since: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VERSION",
+            help="Leave out this version and all before it; the archive can be imported where this version is.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a version, all versions before it, and everything that they contain to one file, and check it.
@@ -48,7 +55,7 @@ def create_archive(
     """
     at = parse(place, version=True)
     with connect(context) as marey, progress() as advance:
-        made = at.on(marey).archive(file, at.version, on_progress=advance)
+        made = at.on(marey).archive(file, at.version, since=since, on_progress=advance)
     if as_json:
         return print_json({"file": str(file), "commit": made.digest, "bytes": file.stat().st_size})
     size_mb = file.stat().st_size / 1e6
@@ -68,14 +75,13 @@ def verify(file: ArchivePath, as_json: AsJson = False) -> None:
 
     with _opened(file) as opened, progress() as advance:
         check_archive(opened, lambda done, total: advance("checking", done, total))
-        entries = sum(1 for _ in opened.versions().entries(opened.manifest.commit))
-        facts = {
-            "dataset": opened.manifest.dataset,
-            "versions": len(opened.history()),
-            "entries": entries,
-            "members": len(opened.members),
-            "commit": opened.manifest.commit,
-        }
+        manifest = opened.manifest
+        facts: dict[str, object] = {"dataset": manifest.dataset, "versions": len(opened.history())}
+        if manifest.base:
+            facts["without"] = ", ".join(manifest.base)
+        else:
+            facts["entries"] = sum(1 for _ in opened.versions().entries(manifest.commit))
+        facts |= {"members": len(opened.members), "commit": manifest.commit}
     print_json(facts) if as_json else print_pairs(facts.items())
 
 
