@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 from marey_client.blobs import Blobs
 from marey_client.errors import ArchiveInUse, NothingToArchive, UnexpectedAnswer
 from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
-from marey_schemas.datasets.commits import Commit, Entry
+from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent
 from marey_schemas.documents.blob_references import references_of
 from marey_schemas.encoding.arrays import EncodedArray
@@ -23,7 +23,7 @@ from marey_versions.archive.checking import check_archive
 from marey_versions.archive.members import ArchiveMember, BadArchive, MemberKind
 from marey_versions.archive.reading import Archive
 from marey_versions.archive.writing import ArchiveWriter
-from marey_versions.records import TIME_OF_COMMIT, CommitRecord, contents_in, revision_content
+from marey_versions.records import CommitRecord, contents_in, revision_content
 from marey_versions.tree.chunks import digest_of
 
 if TYPE_CHECKING:

@@ -96,7 +96,7 @@ class _Import:
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
         known = self._known(history)
-        for digest in known:
+        for digest in known & changes.keys():
             self._note(self._put(changes[digest]))
         for done, (digest, record) in enumerate(history):
             self.on_progress("sending versions", done, len(history))

@@ -141,7 +141,10 @@ def test_what_is_not_what_it_says_is_refused_and_changes_nothing(client: httpx.C
     assert told["context"]["contents"] == [two["content"]]
     refused(client.post(url, json={**body, "tree": other["tree"]}), 422, "other-tree")
     refused(client.post(url, json={**body, "parents": ["sha256:" + "3" * 64]}), 409, "missing-parents")
-    refused(client.post(url, json={**body, "at": "yesterday"}), 422, "invalid-body")
+    for at in ("yesterday", "2020-99-01T00:00:00.000000Z", "2020-1-01T00:00:00.000000Z", "2020-01-01T00:00:00.0Z"):
+        refused(client.post(url, json={**body, "at": at}), 422, "invalid-body")
+    for text in ({"author": "a\0"}, {"message": "m\0"}, {"changes": [{**body["changes"][0], "tags": ["\0"]}]}):
+        assert client.post(url, json={**body, **text}).status_code == 422
     refused(client.post(url, json={**body, "begins": "nowhere"}), 404, "no-version")
     refused(client.get(f"{GAITS}/commits/{digest}"), 404, "no-version")
     assert items_of(client) == []

@@ -18,8 +18,6 @@ from marey_schemas.names import is_digest
 from marey_versions.tree.chunks import Value, digest_of
 
 COMMIT_SCHEMA = "marey/commit@1"
-TIME_OF_COMMIT = "%Y-%m-%dT%H:%M:%S.%fZ"
-"""Format of the time of a commit, which is in UTC."""
 
 _SEPARATOR = "\t"
 """Character between path and kind in a key. Paths cannot contain it, and it sorts before every character of a path."""

@@ -15,6 +15,9 @@ from marey_schemas.names import Digest, ItemId, Message
 MOST_CHANGES = 10_000
 """Greatest number of explicit changes in one commit."""
 
+TIME_OF_COMMIT = "%Y-%m-%dT%H:%M:%S.%fZ"
+"""Format of the time of a commit, which is in UTC."""
+
 EntryPath = Annotated[
     str,
     StringConstraints(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.datasets.commits import EntryPath
+from marey_schemas.datasets.commits import TIME_OF_COMMIT, EntryPath
 from marey_schemas.datasets.naming import RefName
 from marey_schemas.kinds import Kind
 from marey_schemas.names import Digest, Message, Tag
@@ -18,6 +19,13 @@ MOST_RECEIVED_CHANGES = 200_000
 """Greatest number of entries that a commit from elsewhere may change."""
 
 PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
+
+
+def _require_time(text: str) -> str:
+    """Return the text if it is a time in the one form that digests of commits cover."""
+    if datetime.strptime(text, TIME_OF_COMMIT).strftime(TIME_OF_COMMIT) != text:  # noqa: DTZ007
+        raise ValueError("the time must be written like 2026-11-23T10:00:00.000000Z")
+    return text
 
 
 class PartOfContent(Request):
@@ -75,9 +83,11 @@ class ReceivedCommit(Request):
 
     tree: Digest
     parents: tuple[Digest, ...] = Field(max_length=2)
-    author: Annotated[str, StringConstraints(min_length=1, max_length=64)]
+    author: Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
     message: Message
-    at: Annotated[str, StringConstraints(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z$")]
+    at: Annotated[str, AfterValidator(_require_time)] = Field(
+        description="Time in UTC, such as 2026-11-23T10:00:00.000000Z."
+    )
     changes: tuple[ReceivedChange, ...] = Field(max_length=MOST_RECEIVED_CHANGES)
     begins: RefName | None = Field(
         None, description="Branch without commits that begins at this commit; null: no branch moves."

@@ -149,7 +149,8 @@ def test_an_archive_of_later_versions_is_small_and_imported_where_the_earlier_on
     assert later.stat().st_size < 20_000
     assert "only the versions after" in run("archive", "import", later, "away/gaits", status=1).stderr
     run("archive", "import", whole, "away/gaits")
-    run("archive", "import", later, "away/gaits")
+    for _ in range(2):
+        run("archive", "import", later, "away/gaits")
     assert gaits_of(away).at() == head
     gaits_of(away).check_out()
     assert clip(away, "walk").info().comment == "later"

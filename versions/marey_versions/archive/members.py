@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
+import tarfile
+from collections.abc import Iterator
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from marey_schemas.encoding.arrays import MAX_ARRAY_BYTES, ArrayError, EncodedArray
 from marey_schemas.encoding.blocks import BlockError, read_spec
@@ -68,6 +71,32 @@ class ArchiveMember(NamedTuple):
         if member is None or member.name != name:
             raise BadArchive(f"{name}: an archive has no member of this name")
         return member
+
+
+def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
+    """Read the headers of an archive, each with the position of its bytes.
+
+    Only the headers that `ArchiveWriter` writes are accepted: other kinds, such as those that contain long names, can
+    make a reader use as much memory as the file has bytes. Raises `BadArchive`, also where the file was cut off.
+    """
+    size_bytes = file.seek(0, io.SEEK_END)
+    position = 0
+    while True:
+        file.seek(position)
+        block = file.read(tarfile.BLOCKSIZE)
+        if block == bytes(tarfile.BLOCKSIZE):
+            return
+        try:
+            header = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
+        except (tarfile.TarError, ValueError) as error:
+            raise BadArchive(f"the file is no archive, or was cut off after {position:,} bytes: {error}") from error
+        if header.type != tarfile.REGTYPE or header.size < 0:
+            raise BadArchive(f"{header.name}: it is not a member of an archive")
+        header.offset_data = position + tarfile.BLOCKSIZE
+        position = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+        if position > size_bytes:
+            raise BadArchive(f"{header.name}: the archive was cut off")
+        yield header
 
 
 def canonical_tree(member: ArchiveMember, data: bytes) -> Any:

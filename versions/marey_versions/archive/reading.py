@@ -19,6 +19,7 @@ from marey_versions.archive.members import (
     BadArchive,
     MemberKind,
     canonical_tree,
+    read_headers,
     require_digest,
     stored_array,
 )
@@ -66,18 +67,13 @@ class Archive:
 
     def _read_headers(self) -> Manifest:
         manifest: Manifest | None = None
-        self._file.seek(0)
-        try:
-            with tarfile.open(fileobj=self._file, mode="r:") as tar:
-                for header in tar:
-                    if not header.isreg() or manifest is not None:
-                        raise BadArchive(f"{header.name}: it is not a member of an archive")
-                    if header.name == MANIFEST:
-                        manifest = _manifest(self._bytes(MANIFEST, header.offset_data, header.size))
-                    else:
-                        self._add(ArchiveMember.of_name(header.name), header)
-        except tarfile.TarError as error:
-            raise BadArchive(f"the file is no archive, or was cut off: {error}") from error
+        for header in read_headers(self._file):
+            if manifest is not None:
+                raise BadArchive(f"{header.name}: it comes after {MANIFEST}, which is the last member of an archive")
+            if header.name == MANIFEST:
+                manifest = _manifest(self._bytes(MANIFEST, header.offset_data, header.size))
+            else:
+                self._add(ArchiveMember.of_name(header.name), header)
         if manifest is None:
             raise BadArchive(f"the archive has no {MANIFEST}: it was not written to its end, or was cut off")
         return manifest
@@ -141,10 +137,8 @@ class Archive:
     def _bytes(self, name: str, position: int, size_bytes: int) -> bytes:
         if size_bytes > MOST_BYTES:
             raise BadArchive(f"{name}: it has {size_bytes:,} bytes; at most {MOST_BYTES:,} are read")
-        here = self._file.tell()
         self._file.seek(position)
         data = self._file.read(size_bytes)
-        self._file.seek(here)
         if len(data) < size_bytes:
             raise BadArchive(f"{name}: the archive was cut off")
         return data

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import BinaryIO
 
 from marey_schemas.encoding.canonical import canonical_json
-from marey_versions.archive.members import MANIFEST, SCHEMA, ArchiveMember
+from marey_versions.archive.members import MANIFEST, SCHEMA, ArchiveMember, BadArchive, read_headers
 
 
 class ArchiveWriter:
@@ -22,7 +22,7 @@ class ArchiveWriter:
         self._held, end = _complete_members(file)
         file.seek(end)
         file.truncate()
-        self._tar = tarfile.open(fileobj=file, mode="w:", format=tarfile.PAX_FORMAT)  # noqa: SIM115
+        self._tar = tarfile.open(fileobj=file, mode="w:", format=tarfile.GNU_FORMAT)  # noqa: SIM115
 
     def __contains__(self, member: ArchiveMember) -> bool:
         """Return whether the archive has a member already."""
@@ -60,20 +60,14 @@ class ArchiveWriter:
 
 def _complete_members(file: BinaryIO) -> tuple[set[str], int]:
     """Return the names of the members that an unfinished archive has, and the position after the last one."""
-    size_bytes = file.seek(0, io.SEEK_END)
-    file.seek(0)
-    found: list[tuple[str, int]] = []
+    names: set[str] = set()
+    end = 0
     try:
-        with tarfile.open(fileobj=file, mode="r:") as tar:
-            for header in tar:
-                end = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
-                if end > size_bytes or header.name == MANIFEST:
-                    break
-                found.append((header.name, end))
-    except tarfile.TarError:
-        pass  # the file ends within a header, or has none yet: what was found before it is complete
-    return {name for name, _ in found}, _end_of(found)
-
-
-def _end_of(found: Sequence[tuple[str, int]]) -> int:
-    return found[-1][1] if found else 0
+        for header in read_headers(file):
+            if header.name == MANIFEST:
+                break
+            names.add(header.name)
+            end = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+    except BadArchive:
+        pass  # the file ends within a member, or has none yet: what was found before it is complete
+    return names, end

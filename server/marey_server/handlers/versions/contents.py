@@ -40,7 +40,7 @@ class ReceivedContents(Resource):
     tag = "ProjectDatasets"
 
     @writes(
-        access=Access.CONTRIBUTOR,
+        access=Access.MAINTAINER,
         body=RequestBody(ReceivedRevisions, max_bytes=MAX_DOCUMENT_BYTES),
         answer=StoredRevisions,
     )
@@ -49,7 +49,7 @@ class ReceivedContents(Resource):
 
         A revision must come after those that it refers to, which are named by their content digests. The revision of
         an entry gets an item that is deleted at once; a checkout of a version with the entry restores the item. Other
-        revisions get items in the folder `imported`.
+        revisions get items in the folder `imported`. Deleted items count in no quota, so the role is maintainer.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
@@ -63,7 +63,7 @@ class ReceivedCommits(Resource):
     tag = "ProjectDatasets"
 
     @writes(
-        access=Access.CONTRIBUTOR,
+        access=Access.MAINTAINER,
         body=RequestBody(ReceivedCommit, max_bytes=MAX_RECEIVED_BYTES),
         answer=Commit,
         status=201,

@@ -12,7 +12,15 @@ from typing import Any
 
 from sqlalchemy import Row, insert, select, update
 
-from marey_schemas.datasets.commits import Commit, CommitCreate, EntryChange, MoveEntry, PutEntry, RemoveEntry
+from marey_schemas.datasets.commits import (
+    TIME_OF_COMMIT,
+    Commit,
+    CommitCreate,
+    EntryChange,
+    MoveEntry,
+    PutEntry,
+    RemoveEntry,
+)
 from marey_schemas.datasets.naming import RefKind
 from marey_schemas.wording import counted
 from marey_server import faults
@@ -28,7 +36,7 @@ from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
-from marey_versions.records import TIME_OF_COMMIT, CommitRecord, DatasetEntry, RevisionKey, key_of
+from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
 from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
