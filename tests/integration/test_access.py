@@ -128,6 +128,7 @@ def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
         "DELETE /projects/{project}/datasets/{dataset}/refs/{ref}/protection": "maintainer",
         "POST /projects/{project}/datasets/{dataset}/checkout": "maintainer",
         "POST /projects/{project}/datasets/{dataset}/contents": "maintainer",
+        "POST /projects/{project}/datasets/{dataset}/received-commits": "maintainer",
         "DELETE /projects/{project}/{kind}/{item}": "maintainer",
         "POST /projects/{project}/{kind}/{item}/restore": "maintainer",
     }
