@@ -278,6 +278,22 @@ def test_strangers_neither_see_nor_touch_jobs(server: Server, owner: httpx.Clien
     assert stranger.post("/leases", json={"worker": "w", "kinds": ["errand"]}).status_code == 403
 
 
+def test_contributors_cancel_and_retry_their_own_jobs_only(
+    server: Server, owner: httpx.Client, worker: httpx.Client
+) -> None:
+    sam = server.client(server.make_user("sam"))
+    ok(owner.put("/projects/lab/members/sam", json={"role": "contributor"}))
+    theirs, own = submit(owner), submit(sam)
+    for what in ("cancel", "retry"):
+        refused = sam.post(f"/jobs/{theirs['id']}/{what}")
+        assert (refused.status_code, refused.json()["code"]) == (403, "insufficient-role")
+        if what == "cancel":
+            ok(owner.post(f"/jobs/{theirs['id']}/cancel"))
+    ok(sam.post(f"/jobs/{own['id']}/cancel"))
+    assert ok(sam.post(f"/jobs/{own['id']}/retry"), 202)["retry_of"] == own["id"]
+    assert ok(owner.post(f"/jobs/{theirs['id']}/retry"), 202)["retry_of"] == theirs["id"]
+
+
 def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
     worker = server.make_user("worker", scopes=("work",))
     for anybody in (server.client(), server.client(worker)):

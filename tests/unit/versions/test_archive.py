@@ -164,6 +164,14 @@ def test_an_archive_that_was_cut_off_anywhere_is_refused_and_continued(length: i
     assert part.getvalue() == whole
 
 
+def test_what_an_interrupted_attempt_has_written_whole_is_not_written_again() -> None:
+    whole = example().write().getvalue()
+    members = list(example().members)
+    third = whole.index(members[2].name.encode())
+    writer = ArchiveWriter(io.BytesIO(whole[: third + 600]))
+    assert [member in writer for member in members[:3]] == [True, True, False]
+
+
 def test_a_member_that_is_there_already_is_not_written_again() -> None:
     file = io.BytesIO()
     writer = ArchiveWriter(file)
