@@ -285,3 +285,90 @@ def link() -> tarfile.TarInfo:
 def test_a_file_that_is_no_archive_is_refused(file: io.BytesIO, message: str) -> None:
     with pytest.raises(BadArchive, match=message):
         checked(file)
+
+
+def with_changes(made: Example, line: dict[str, Any]) -> None:
+    made.members[ArchiveMember(MemberKind.CHANGES, made.head)] = canonical_json(line) + b"\n"
+
+
+def with_odd_tag(made: Example) -> None:
+    with_changes(made, {**put("a", {}), "tags": [1]})
+
+
+def with_odd_commit(made: Example) -> None:
+    made.members = {ArchiveMember(MemberKind.COMMIT, digest_of(b"[]")): b"[]"}
+    made.head = digest_of(b"[]")
+
+
+def with_odd_revision(made: Example) -> None:
+    made.members[ArchiveMember(MemberKind.REVISION, digest_of(b"[]"))] = b"[]"
+    refer(made, digest_of(b"[]"))
+
+
+def with_spaces(made: Example) -> None:
+    data = b'{"schema": "marey/motion@1"}'
+    made.members[ArchiveMember(MemberKind.DOCUMENT, digest_of(data))] = data
+    made.commit({key_of("c", "clip"): {"parts": {"motion": digest_of(data)}, "tags": []}},
+                [put("c", {"motion": digest_of(data)})])  # fmt: skip
+
+
+def refer(made: Example, content: str) -> None:
+    motion = made.document({"schema": "marey/motion@1", "skeleton": {"content": content}})
+    made.commit({key_of("c", "clip"): {"parts": {"motion": motion}, "tags": []}}, [put("c", {"motion": motion})])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (with_odd_tag, "not a list of changes"),
+        (with_odd_commit, "not the document of a commit"),
+        (with_odd_revision, "does not describe a revision"),
+        (with_spaces, "not in canonical form"),
+    ],
+)
+def test_members_of_the_right_digest_and_another_form_are_refused(
+    damage: Callable[[Example], None], message: str
+) -> None:
+    made = Example() if damage in (with_odd_revision, with_spaces) else example()
+    damage(made)
+    with pytest.raises(BadArchive, match=message):
+        checked(made.write())
+
+
+def test_members_that_two_documents_share_are_read_once() -> None:
+    made = Example()
+    poses = made.array(POSES)
+    file = digest_of(ORIGINAL)
+    made.members[ArchiveMember(MemberKind.FILE, file)] = ORIGINAL
+    infos = [
+        made.document({"schema": "marey/clip-info@1", "comment": text, "source": {"file": file}, "poses": poses})
+        for text in ("a", "b")
+    ]
+    entries = {key_of(one, "clip"): {"parts": {"info": one}, "tags": []} for one in infos}
+    made.commit(entries, [put(one, {"info": one}) for one in infos])
+    assert len(checked(made.write()).members) == 6
+
+
+def test_files_of_earlier_versions_may_be_missing_from_a_later_part() -> None:
+    made = Example()
+    info = made.document({"schema": "marey/clip-info@1", "source": {"file": digest_of(ORIGINAL)}})
+    made.commit({key_of("c", "clip"): {"parts": {"info": info}, "tags": []}}, [put("c", {"info": info})], AT_BASE)
+    assert checked(made.write(base=(AT_BASE,))).manifest.base == (AT_BASE,)
+    with pytest.raises(BadArchive):
+        checked(made.write())
+
+
+AT_BASE = digest_of(b"a commit before")
+
+
+def test_nothing_comes_after_the_manifest_and_large_members_are_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    member = (tarfile.TarInfo(MEMBERS[0].name), b"1")
+    complete = (tarfile.TarInfo(MANIFEST), canonical_json({
+        "schema": "marey/archive@1", "dataset": "d", "commit": AT_BASE, "base": [],
+    }))  # fmt: skip
+    with pytest.raises(BadArchive, match="comes after"):
+        checked(tar_of(complete, member))
+    file = example().write()
+    monkeypatch.setattr("marey_versions.archive.reading.MOST_BYTES", 10)
+    with pytest.raises(BadArchive, match="at most 10 are read"):
+        checked(file)
