@@ -161,7 +161,11 @@ def _turns(skeleton: Skeleton, frames: Floats, carried: NDArray[np.bool_]) -> tu
 
 
 def _mirrored_translations(skeleton: Skeleton, mirror: _Mirror, motion: Motion) -> tuple[Floats, tuple[int, ...]]:
-    """Mirror translations: a joint gets the mirrored translations of its partner, in the axes of its parent."""
+    """Mirror the translations of joints.
+
+    Each joint gets the mirrored translations of its counterpart on the other side, in the axes of the joint's own
+    parent.
+    """
     if not motion.translated_joints:
         return motion.translations, ()
     moving = np.array(motion.translated_joints)

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
 member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
 
-ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the largest number of items.")]
+ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the maximum number of items.")]
 ByteLimit = Annotated[
-    int | None, typer.Option("--stored-bytes", min=0, help="Set the largest number of bytes of all revisions together.")
+    int | None, typer.Option("--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes.")
 ]
 DefaultLimits = Annotated[
     bool, typer.Option("--defaults", help="Use the limits in the server's settings, except for those given here.")

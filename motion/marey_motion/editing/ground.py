@@ -58,7 +58,7 @@ def move_to_ground(take: Take, command: MoveToGround) -> Take:
 
 
 def find_ground(take: Take, _command: FindGround) -> Take:
-    """Record the height of the ground.
+    """Find the height of the ground and record it; the motion stays as it is.
 
     Parameters
     ----------

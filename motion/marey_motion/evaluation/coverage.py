@@ -162,7 +162,9 @@ def cell_deficits(seconds: Floats, least_s: float, window_s: float) -> Floats:
 
 
 def cell_edges(values: Sequence[float], step: float) -> Floats:
-    """Compute cell edges half-way between the values of a grid; the outermost values are centred in their cells.
+    """Compute the edges of cells around the values of a grid.
+
+    Inner edges lie half-way between neighbouring values; the outermost values are in the middle of their cells.
 
     Parameters
     ----------

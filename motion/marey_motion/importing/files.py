@@ -37,7 +37,7 @@ _LONGEST_COLLECTION = 1024
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry of a file that is not read by itself: a companion of other files, or a file with a refused name.
+    """Make the entry of a file that is not read on its own: a companion of other files, or a file with a refused name.
 
     Parameters
     ----------

@@ -81,8 +81,8 @@ class SourceClip:
 
     Parameters
     ----------
-    uid : permanent identifier of the clip, for example "clip_01J…@3"; of rows with equal costs, the row of the clip
-        with the lower uid is chosen
+    uid : permanent identifier of the clip, for example "clip_01J…@3"; if rows of several clips have equal costs, the
+        row of the clip with the lowest uid is chosen
     name : name for people
     content : digest of its motion document, or "" when unknown
     loop : whether the last frame leads into the first one

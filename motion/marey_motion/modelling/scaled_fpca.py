@@ -126,7 +126,7 @@ class _Problem:
 
     @cached_property
     def deviating_poses(self) -> Floats:
-        """Deviations (m, T·D) of the examples at the frames where joints are compared."""
+        """Deviations (m, T·D) of the examples from the mean pose, at the T frames where joints are compared."""
         return np.asarray((self.values @ self.deviations).reshape(len(self.coefficients), -1))
 
     @cached_property

@@ -250,7 +250,7 @@ class _PosedBody:
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:
-        """Parts of the body that have the pose of a standing person, judged in the first frame."""
+        """Parts of the body that are posed as in standing in the first frame, so that axes can be read from them."""
         left, up = self.hips_left[0], self.up[0]
         legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
         if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):

@@ -54,8 +54,8 @@ class ModelPlan(Request):
             raise ValueError("give either files to import or clips, not both")
         if self.annotations and (self.files is not None or self.annotate is not None):
             raise ValueError(
-                "annotations: give annotations only for existing clips, neither together with files to "
-                "import nor together with `annotate`, which proposes them"
+                "annotations: remove them, or remove `files` and `annotate`; annotations belong to existing clips, and "
+                "`annotate` proposes its own"
             )
         if self.cut is not None and not self.annotations and self.annotate is None:
             raise ValueError("cut: cutting needs annotations; give some, or let them be proposed")

@@ -92,7 +92,7 @@ def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, reques
         numbers += _size(source.sources[name])
     if numbers > MOST_NUMBERS:
         raise TooLargeProblem(
-            "The motions are too long for a preview; submit a job of the kind edit instead.", code="preview-too-large"
+            "The motions are too long for a preview; submit a job of the kind `edit` instead.", code="preview-too-large"
         )
     for one in (motion, *source.sources.values()):
         skeleton, revision = one["skeleton"]["item"], one["skeleton"]["revision"]

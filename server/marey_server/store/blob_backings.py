@@ -141,7 +141,7 @@ class DatabaseBlobs:
 
     def adopt(self, copy: Path, digest: str) -> None:
         """Raise `AssertionError`: this backing makes no copies."""
-        raise AssertionError(f"the database keeps no copies of files, but was given the copy {copy} for {digest}")
+        raise AssertionError(f"got the copy {copy} of {digest}, but the database makes blobs of uploaded pieces")
 
     def check_writable(self) -> None:
         """Do nothing: the server checks the database separately."""

@@ -124,8 +124,8 @@ def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GR
 def _staged_documents(tx: Transaction) -> set[str]:
     """Return the documents that running attempts have staged.
 
-    A document staged after this read has a renewed row, and so is not garbage. Documents staged by completed attempts
-    are kept for identical jobs only as long as something else refers to them.
+    A document staged after this read is not garbage either, because staging updates the time of its row. What
+    completed attempts staged is kept only while something else refers to it.
     """
     running = select(job.c.id).where(job.c.state == JobState.RUNNING.value)
     staged = select(staged_output.c.draft).where(staged_output.c.job_id.in_(running))

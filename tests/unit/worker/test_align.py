@@ -209,7 +209,7 @@ def test_names_of_results_that_would_be_too_long_refuse_the_job(project: Project
     first, *others = project.inputs["clips"]
     project.inputs["clips"] = (first.model_copy(update={"name": 250 * "n"}), *others)
     refused = refusal(project, suffix="-aligned")
-    assert (refused.code, refused.detail[-44:]) == ("name-too-long", "has 258 characters; at most 255 are possible")
+    assert (refused.code, refused.detail[-43:]) == ("name-too-long", "has 258 characters; at most 255 are allowed")
 
 
 def test_clips_that_cannot_be_read_refuse_the_job(project: Project) -> None:

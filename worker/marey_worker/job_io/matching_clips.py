@@ -203,7 +203,8 @@ def _common_rig(context: Context, wanted: ClipSet, motions: Sequence[tuple[str, 
     if edited is not None and edited.item != most:
         raise JobRefused(
             "wrong-rig",
-            f"the input `rig` is the skeleton {edited.item}, but the clips have the skeleton {most}; give that one",
+            f"the input `rig` is the skeleton {edited.item}, but the clips have the skeleton {most}; give "
+            f"a revision of {most} as `rig`",
         )
     mapping = skeleton if edited is None else RevisionRef(item=edited.item, revision=edited.revision)
     return Rig(skeleton, mapping)

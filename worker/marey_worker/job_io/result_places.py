@@ -44,7 +44,7 @@ class ResultPlaces:
     def _require_free(self, kind: Kind, collection: str, name: str) -> None:
         if len(name) > MAX_NAME_LENGTH:
             raise MotionError(
-                f"the name {name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are possible",
+                f"the name {name!r} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed",
                 code="name-too-long",
             )
         if (kind, collection, name) in self._taken:

@@ -147,7 +147,7 @@ class _Job:
                 raise JobRefused(
                     "wrong-rig",
                     f"the input `rig` is the skeleton {edited.item}, but the clips have the skeleton "
-                    f"{skeleton.item}; give that one",
+                    f"{skeleton.item}; give a revision of {skeleton.item} as `rig`",
                 )
             return Rig(skeleton, RevisionRef(item=edited.item, revision=edited.revision))
         return Rig.as_stored(skeleton)

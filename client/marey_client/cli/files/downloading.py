@@ -52,7 +52,7 @@ def download(
 ) -> None:
     """Write clips to files: one clip, or all clips in a folder and below.
 
-    If a folder has only aligned clips, these are written. After `@`, name a revision of the clip, or a version of the
+    Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a version of the
     dataset. Other items, such as edits and evaluations, are written with `--format json`, models and annotations also
     with `--format predecessor`.
 

@@ -87,7 +87,8 @@ def ls(
         str, typer.Option(help="Column by which the items are sorted; - before it reverses the order, as in -updated.")
     ] = "name",
     columns: Annotated[
-        str, typer.Option(help=f"Columns after the name, separated by commas, of {', '.join(COLUMNS)}.")
+        str,
+        typer.Option(help=f"Columns to show beside the name, separated by commas: {', '.join(COLUMNS)}."),
     ] = DEFAULT_COLUMNS,
     deleted: Annotated[bool, typer.Option("--deleted", help="List removed items, in the folder and below.")] = False,
     as_json: AsJson = False,

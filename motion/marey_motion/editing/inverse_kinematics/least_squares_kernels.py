@@ -74,7 +74,10 @@ def _look_change(gaze, wished, turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_column(targets, frame, c, error, tip, turn, move, spin, jacobian, column):  # type: ignore[no-untyped-def]
-    """Fill derivatives of the error of target `c` by an unknown that moves its tip by `move` and turns it by `spin`."""
+    """Fill the derivatives of the error of target `c` with respect to one unknown.
+
+    A unit change of the unknown moves the tip by `move` and turns it by `spin`.
+    """
     if targets.kinds[c] == POSITION:
         axes = targets.axes
         change = (move[0] * axes[c, 0], move[1] * axes[c, 1], move[2] * axes[c, 2])

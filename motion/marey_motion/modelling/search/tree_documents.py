@@ -19,7 +19,7 @@ Tree = dict[str, Any]
 def sample_tree_to_tree(
     tree: SampleTree, *, model_digest: str | PartDigestRef, seed: int, options: TreeOptions
 ) -> Tree:
-    """Make part `tree` of a model.
+    """Convert samples to the document that is stored as the part `tree` of a model.
 
     Parameters
     ----------

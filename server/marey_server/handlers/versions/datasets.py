@@ -123,7 +123,7 @@ class BranchProtection(Resource):
 
 
 class CommitsQuery(PageQuery):
-    """Query of a list of commits."""
+    """Query parameters for listing commits."""
 
     version: Version = Field(MAIN, description="Version at which the list begins.")
     path: CollectionPath = Field(

@@ -374,7 +374,11 @@ class _Publication:
 
 
 def _names(draft: Draft) -> Iterator[str]:
-    """Yield names to try for a new item: that of the draft, then numbered ones if content identifies the draft."""
+    """Yield the names to try for a new item.
+
+    The first is the name of the draft. If items with equal content are reused, this name may belong to an item with
+    other content; then numbered names follow.
+    """
     yield draft.item_name
     if draft.reuse == "by_content":
         for number in itertools.count(2):

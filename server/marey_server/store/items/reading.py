@@ -190,7 +190,7 @@ def cut_part(
     """
     if tree["schema"] != "marey/motion@1":
         raise InvalidProblem(
-            "The parameters frames and joints select parts of a motion, but this document is not a motion.",
+            "The parameters `frames` and `joints` select parts of a motion, but this document is not a motion.",
             code="not-a-motion",
         )
     return slice_motion(tree, frames, joints, encoded=encoded)
