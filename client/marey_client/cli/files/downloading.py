@@ -52,9 +52,9 @@ def download(
 ) -> None:
     """Write clips to files: one clip, or all clips in a folder and below.
 
-    Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a version of the
-    dataset. Other items, such as edits and evaluations, are written with `--format json`, models and annotations also
-    with `--format predecessor`.
+    Aligned clips are written only if the folder contains no other clips. After `@`, name a revision of the clip, or a
+    version of the dataset. Other items, such as edits and evaluations, are written with `--format json`, models and
+    annotations also with `--format predecessor`.
 
     An existing file is replaced; if several clips would have the same file name, the later ones get a number.
     """
