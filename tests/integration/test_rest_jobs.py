@@ -294,6 +294,21 @@ def test_contributors_cancel_and_retry_their_own_jobs_only(
     assert ok(owner.post(f"/jobs/{theirs['id']}/retry"), 202)["retry_of"] == theirs["id"]
 
 
+def test_a_job_whose_failed_dependency_belongs_to_another_is_retried_by_those_who_may_retry_both(
+    server: Server, owner: httpx.Client
+) -> None:
+    sam = server.client(server.make_user("sam"))
+    ok(owner.put("/projects/lab/members/sam", json={"role": "contributor"}))
+    theirs = submit(owner)
+    own = submit(sam, after=[theirs["id"]])
+    ok(owner.post(f"/jobs/{theirs['id']}/cancel"))
+    assert ok(sam.get(f"/jobs/{own['id']}"))["state"] == "failed"
+    refused = sam.post(f"/jobs/{own['id']}/retry")
+    assert (refused.status_code, refused.json()["code"]) == (403, "insufficient-role")
+    again = ok(owner.post(f"/jobs/{own['id']}/retry"), 202)
+    assert (again["retry_of"], again["state"]) == (own["id"], "waiting")
+
+
 def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
     worker = server.make_user("worker", scopes=("work",))
     for anybody in (server.client(), server.client(worker)):

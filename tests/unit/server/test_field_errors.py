@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from marey_schemas.editing.commands import Trim
+from marey_schemas.editing.commands import Resample, Trim
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.problems import FieldError
 from marey_server.errors import InvalidProblem
@@ -38,6 +38,13 @@ def test_a_fault_of_a_document_is_told_as_one_of_a_body() -> None:
     assert list(refused.value.errors) == told(EditDocument, tree)
     first = refused.value.errors[0]
     assert (first.pointer, first.code) == ("/commands/0/name~1of~0it", "extra-forbidden")
+
+
+def test_the_pointer_of_a_missing_field_names_the_field_but_no_member_of_a_union() -> None:
+    (missing,) = told(Resample, {"command": "resample"})
+    assert (missing.pointer, missing.code) == ("/frame_rate_hz", "missing")
+    inner = told(EditDocument, {"schema": "marey/edit@1", "commands": [{"command": "resample"}]})
+    assert [one.pointer for one in inner if one.pointer.startswith("/commands")] == ["/commands/0/frame_rate_hz"]
 
 
 def test_only_so_many_faults_are_told() -> None:

@@ -63,6 +63,18 @@ def test_a_clip_comes_back_exactly(lab: Lab, rig: Item) -> None:
     assert encoded.tree["poses"].decode().tobytes() == motion["poses"].tobytes()
 
 
+def test_contents_are_found_in_current_items_of_their_kind_only(lab: Lab, rig: Item) -> None:
+    clip = lab.add_clip(rig, "walk", frames=7)
+    hierarchy = lab.read(items.read_part, "lab", Kind.SKELETON, rig.id, "hierarchy").digest
+    motion = lab.read(items.read_part, "lab", Kind.CLIP, clip.id, "motion").digest
+    asked = [hierarchy, motion, "sha256:" + "0" * 64]
+    assert lab.read(items.find_contents, "lab", Kind.SKELETON, "hierarchy", asked) == {hierarchy}
+    assert lab.read(items.find_contents, "lab", Kind.CLIP, "motion", asked) == {motion}
+    assert lab.read(items.find_contents, "lab", Kind.CLIP, "info", asked) == set()
+    lab.write(items.delete_item, "lab", Kind.CLIP, clip.id, expected_rev=None)
+    assert lab.read(items.find_contents, "lab", Kind.CLIP, "motion", asked) == set()
+
+
 def test_the_summary_tells_what_lists_show(lab: Lab, rig: Item) -> None:
     info = {"checks": [{"code": "foot-slide", "message": "m"}, {"code": "foot-slide", "message": "n"}]}
     clip = lab.add_clip(rig, frames=60, info=info)
