@@ -23,8 +23,14 @@ def json_pointer(steps: Sequence[str]) -> str:
 def field_errors(
     error: ValidationError, tree: Any, pointer: Callable[[list[str]], str] = json_pointer
 ) -> list[FieldError]:
-    """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of each to text."""
+    """Return the first `MAX_ERRORS` validation errors of `tree`; `pointer` converts the location of each to text.
+
+    pydantic counts only the valid items of a list, so it also calls a list too short if an item is invalid; this
+    error is left out.
+    """
     entries = error.errors(include_url=False, include_context=False, include_input=False)
+    wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}
+    entries = [entry for entry in entries if entry["type"] != "too_short" or entry["loc"] not in wrong]
     return [
         FieldError(
             pointer=pointer(_steps(entry["loc"], tree, may_lack_last=entry["type"] == "missing")),

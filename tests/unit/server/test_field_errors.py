@@ -43,8 +43,13 @@ def test_a_fault_of_a_document_is_told_as_one_of_a_body() -> None:
 def test_the_pointer_of_a_missing_field_names_the_field_but_no_member_of_a_union() -> None:
     (missing,) = told(Resample, {"command": "resample"})
     assert (missing.pointer, missing.code) == ("/frame_rate_hz", "missing")
-    inner = told(EditDocument, {"schema": "marey/edit@1", "commands": [{"command": "resample"}]})
-    assert [one.pointer for one in inner if one.pointer.startswith("/commands")] == ["/commands/0/frame_rate_hz"]
+    (inner,) = told(EditDocument, {"schema": "marey/edit@1", "commands": [{"command": "resample"}]})
+    assert (inner.pointer, inner.code) == ("/commands/0/frame_rate_hz", "missing")
+
+
+def test_a_list_is_too_short_only_if_it_is_so_in_the_document() -> None:
+    (short,) = told(EditDocument, {"schema": "marey/edit@1", "commands": []})
+    assert (short.pointer, short.code) == ("/commands", "too-short")
 
 
 def test_only_so_many_faults_are_told() -> None:
