@@ -55,7 +55,7 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy -n auto
 	$(BIN)/lint-imports
 	$(BIN)/python -m lint
 

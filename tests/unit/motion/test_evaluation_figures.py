@@ -192,6 +192,7 @@ def test_transition_costs_and_switches_are_those_of_the_record(result: Evaluatio
 # Figure 8
 
 
+@pytest.mark.slow
 def test_one_normal_has_the_static_error_as_its_mean_and_the_sign_can_be_turned(result: EvaluationResult) -> None:
     trial = "circle v=3 w=-50"
     metrics = next(each.metrics for each in result.trials if each.trial.name == trial)
@@ -447,6 +448,7 @@ def standing() -> EvaluationResult:
     return replace(made, records=records, coverage=coverage)
 
 
+@pytest.mark.slow
 def test_of_a_clip_that_stands_rounding_is_not_shown_as_motion() -> None:
     figures = draw_figures(standing())
     assert "0 % of the time backward, 0 % mainly sideways." in figures["directions"].caption

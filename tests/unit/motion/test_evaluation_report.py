@@ -63,6 +63,7 @@ def test_the_same_result_gives_the_same_page(result: EvaluationResult) -> None:
     assert render_report(result, title="Walks") == render_report(result, title="Walks")
 
 
+@pytest.mark.slow
 def test_the_page_opens_with_the_verdict(page: Page, result: EvaluationResult) -> None:
     assert page.text.startswith("Walks Walks " + verdict(result))
 
@@ -181,6 +182,7 @@ def test_reports_are_made_of_little(change: str, result: EvaluationResult) -> No
     is_sound(render_comparison(little, result, title="little"))
 
 
+@pytest.mark.slow
 def test_a_real_evaluation_is_reported() -> None:
     options = EvaluationOptions(speeds_m_s=(1.25, 2.0), turn_rates_deg_s=(-50.0, 0.0, 50.0), duration_s=6.0)
     clips = [

@@ -27,6 +27,7 @@ from marey_motion.skeleton import EndSite, Skeleton
 CENTIMETRES = ImportOptions(unit_scale_m=0.01, up_axis="y")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "outcome"),
     [

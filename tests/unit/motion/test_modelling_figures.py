@@ -46,6 +46,7 @@ def figures() -> Mapping[str, DrawnFigure]:
     return figures_of_walks()
 
 
+@pytest.mark.slow
 def test_every_figure_is_sound(figures: Mapping[str, DrawnFigure]) -> None:
     assert (set(ALIGNMENT_FIGURES) | set(MODEL_FIGURES) | {"component-1"}) - set(figures) == {"search-errors"}
     for figure in figures.values():
@@ -95,6 +96,7 @@ def test_the_clips_whose_timing_is_unlike_the_references_are_named(subject: Mode
     assert "late one" in figure.svg
 
 
+@pytest.mark.slow
 def test_keyframes_are_marked_by_their_labels(figures: Mapping[str, DrawnFigure]) -> None:
     assert "left foot down" in figures["time-warps"].svg
     assert "left foot down" in figures["mean"].svg

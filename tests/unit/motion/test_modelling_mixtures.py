@@ -102,6 +102,7 @@ def test_one_kind_in_many_dimensions_is_one_component() -> None:
     assert len(fit_mixture(one_kind).mixture.weights) == 1
 
 
+@pytest.mark.slow
 def test_identical_examples_give_identical_mixtures_every_time() -> None:
     """Without a seed, the number of components was another one in every run."""
     random = np.random.default_rng(4)
@@ -112,6 +113,7 @@ def test_identical_examples_give_identical_mixtures_every_time() -> None:
     assert first.candidates == second.candidates
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(4))
 @given(st.sampled_from([1e-4, 0.03, 7.0, 1e4]), st.integers(0, 50))
 def test_the_choice_does_not_depend_on_the_unit(unit: float, seed: int) -> None:
@@ -162,6 +164,7 @@ def test_a_mixture_that_fits_its_own_examples_alone_is_not_taken() -> None:
     assert "held-out" in refused
 
 
+@pytest.mark.slow
 def test_held_out_likelihoods_are_those_of_mixtures_that_lack_the_example() -> None:
     examples = two_kinds(100)
     fitted = fit_mixture(examples)

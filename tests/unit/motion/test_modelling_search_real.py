@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from marey_motion.alignment.aligned import AlignedClip
 from marey_motion.alignment.aligning import SourceExample, align_clips
@@ -31,6 +32,7 @@ TARGETS = 200
 HELD_OUT_EVERY = 4
 
 
+@pytest.mark.slow
 def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None:
     files = sorted(mocap.glob("bandai-namco-2/*raise-up*right-hand*.bvh"))
     assert len(files) >= 20

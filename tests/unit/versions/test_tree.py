@@ -119,6 +119,7 @@ class Counting(ChunksInMemory):
         super().save(chunks)
 
 
+@pytest.mark.slow
 def test_one_change_reads_and_writes_few_chunks() -> None:
     store = Counting(stored(numbered(30_000))[0])
     root = build(ChunksInMemory(), sorted(numbered(30_000).items()))

@@ -98,6 +98,7 @@ def test_the_headline_counts_the_clips_and_those_that_no_trial_plays() -> None:
     assert (headline["clips"], headline["unused_clips"]) == (6, 2)
 
 
+@pytest.mark.slow
 def test_the_report_names_its_files_and_figures_of_the_trials_that_were_asked_for(project: ProjectInMemory) -> None:
     wanted = PARAMS.model_copy(update={"report": True, "trial_figures": ("switching v=1 w=50",)})
     evaluate.gather(project, wanted, [evaluate.run(project, wanted)])

@@ -26,6 +26,7 @@ def let_go(folder: Path) -> None:
     (folder / "go").touch()
 
 
+@pytest.mark.slow
 def test_the_next_job_runs_while_the_last_results_are_stored(shared_server: FakeServer, tmp_path: Path) -> None:
     first = being_stored(shared_server)
     second = running(shared_server, tmp_path)
@@ -51,6 +52,7 @@ def test_a_third_job_waits_until_the_results_of_the_first_are_published(shared_s
     assert order.index(("claimed", second)) < order.index(("ended", first)) < order.index(("claimed", third))
 
 
+@pytest.mark.slow
 def test_results_that_are_refused_while_the_next_job_runs_fail_their_own_job(
     shared_server: FakeServer, tmp_path: Path
 ) -> None:
