@@ -108,8 +108,8 @@ def test_a_model_can_do_without_a_tree() -> None:
     [
         ((), "either files"),
         ((FILES, CLIPS), "either files"),
-        ((FILES, LAYER), "give annotations only for existing clips"),
-        ((CLIPS, LAYER, STEPS), "give annotations only for existing clips"),
+        ((FILES, LAYER), "annotations: remove them, or remove `files`"),
+        ((CLIPS, LAYER, STEPS), "annotations: remove them, or remove `files`"),
         ((CLIPS, {"cut": {}}), "needs annotations"),
         ((CLIPS, LAYER, GAME), "cannot be used after retargeting"),
         ((CLIPS, {"align": {"window": 4}}), "odd"),

@@ -104,7 +104,7 @@ class _Job:
         if long:
             raise JobRefused(
                 "name-too-long",
-                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible",
+                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
             )
 
     def _name(self, pin: PinnedInput, twin: str) -> str:

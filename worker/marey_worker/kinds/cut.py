@@ -139,7 +139,7 @@ class _Cutting:
         if long:
             raise JobRefused(
                 "name-too-long",
-                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are possible",
+                f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
             )
 
     def _folder(self, one: _AnnotatedClip, segment: Segment) -> str:
