@@ -68,24 +68,23 @@ class DatasetReader(Protocol):
 
 
 def write_archive(
-    dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress, *, since: str | None = None
+    dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress, *, since: Sequence[str] = ()
 ) -> Commit:
-    """Write an archive of a version, and check it. With `since`, leave out this version and all before it.
+    """Write an archive of a version, and check it. Leave out the versions `since` and all before them.
 
     An attempt that was interrupted leaves a file whose name ends in `.part`; the next attempt continues it. Raises
     `ArchiveInUse` if another process writes it, and `NothingToArchive`.
     """
     head = dataset.at(version)
-    base = None if since is None else dataset.at(since)
-    digits = (one.digest.removeprefix("sha256:")[:12] for one in (head, base) if one is not None)
-    part = path.with_name(f"{path.name}.{'-'.join(digits)}.part")
+    bases = [dataset.at(one) for one in since]
+    part = path.with_name(f"{path.name}.{short_name(one.digest for one in (head, *bases))}.part")
     part.parent.mkdir(parents=True, exist_ok=True)
     with (
         os.fdopen(os.open(part, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as file,
         tempfile.TemporaryDirectory(dir=part.parent) as folder,
     ):
         _lock(file, part)
-        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head, base)
+        _Making(dataset, ArchiveWriter(file), Path(folder), on_progress).run(head, bases)
         try:
             check_archive(Archive(file), lambda done, of: on_progress("checking", done, of))
         except BadArchive as error:
@@ -97,6 +96,11 @@ def write_archive(
         os.fsync(file.fileno())
     part.replace(path)
     return head
+
+
+def short_name(commits: Iterable[str]) -> str:
+    """Return a part of a file name that differs for different commits."""
+    return "-".join(digest.removeprefix("sha256:")[:12] for digest in commits)
 
 
 def _lock(file: BinaryIO, path: Path) -> None:
@@ -123,14 +127,16 @@ class _Making:
     earlier: dict[str, PartOfContent] = field(default_factory=dict)
     """Where the server has the document that was replaced by one of `documents`."""
 
-    def run(self, head: Commit, base: Commit | None) -> None:
-        before = {} if base is None else self._history(base, {})
+    def run(self, head: Commit, bases: Sequence[Commit]) -> None:
+        before: dict[str, Commit] = {}
+        for base in bases:
+            before = self._history(base, before)
         commits = [one for one in self._history(head, before).values() if one.digest not in before]
         if not commits:
-            raise NothingToArchive(f"there is nothing to archive: {head.digest} is not after the version to leave out")
+            raise NothingToArchive(f"there is nothing to archive: {head.digest} is not after the versions to leave out")
         for done, commit in enumerate(commits):
             self.on_progress("reading versions", done, len(commits))
-            self._add_commit(commit, unchanged=base is not None)
+            self._add_commit(commit, unchanged=bool(bases))
         self._add_documents(self.documents)
         parents = {parent for commit in commits for parent in commit.parents}
         self.writer.finish(self.dataset.name, head.digest, sorted(parents & before.keys()))

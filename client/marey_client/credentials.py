@@ -99,6 +99,20 @@ def resolve(
     return Credential(chosen, None) if file is None else _from_file(chosen, file)
 
 
+def resolve_other(url: str, token_file: Path | None = None, environment: Mapping[str, str] | None = None) -> Credential:
+    """Return the token for a second server, from a file or from `marey login`.
+
+    Tokens in the environment or in the data folder are for the first server, and are never sent to another one.
+    """
+    chosen = url.rstrip("/")
+    require_address(chosen)
+    if token_file is not None:
+        return _from_file(chosen, token_file)
+    path = logins_path(os.environ if environment is None else environment)
+    token = read_logins(path).tokens.get(chosen)
+    return Credential(chosen, token, "" if token is None else f"marey login, which keeps it in {path}", logins=path)
+
+
 def _from_file(url: str, file: Path) -> Credential:
     return Credential(url, read_secret(file), str(file), file=file)
 

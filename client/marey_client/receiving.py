@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from marey_client.blobs import Blobs
-from marey_client.errors import EarlierVersionsMissing, NotFound
+from marey_client.errors import EarlierVersionsMissing
 from marey_client.transport import BLOCKS, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, ReceivedChange, ReceivedCommit
@@ -46,6 +46,9 @@ class ReceivingDataset(Protocol):
 
     def at(self, version: str) -> Commit:
         """Return the commit that a version names."""
+
+    def has(self, commit: str) -> bool:
+        """Return whether the dataset has a commit."""
 
 
 def send_versions(
@@ -92,7 +95,7 @@ class _Import:
     """For the content digest of a document, the content digest of a revision with this document."""
 
     def run(self, begins: str | None) -> Commit:
-        require_base(self.archive, self._has)
+        require_base(self.archive, self.dataset.has)
         history = self.archive.history()
         changes = {digest: self.archive.changes(digest) for digest, _ in history}
         known = self._known(history)
@@ -112,16 +115,10 @@ class _Import:
         """Return the digests of the commits that the dataset has; it also has all before each of them."""
         known: set[str] = set()
         for digest, record in reversed(history):
-            if digest not in known and not self._has(digest):
+            if digest not in known and not self.dataset.has(digest):
                 continue
             known.update((digest, *record.parents))
         return known
-
-    def _has(self, commit: str) -> bool:
-        try:
-            return self.dataset.at(commit).digest == commit
-        except NotFound:
-            return False
 
     def _put(self, changes: Mapping[str, EntryChange]) -> list[str]:
         """Return the content digests of the entries that were added or changed, and note their revisions."""

@@ -85,6 +85,46 @@ class Datasets:
                 handle = self.create(name, collection=name)
             return handle.receive(archive, into=into, on_progress=on_progress)
 
+    def pull(
+        self,
+        source: DatasetHandle,
+        name: str,
+        version: str = MAIN,
+        *,
+        into: str | None = None,
+        on_progress: OnProgress = _silent,
+    ) -> ImportedVersion:
+        """Copy a version of another dataset, and all versions before it, into the dataset `name` of this project.
+
+        `source` may be on another server. Only what the dataset lacks is copied; an attempt that was interrupted is
+        continued by the next one. The dataset is created if it does not exist. The branch `into` moves as in
+        `import_archive`; by default it is the branch that `version` names, or `main`. If `version` is a tag, the tag is
+        created too, unless a branch or tag of this name exists.
+        """
+        from marey_client.transfers import fetched_versions, find_missing
+
+        head, named = source.at(version), source.find_ref(version)
+        target = self._opened_or_created(name)
+        branch = into or (version if named is not None and named.kind is RefKind.BRANCH else MAIN)
+        missing = find_missing(source, head, target.has)
+        if missing.commits:
+            with fetched_versions(source, head, missing.bases, on_progress) as archive:
+                made = target.receive(archive, into=branch, on_progress=on_progress)
+        else:
+            made = target.forward(branch, target.at(head.digest))
+        if named is None or named.kind is not RefKind.TAG:
+            return made
+        tag = target.find_ref(named.name) or target.create_tag(named.name, head.digest)
+        return made._replace(tag=tag.name if tag.kind is RefKind.TAG and tag.commit == head.digest else None)
+
+    def _opened_or_created(self, name: str) -> DatasetHandle:
+        handle = self.at(name)
+        try:
+            handle.read()
+        except NotFound:
+            return self.create(name, collection=name)
+        return handle
+
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
         return DatasetHandle(self.transport, f"{self.url}/{name}")
@@ -108,10 +148,15 @@ class PickOptions(TypedDict, total=False):
 
 
 class ImportedVersion(NamedTuple):
-    """Newest version of an archive that was imported, and the branch that is at it now, None if there is none."""
+    """Version that came from an archive or another dataset."""
 
     commit: Commit
-    branch: str | None
+    branch: str
+    """The branch that was to have the version."""
+    moved: bool
+    """Whether the branch is at the version now; if not, it has other versions, and the two can be merged."""
+    tag: str | None = None
+    """The tag that was copied with the version, or None."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +227,13 @@ class DatasetHandle:
     def at(self, version: str = MAIN) -> Commit:
         """Return the commit that a version names."""
         return self.transport.get(Commit, f"{self.url}/commits/{version}")
+
+    def has(self, commit: str) -> bool:
+        """Return whether the dataset has the commit with this digest."""
+        try:
+            return self.at(commit).digest == commit
+        except NotFound:
+            return False
 
     def entries(self, version: str = MAIN, *, path: str = "") -> Iterator[Entry]:
         """List the entries of a version by path, all or those below a folder."""
@@ -259,30 +311,39 @@ class DatasetHandle:
         path: str | Path,
         version: str = MAIN,
         *,
-        since: str | None = None,
+        since: str | Sequence[str] | None = None,
         on_progress: OnProgress = _silent,
     ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
         The file is complete and checked, or else it does not exist; an attempt that was interrupted is continued by the
-        next one. With `since`, leave out this version and all before it; such an archive can be imported where that
-        version is. Return the commit of the version. Raises `NothingToArchive`.
+        next one. With `since`, leave out these versions and all before them; such an archive can be imported where
+        these versions are. Return the commit of the version. Raises `NothingToArchive`.
         """
         from marey_client.archives import write_archive
 
-        return write_archive(self, version, Path(path), on_progress, since=since)
+        bases = () if since is None else (since,) if isinstance(since, str) else since
+        return write_archive(self, version, Path(path), on_progress, since=bases)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
         """Record the versions of an archive that was checked; `Datasets.import_archive` describes the rest."""
         from marey_client.receiving import send_versions
 
-        ref = next((one for one in self.refs() if one.name == into), None)
+        ref = self.find_ref(into)
         empty = ref is not None and ref.commit is None
         made = send_versions(self, archive, on_progress, begins=into if empty else None)
+        return self.forward(into, made)
+
+    def forward(self, branch: str, commit: Commit) -> ImportedVersion:
+        """Move a branch to a commit of the dataset if the commit follows it; create the branch if it does not exist."""
+        ref = self.find_ref(branch)
         if ref is None:
-            self.create_branch(into, made.digest)
-        moved = ref is None or empty or self._fast_forward(into, made.digest)
-        return ImportedVersion(made, into if moved else None)
+            self.create_branch(branch, commit.digest)
+        elif ref.commit is None:
+            self.move_branch(branch, commit.digest, expected_rev=ref.rev)
+        else:
+            return ImportedVersion(commit, branch, self._fast_forward(branch, commit.digest))
+        return ImportedVersion(commit, branch, True)
 
     def _fast_forward(self, branch: str, commit: str) -> bool:
         """Move a branch to a commit that follows its newest one; return whether the branch is at the commit now."""
@@ -303,6 +364,10 @@ class DatasetHandle:
         """List the branches and tags by name."""
         return pages(self.transport, Ref, f"{self.url}/refs")
 
+    def find_ref(self, name: str) -> Ref | None:
+        """Return the branch or tag with a name, or None."""
+        return next((one for one in self.refs() if one.name == name), None)
+
     def create_branch(self, name: str, at: str = MAIN) -> Ref:
         """Create a branch at a version."""
         return self._create(RefCreate(name=name, kind=RefKind.BRANCH, at=at))
@@ -314,10 +379,14 @@ class DatasetHandle:
     def _create(self, request: RefCreate) -> Ref:
         return self.transport.post(Ref, f"{self.url}/refs", request)
 
-    def move_branch(self, name: str, to: str) -> Ref:
-        """Move a branch to any version. No commit is deleted."""
+    def move_branch(self, name: str, to: str, *, expected_rev: int | None = None) -> Ref:
+        """Move a branch to any version. No commit is deleted.
+
+        Raises `PreconditionFailed` if `expected_rev` is given and the branch is at another state.
+        """
         body = as_json(RefMove(at=to))
-        return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=ANY_STATE))
+        state = ANY_STATE if expected_rev is None else {"If-Match": f'"{expected_rev}.json"'}
+        return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=state))
 
     def ref(self, name: str) -> Ref:
         """Return a branch with its protection, or a tag."""

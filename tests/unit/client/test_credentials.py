@@ -154,6 +154,19 @@ def test_files_that_hold_no_token_or_that_others_can_read_are_refused(
         credentials.read_secret(write_secret(tmp_path / "token", text, mode))
 
 
+def test_a_second_server_gets_no_token_that_is_meant_for_the_first(environment: dict[str, str], tmp_path: Path) -> None:
+    write_secret(tmp_path / "data" / "admin.token", "marey_a_first\n")
+    environment["MAREY_TOKEN"] = "marey_b_first"
+    assert credentials.resolve_other("http://127.0.0.1:9999/", None, environment).token is None
+    credentials.store_login(credentials.logins_path(environment), SERVER, "marey_c_second")
+    assert credentials.resolve_other(SERVER + "/", None, environment).token == "marey_c_second"
+    assert credentials.resolve_other("https://third.example", None, environment).token is None
+    file = write_secret(tmp_path / "third", "marey_d_third\n")
+    assert credentials.resolve_other("https://third.example", file, environment).token == "marey_d_third"
+    with pytest.raises(errors.BadAddress):
+        credentials.resolve_other("third.example", None, environment)
+
+
 def test_a_damaged_file_of_logins_is_an_error_that_says_what_to_do(environment: dict[str, str]) -> None:
     path = write_secret(credentials.logins_path(environment), json.dumps({"tokens": 3}))
     with pytest.raises(errors.BadCredentialFile, match="log in again"):

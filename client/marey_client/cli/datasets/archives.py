@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, parse, short
+from marey_client.cli.datasets.places import DatasetPlace, VersionPlace, imported, parse, short
 from marey_client.cli.terminal.failures import Refused
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, progress
@@ -41,10 +41,11 @@ def create_archive(
     place: VersionPlace,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File to write, such as gaits.tar; it is replaced.")],
     since: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
             metavar="VERSION",
-            help="Leave out this version and all before it; the archive can be imported where this version is.",
+            help="Leave out this version and all before it; the archive can be imported where this version is. May be "
+            "given several times.",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -123,14 +124,8 @@ def import_archive(
         datasets = marey.project(at.project).datasets
         made = datasets.import_archive(file, at.dataset, into=branch, on_progress=advance)
     if as_json:
-        return print_json({"commit": made.commit.digest, "branch": made.branch})
-    name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
-    if made.branch is None:
-        return print_message(
-            f"{name} has the version {digits}; {branch} has other versions and did not move: marey dataset merge "
-            f"{name}@{digits} --into {branch}"
-        )
-    return print_message(f"{made.branch} of {name} is at {digits}; marey dataset checkout {name}@{made.branch}")
+        return print_json({"commit": made.commit.digest, "branch": made.branch, "moved": made.moved})
+    return print_message(imported(at, made))
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import typer
 from marey_client.cli.terminal.failures import WrongUsage
 
 if TYPE_CHECKING:
-    from marey_client.handles.datasets import DatasetHandle
+    from marey_client.handles.datasets import DatasetHandle, ImportedVersion
     from marey_client.marey import Marey
 
 SHOWN_DIGITS = 12
@@ -47,6 +47,17 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
     if at and not version:
         raise WrongUsage(f"{text!r} names a version, but this command works on the dataset; write {place}")
     return NamedVersion(project, name, named or "main")
+
+
+def imported(at: NamedVersion, made: ImportedVersion) -> str:
+    """Return the sentence that says where a version is now that was imported for a branch, and what to do next."""
+    name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
+    if not made.moved:
+        return (
+            f"{name} has the version {digits}; {made.branch} has other versions and did not move: marey dataset merge "
+            f"{name}@{digits} --into {made.branch}"
+        )
+    return f"{made.branch} of {name} is at {digits}; marey dataset checkout {name}@{made.branch}"
 
 
 def short(digest: str | None) -> str | None:

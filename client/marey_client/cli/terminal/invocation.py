@@ -42,6 +42,28 @@ def credential_of(context: typer.Context) -> Credential:
 
 
 @contextmanager
+def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Iterator[Marey]:
+    """Return a connection to a second server, or the connection to the first one if no other is named."""
+    from marey_client.cli.terminal.failures import WrongUsage
+    from marey_client.credentials import resolve_other
+    from marey_client.errors import Unauthenticated
+    from marey_client.marey import Marey
+
+    if url is None:
+        if token_file is not None:
+            raise WrongUsage("--other-token-file is for another server; name it by its URL")
+        yield first
+        return
+    found = resolve_other(url, token_file)
+    with Marey(found.url, found.bearer) as marey:
+        try:
+            yield marey
+        except Unauthenticated as error:
+            error.add_note(f"if {found.url} refused the token: marey login {found.url} stores one for it")
+            raise
+
+
+@contextmanager
 def connect(context: typer.Context, *, anonymous: bool = False) -> Iterator[Marey]:
     """Return a connection to the server named by the options, the environment or `marey login`."""
     from marey_client.errors import Unauthenticated
