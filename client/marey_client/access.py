@@ -116,7 +116,9 @@ class Tokens:
         transport = self.transport.with_present_token()
         found = transport.get(Me, "/me").token
         if found is None:
-            raise UnexpectedAnswer("the server does not say which token this is, so it cannot rotate it; upgrade it")
+            raise UnexpectedAnswer(
+                "the server does not report which token it received, so the token cannot be rotated; upgrade the server"
+            )
         wanted = TokenRotation(rotation_id=rotation_id or secrets.token_hex(16), grace_s=int(grace.total_seconds()))
         return transport.post(NewToken, f"/tokens/{found}/rotate", wanted, repeatable=True)
 

@@ -166,7 +166,7 @@ class _Making:
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
         if record.digest != commit.digest:
-            raise UnexpectedAnswer(f"the server's commit {commit.digest} has another content than its digest says")
+            raise UnexpectedAnswer(f"the server's commit {commit.digest} does not match its digest")
         changes = self._changes(commit)
         lines = []
         for place, change in sorted(changes.items()):
@@ -233,7 +233,7 @@ class _Making:
         for digest, body in bodies.items():
             data = canonical_json(body)
             if digest_of(data) != digest:
-                raise UnexpectedAnswer(f"the server's document {digest} has another content than its digest says")
+                raise UnexpectedAnswer(f"the server's document {digest} does not match its digest")
             for file in self._files(digest, body):
                 self._add_file(ArchiveMember(MemberKind.FILE, file))
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)

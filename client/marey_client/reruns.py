@@ -49,10 +49,12 @@ def rerun_request(job: Job, kind: JobKind, *, into: str | None = None) -> JobCre
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")
     if job.parent is not None:
-        raise CannotRerun(f"{job.id} is a task of {job.parent}; repeat that job")
+        raise CannotRerun(f"{job.id} is a task of the job {job.parent}; repeat that job")
     declared = job_kinds().get(job.kind)
     if declared is not None and declared.in_place and job.params.get(declared.in_place):
-        raise CannotRerun(f"the job {job.id} has replaced its sources; its repetition would change them again")
+        raise CannotRerun(
+            f"the job {job.id} wrote new revisions of its inputs (--in-place); repeating it would change them again"
+        )
     return JobCreate(
         kind=job.kind,
         inputs={name: _inputs(pins, many=kind.inputs[name].many) for name, pins in job.inputs.items()},

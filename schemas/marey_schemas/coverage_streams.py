@@ -96,7 +96,7 @@ class CoverageStreamCreate(Request):
             cells = len(self.speeds_m_s) * len(self.turn_rates_deg_s)
             if cells > MOST_CELLS:
                 raise ValueError(
-                    f"these speeds and turn rates make a grid of {cells} cells; at most {MOST_CELLS} are possible"
+                    f"these speeds and turn rates make a grid of {cells} cells; at most {MOST_CELLS} are allowed"
                 )
         return self
 
@@ -133,7 +133,7 @@ class CoverageFrames(Request):
             if frames is not None and not np.issubdtype(frames.dtype, np.floating):
                 raise ValueError(f"{name}: the dtype is {frames.dtype.str}, but must be <f4 or <f8")
         if self.frame_count > MOST_FRAMES:
-            raise ValueError(f"the request has {self.frame_count} frames; at most {MOST_FRAMES} are possible")
+            raise ValueError(f"the request has {self.frame_count} frames; at most {MOST_FRAMES} are allowed")
         if self.frame_count == 0 and not self.ends_take:
             raise ValueError("the request is empty; send frames, or set ends_take")
         return self

@@ -93,11 +93,11 @@ class SearchRequest(RefineOptions):
         total = sum(len(step.constraints) for step in self.asked_steps)
         if total > MOST_CONSTRAINTS:
             raise ValueError(
-                f"steps: the steps have {total} constraints together; at most {MOST_CONSTRAINTS} are possible"
+                f"steps: the steps have {total} constraints together; at most {MOST_CONSTRAINTS} are allowed"
             )
         if total * self.candidates > MOST_CANDIDATE_CONSTRAINTS:
             most = MOST_CANDIDATE_CONSTRAINTS // total
-            raise ValueError(f"candidates: with {total} constraints, at most {most} candidates are possible")
+            raise ValueError(f"candidates: with {total} constraints, at most {most} candidates are allowed")
         return self
 
     @property

@@ -179,7 +179,7 @@ def change_user(
     name: UserName,
     display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
     administrator: Annotated[
-        bool | None, typer.Option(help="Give the user the rights of an administrator, or remove them.")
+        bool | None, typer.Option(help="Give the user the rights of an administrator, or take them away.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -157,7 +157,7 @@ def _body_constraints(
     for text in texts or ():
         moment, _, values = text.rpartition("=")
         if not (moment and values):
-            raise WrongUsage(f"{text!r} is not a time with its value; write WHEN={('x,z' if count == 2 else 'number')}")
+            raise WrongUsage(f"{text!r} names no time and value; write WHEN={('x,z' if count == 2 else 'number')}")
         numbers = _numbers(values, count, text)
         made.append(_constraint(kind, moment, field, numbers if count > 1 else numbers[0], tolerance))
     return made

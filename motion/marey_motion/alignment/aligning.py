@@ -181,7 +181,7 @@ class _Aligning:
     def _require_options(self, clips: Sequence[SourceExample]) -> None:
         repeated = [uid for uid, count in Counter(one.uid for one in clips).items() if count > 1]
         if repeated:
-            raise MotionError("two examples have this uid; give each example a uid of its own", where=repeated[0])
+            raise MotionError("two examples have this uid; each example needs a different one", where=repeated[0])
         wanted = self._options.reference
         if wanted not in (MEDOID, NEAREST_MEAN_LENGTH) and wanted not in {one.uid for one in clips}:
             raise MotionError("the reference is not one of the clips to align", code="unknown-reference", where=wanted)

@@ -124,7 +124,7 @@ def scale(take: Take, command: Scale) -> Take:
 def flip_axes(take: Take, command: FlipAxes) -> Take:
     """Rotate the world so that one axis becomes +y and another +z.
 
-    Only rotations are possible; a change of handedness is a reflection, see `mirror`.
+    Only rotations are allowed; a change of handedness is a reflection, see `mirror`.
 
     Parameters
     ----------

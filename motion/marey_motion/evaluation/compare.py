@@ -122,9 +122,7 @@ def compare_results(before: EvaluationResult, after: EvaluationResult) -> Compar
     """
     require_comparable(before.provenance, after.provenance)
     if not (len(before.records) == len(before.trials) == len(after.trials) == len(after.records)):
-        raise MotionError(
-            "a comparison needs both evaluations with the records of all their trials", code="records-missing"
-        )
+        raise MotionError("both evaluations must contain the records of all their trials", code="records-missing")
     uids = {clip.uid for clip in before.clips}, {clip.uid for clip in after.clips}
     used = _used(before), _used(after)
     return Comparison(

@@ -95,7 +95,7 @@ class OnlineCoverage:
         shape = len(self.speed_edges_m_s) - 1, len(self.turn_rate_edges_deg_s) - 1
         if shape[0] * shape[1] > MOST_CELLS:
             raise MotionError(
-                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are possible", where="grid"
+                f"the grid has {shape[0]} x {shape[1]} cells; at most {MOST_CELLS} are allowed", where="grid"
             )
         self._before = np.zeros(shape) if seconds is None else np.array(seconds, dtype=np.float64)
         if self._before.shape != shape:

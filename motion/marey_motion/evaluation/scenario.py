@@ -134,7 +134,7 @@ def require_names(trials: Iterable[Trial]) -> None:
     for trial in trials:
         if trial.name in seen:
             raise MotionError(
-                f"two trials are called {trial.name}; give each trial a name of its own",
+                f"two trials are called {trial.name}; each trial needs a different name",
                 where="grid",
             )
         seen.add(trial.name)

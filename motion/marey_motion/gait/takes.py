@@ -234,7 +234,7 @@ def _frame_count(path: RootPath, frame_rate_hz: float) -> int:
     if not 1 <= frames <= MAX_FRAMES:
         raise MotionError(
             f"a walk of {path.duration_s:g} s at {frame_rate_hz:g} Hz has {frames} frames; 1 to {MAX_FRAMES} "
-            "are possible",
+            "are allowed",
             code="gait-invalid",
             where="duration_s",
         )

@@ -105,7 +105,10 @@ class ProposalMerge(Request):
     @model_validator(mode="after")
     def _can_wait(self) -> ProposalMerge:
         if self.when_green and (self.resolutions or self.message):
-            raise ValueError("a merge that waits has neither resolutions nor a message; resolve conflicts in a commit")
+            raise ValueError(
+                "a merge that waits for reviews and checks cannot have resolutions or a message; "
+                "resolve conflicts by a commit first"
+            )
         return self
 
 

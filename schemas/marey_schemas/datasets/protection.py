@@ -41,7 +41,7 @@ class ProtectionRule(Request):
     @model_validator(mode="after")
     def _is_consistent(self) -> ProtectionRule:
         if self.role is Role.READER:
-            raise ValueError("readers cannot move a branch; the least role is contributor")
+            raise ValueError("readers cannot move a branch; require the role contributor, maintainer or owner")
         if self.direct_commits and (self.approvals or self.checks or self.up_to_date):
             raise ValueError("direct commits would bypass the approvals and checks; allow them only without these")
         return self

@@ -89,7 +89,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
     """
     unknown = sorted(leaf.keys() - LEAF_KEYS - {"encoding"})
     if unknown:
-        raise ArrayError("bad-array", f"an array has no member {unknown[0]!r}")
+        raise ArrayError("bad-array", f"the description of an array has no key {unknown[0]!r}")
     spec = ArraySpec.parse(leaf["dtype"], leaf["shape"])
     spec.require(max_bytes)
     data = leaf["data"]

@@ -232,7 +232,7 @@ def _undo_prediction(body: _Sections, columns: int, frames: int) -> Integers:
         raise TileError(f"the tile declares quaternions after its first {lead} columns, but has only {columns} columns")
     choice = body.take(count)
     if (choice > 7).any():
-        raise TileError("the number that says how a quaternion is predicted must be 0 to 7 (component + 4 * sign)")
+        raise TileError("the predictor of a quaternion must be a number from 0 to 7 (component + 4 * sign)")
     predicted_rows, other_rows = _rows(choice & 3, columns, lead)
     channels = np.empty((columns, frames), np.uint32)
     channels[other_rows] = others = _undo_difference(body, 4, columns - count, frames)

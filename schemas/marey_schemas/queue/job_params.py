@@ -161,14 +161,13 @@ class EvaluateParams(EvaluationOptions, TaggedResults):
     def _check_size(self) -> Self:
         if self.trial_count > MOST_TRIALS:
             raise ValueError(
-                f"the speeds, turn rates and families make {self.trial_count} trials; at most {MOST_TRIALS} "
-                "are possible"
+                f"the speeds, turn rates and families make {self.trial_count} trials; at most {MOST_TRIALS} are allowed"
             )
         simulated_s = self.trial_count * (self.approach_s + self.duration_s)
         if simulated_s > MOST_SIMULATED_S:
             raise ValueError(
                 f"{self.trial_count} trials of this length simulate {simulated_s:,.0f} s together; at most "
-                f"{MOST_SIMULATED_S:,.0f} s are possible"
+                f"{MOST_SIMULATED_S:,.0f} s are allowed"
             )
         for item, (start, stop) in self.trims.items():
             if stop <= start:

@@ -96,5 +96,5 @@ def write_precondition(if_match: str | None, if_none_match: str | None, *, may_c
             "again, and send its ETag."
         )
     if len(revs) > MOST_STATES:
-        raise BadRequestProblem(f"If-Match names {len(revs)} versions; at most {MOST_STATES} are possible.")
+        raise BadRequestProblem(f"If-Match names {len(revs)} versions; at most {MOST_STATES} are allowed.")
     return Precondition(revs[0] if len(revs) == 1 else frozenset(revs))

@@ -41,7 +41,8 @@ class RequestMemory:
             if others and (exceeds_share or self.held_bytes + more > total):
                 whose = "your requests" if exceeds_share else "all requests together"
                 raise UnavailableProblem(
-                    f"The memory for {whose} is in use; try again in a few seconds, with fewer requests at once.",
+                    f"The memory that is reserved for {whose} is full; try again in a few seconds, "
+                    "with fewer requests at once.",
                     code="memory",
                     headers={"Retry-After": str(RETRY_AFTER_S)},
                 )

@@ -72,8 +72,7 @@ class PasswordLane:
             )
         if len(self) >= PLACES:
             raise UnavailableProblem(
-                f"The server is already checking {PLACES} passwords, the most that it checks at once; try "
-                "again in 2 s.",
+                f"The server is already checking {PLACES} passwords, the maximum; try again in 2 s.",
                 code="too-many-passwords",
                 headers={"Retry-After": "2"},
             )

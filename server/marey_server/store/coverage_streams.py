@@ -91,7 +91,7 @@ def create_stream(tx: Transaction, project: str, new: NewStream) -> Stream:
     count = select(func.count()).where(coverage_stream.c.project_id == project_row.id, ~_is_old(tx))
     if tx.execute(count).scalar_one() >= MOST_STREAMS:
         raise ConflictProblem(
-            f"The project already has {MOST_STREAMS} coverage streams, the most that are possible; delete "
+            f"The project already has {MOST_STREAMS} coverage streams, the most that are allowed; delete "
             "those that are no longer used.",
             code="too-many-streams",
         )

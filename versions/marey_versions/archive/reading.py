@@ -217,5 +217,5 @@ def _change(line: Mapping[str, Any]) -> EntryChange:
         return EntryChange(None, {})
     parts, tags, unchanged = dict(line["parts"]), list(line["tags"]), dict(line.get("unchanged", {}))
     if not all(isinstance(one, str) for one in (*parts, *parts.values(), *tags, *unchanged, *unchanged.values())):
-        raise ValueError("the parts and tags of an entry are texts")
+        raise ValueError("the parts and tags of an entry must be strings")
     return EntryChange({"parts": parts, "tags": tags}, unchanged)

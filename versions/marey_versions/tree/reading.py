@@ -57,7 +57,7 @@ class ChunkReader:
         chunks = self.several([child.digest for child in children])
         for child, chunk in zip(children, chunks, strict=True):
             if (chunk.level, chunk.last_key, chunk.count) != (level, child.last_key, child.entries):
-                raise DamagedChunk(f"the chunk {child.digest} is not what the chunk above says")
+                raise DamagedChunk(f"the chunk {child.digest} does not match its description in the chunk above it")
         return chunks
 
     def know(self, digest: str, chunk: Chunk) -> None:

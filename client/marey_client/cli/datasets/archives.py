@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 archive = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Archives: a version of a dataset with everything before it, as one file that is checked without a server.",
+    help="Archives: a version of a dataset, with all versions before it, as one file that can be "
+    "checked without a server.",
 )
 
 ArchivePath = Annotated[
@@ -110,7 +111,7 @@ def import_archive(
     context: typer.Context,
     file: ArchivePath,
     place: DatasetPlace,
-    branch: Annotated[str, typer.Option(help="Branch that is to have the version.")] = "main",
+    branch: Annotated[str, typer.Option(help="Branch that is moved to the version.")] = "main",
     as_json: AsJson = False,
 ) -> None:
     """Check an archive, and record its versions in a dataset, which is created if it does not exist.

@@ -36,7 +36,9 @@ Base = Annotated[
 Parent = Annotated[
     int | None,
     typer.Option(
-        min=1, max=2, help="For a merge: the parent with which it is compared; 1: the branch that the merge changed."
+        min=1,
+        max=2,
+        help="If the commit is a merge: the parent with which it is compared. 1: the branch that the merge changed.",
     ),
 ]
 

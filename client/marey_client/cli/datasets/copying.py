@@ -24,11 +24,16 @@ TargetPlace = Annotated[
 ]
 TokenFile = Annotated[
     Path | None,
-    typer.Option("--other-token-file", help="File with a token for the other server; default: its marey login."),
+    typer.Option(
+        "--other-token-file",
+        help="File with a token for the other server; default: the token that marey login stored for it.",
+    ),
 ]
 Branch = Annotated[
     str | None,
-    typer.Option(help="Branch that is to have the version. Default: the branch that was copied, or main."),
+    typer.Option(
+        help="Branch of the target dataset that is moved to the version. Default: the branch that was copied, or main."
+    ),
 ]
 
 

@@ -36,7 +36,7 @@ CommitSeen = Annotated[
     str | None,
     typer.Option(
         "--commit",
-        help="Commit that you have looked at; the command is refused if it is not the newest one of the proposal.",
+        help="Commit that you have reviewed; the command is refused if the proposal has a newer one.",
     ),
 ]
 Number = Annotated[int, typer.Argument(min=1, help="Number of the proposal; marey proposal ls lists the numbers.")]
@@ -210,7 +210,10 @@ def check(
     number: Number,
     name: Annotated[str, typer.Argument(help="Name of the check, such as evaluation.")],
     state: Annotated[CheckState, typer.Argument(help="State of the check.")],
-    job: Annotated[str | None, typer.Option(help="Job that checks; a success needs a job that has succeeded.")] = None,
+    job: Annotated[
+        str | None,
+        typer.Option(help="Job that made the check; the state can be success only if the job has succeeded."),
+    ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
     text: Annotated[str, typer.Option("--message", "-m", help="Result in words.")] = "",
     commit: CommitSeen = None,
@@ -237,7 +240,7 @@ def merge(
     theirs: Theirs = None,
     base: Base = None,
     when_green: Annotated[
-        bool, typer.Option("--when-green", help="If something is missing, merge as soon as nothing is.")
+        bool, typer.Option("--when-green", help="If approvals or checks are missing, merge as soon as they are there.")
     ] = False,
     withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw an earlier --when-green.")] = False,
     as_json: AsJson = False,
@@ -283,12 +286,14 @@ def protect(
     context: typer.Context,
     place: BranchPlace,
     role: Annotated[
-        str, typer.Option(help="Least role of a user who may move the branch: contributor, maintainer or owner.")
+        str, typer.Option(help="Lowest role that may move the branch: contributor, maintainer or owner.")
     ] = "contributor",
     direct_commits: Annotated[
         bool, typer.Option("--direct-commits", help="Allow commits and merges without a proposal.")
     ] = False,
-    approvals: Annotated[int, typer.Option(min=0, help="Approvals that a proposal needs, without the author's.")] = 0,
+    approvals: Annotated[
+        int, typer.Option(min=0, help="Number of approvals that a proposal needs; the author's does not count.")
+    ] = 0,
     checks: Annotated[
         list[str] | None, typer.Option("--check", metavar="NAME", help="Check that must succeed; can be repeated.")
     ] = None,

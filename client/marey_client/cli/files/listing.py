@@ -129,7 +129,7 @@ def _explain(
 ) -> None:
     """Print how many items each condition of a query hides; of clips, unless other kinds are given."""
     if query is None:
-        raise WrongUsage("--explain needs a query: add --query")
+        raise WrongUsage("--explain counts what the conditions of a query hide; add --query")
     with connect(context) as marey:
         project = marey.project(address.project)
         for kind in map(kind_named, kinds or ["clip"]):

@@ -187,7 +187,7 @@ def build_objective(
     """
     if len(constraints) > MOST_SOUGHT:
         raise InvalidConstraint(
-            f"the search has {len(constraints)} constraints; at most {MOST_SOUGHT} are possible", where="constraints"
+            f"the search has {len(constraints)} constraints; at most {MOST_SOUGHT} are allowed", where="constraints"
         )
     tracked = {one: place for place, one in enumerate(also)}
     moments: dict[float, int] = {}

@@ -96,7 +96,7 @@ def pin_inputs(
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
         errors.append(
-            _error(f"{at}/inputs", "too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
+            _error(f"{at}/inputs", "too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are allowed.")
         )
     if errors:
         raise InvalidProblem(f"{errors[0].pointer}: {errors[0].detail}", errors=errors[:100])

@@ -20,7 +20,7 @@ def labels_key(labels: Mapping[str, str]) -> str:
     pairs = _checked_pairs(labels)
     key = ",".join(pairs)
     if len(key) > LONGEST_KEY:
-        raise _refusal(f"The labels have {len(key)} characters together; at most {LONGEST_KEY} are possible.")
+        raise _refusal(f"The labels have {len(key)} characters together; at most {LONGEST_KEY} are allowed.")
     return key
 
 
@@ -42,7 +42,7 @@ def first_outside(labels: Mapping[str, str], allowed: Mapping[str, str] | None) 
 
 def _checked_pairs(labels: Mapping[str, str]) -> list[str]:
     if len(labels) > MOST_LABELS:
-        raise _refusal(f"There are {len(labels)} labels; at most {MOST_LABELS} are possible.")
+        raise _refusal(f"There are {len(labels)} labels; at most {MOST_LABELS} are allowed.")
     return [f"{quote(name, safe='')}={quote(value, safe='')}" for name, value in sorted(labels.items())]
 
 

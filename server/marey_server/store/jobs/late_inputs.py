@@ -155,7 +155,7 @@ def _pin_outputs(tx: Transaction, row: Row[Any], kind: KindDeclaration) -> Pinne
             pins[name] = [one | {"below": made[entries[0]["job"]].below(one)} for one in pins[name]]
     total = sum(map(len, pins.values()))
     if total > MOST_INPUTS:
-        raise LateInputError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are possible.")
+        raise LateInputError("too-many", f"The job has {total} inputs; at most {MOST_INPUTS} are allowed.")
     return pins
 
 

@@ -60,7 +60,7 @@ def require_newest(tx: Transaction, row: Row[Any], version: str | None) -> None:
     """Raise `ConflictProblem` if a version is named that is not the newest commit of the proposal."""
     if version is not None and resolve(tx, row.dataset_id, version) != row.head_now:
         raise ConflictProblem(
-            "The newest commit of the proposal is another one than the one that you name; look at it first.",
+            "The proposal has a newer commit than the one that you name; review the newer one first.",
             code="proposal-moved",
             context={"commit": row.head_now},
         )
