@@ -99,7 +99,7 @@ def write_archive(
 
 
 def short_name(commits: Iterable[str]) -> str:
-    """Return a part of a file name that differs for different commits."""
+    """Return a short text that identifies commits, for file names."""
     return "-".join(digest.removeprefix("sha256:")[:12] for digest in commits)
 
 
@@ -179,7 +179,7 @@ class _Making:
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
-        """Note the revision of an entry, and where its documents are; those of the `earlier` entry are not needed."""
+        """Note the revision of an entry, and where the server has its documents, except those of the `earlier` entry."""
         content = _content(entry)
         self.known.add(content)
         for part, digest in entry.parts.items():
@@ -239,7 +239,7 @@ class _Making:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, and the document of the earlier version does not."""
+        """Return the digests of the files that a document names, but its earlier version does not."""
         named = _files_in(body)
         if named and digest in self.earlier:
             (before,) = self._fetch([self.earlier[digest]])
@@ -269,7 +269,7 @@ class _Making:
             self.writer.add_stream(member, stream, fetched.stat().st_size)
 
     def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
-        """Return the first documents of a list, at least one."""
+        """Request documents; return as many of the first ones as one answer contains, at least one."""
         found: list[Any] = self._ask(ContentsRequest(documents=tuple(places)))["documents"]
         for place, tree in zip(places, found, strict=False):
             if not isinstance(tree, dict):
@@ -313,7 +313,7 @@ def _place(entry: Entry) -> tuple[str, str]:
 
 
 def _line(place: tuple[str, str], entry: Entry | None, unchanged: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the line of a list of changes that says what an entry is now."""
+    """Return the line that describes an entry after its change, for a list of changes."""
     path, kind = place
     if entry is None:
         return {"path": path, "kind": kind, "removed": True}

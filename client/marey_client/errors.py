@@ -54,7 +54,7 @@ class EarlierVersionsMissing(MareyError):
 
 
 class NothingToArchive(MareyError):
-    """The version that an archive leaves out has all commits of the version that it was to contain."""
+    """All commits of the version to archive are among those to leave out."""
 
 
 class FileChanged(MareyError):

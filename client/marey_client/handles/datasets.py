@@ -335,7 +335,7 @@ class DatasetHandle:
         return self.forward(into, made)
 
     def forward(self, branch: str, commit: Commit) -> ImportedVersion:
-        """Move a branch to a commit of the dataset if the commit follows it; create the branch if it does not exist."""
+        """Move a branch to a commit that follows its newest one; create the branch if it does not exist."""
         ref = self.find_ref(branch)
         if ref is None:
             self.create_branch(branch, commit.digest)
@@ -382,7 +382,7 @@ class DatasetHandle:
     def move_branch(self, name: str, to: str, *, expected_rev: int | None = None) -> Ref:
         """Move a branch to any version. No commit is deleted.
 
-        Raises `PreconditionFailed` if `expected_rev` is given and the branch is at another state.
+        Raises `PreconditionFailed` if `expected_rev` is given and the branch has changed since.
         """
         body = as_json(RefMove(at=to))
         state = ANY_STATE if expected_rev is None else {"If-Match": f'"{expected_rev}.json"'}

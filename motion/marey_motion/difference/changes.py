@@ -27,12 +27,12 @@ MOST_SPANS = 100
 
 
 class Course(NamedTuple):
-    """Frames of the clip after the change that are compared, and their rate.
+    """Frames of the new clip that are compared with frames of the old clip, and their rate.
 
     Parameters
     ----------
-    frames : (n,) int    increasing numbers of the matched frames of the clip after
-    frame_rate_hz : float    frames per second of the clip after
+    frames : (n,) int    increasing numbers of the matched frames of the new clip
+    frame_rate_hz : float    frames per second of the new clip
     """
 
     frames: Ints

@@ -111,7 +111,7 @@ def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
 
 
 def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timing, Move | None]:
-    """Match the frames. If the whole clip was moved, apply the movement to the clip before, and match again."""
+    """Match the frames. If the whole clip was moved, apply the movement to the old clip, and match again."""
     timing = compare_timing(before, after, rate_ratio)
     move = whole_move(*_paths(timing, after, None))
     if move is None:
@@ -124,7 +124,10 @@ def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timi
 
 
 def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
-    """Return the positions (n, 3) of the body in matched frames, before and after; `move` is undone in those before."""
+    """Return the positions (n, 3) of the body in matched frames of the old and of the new clip.
+
+    Those of the old clip are returned as they were before `move` was applied to it.
+    """
     pairs = timing.matching.pairs
     before = timing.before.roots[pairs[:, 0]].astype(np.float64)
     if move is not None:

@@ -1,4 +1,4 @@
-"""Candidates for the lag between two clips: the frame number in the clip after minus that in the clip before."""
+"""Candidates for the lag between two clips: the frame number in the new clip minus that in the old clip."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marey_motion.difference.poses import Poses
 MOST_LAGS = 16
 """Maximum number of candidates from each of the two methods."""
 WINDOWS = 12
-"""Number of windows of the clip before that are searched in the whole clip after."""
+"""Number of windows of the old clip that are searched in the whole clip after."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
 """Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
@@ -64,7 +64,7 @@ def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, 
     Parameters
     ----------
     before, after : Poses    frames of the same joints
-    unmatched : (n,) int    frames of the clip before on which windows are centred
+    unmatched : (n,) int    frames of the old clip on which windows are centred
 
     Returns
     -------
@@ -100,9 +100,9 @@ def _window_distances(window: Floats, spectrum: Complexes, energy: Floats, size:
 
 
 def likely_pace(before: Poses, after: Poses) -> float:
-    """Estimate the pace at which the clip after was resampled from the clip before, or from a part of it.
+    """Estimate the pace at which the new clip was resampled from the old clip, or from a part of it.
 
-    Windows of the clip after are stretched to many paces, and each is compared with every place of the clip before.
+    Windows of the new clip are stretched to many paces, and each is compared with every place of the old clip.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ class Matching(NamedTuple):
 
     Parameters
     ----------
-    pairs : (n, 2) int    frames of the clip before and matched frames of the clip after, both increasing
+    pairs : (n, 2) int    frames of the old clip and matched frames of the new clip, both increasing
     costs : (n,) float64    costs of the pairs
     total : float    cost of the matching, including removed and inserted frames
     """
@@ -68,14 +68,14 @@ def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matchin
 
 
 def _poorly_matched(matching: Matching, count: int) -> Ints:
-    """Return the frames of the clip before that are unmatched, or matched with a different frame."""
+    """Return the frames of the old clip that are unmatched, or matched with a different frame."""
     well = np.zeros(count, dtype=np.bool_)
     well[matching.pairs[matching.costs <= WELL_MATCHED, 0]] = True
     return np.flatnonzero(~well)
 
 
 class _Diagonal(NamedTuple):
-    """All pairs of frames with one lag; `start` and `stop` limit frames of the clip before; `costs` are cumulative."""
+    """All pairs of frames with one lag; `start` and `stop` limit frames of the old clip; `costs` are cumulative."""
 
     lag: int
     start: int

@@ -64,9 +64,9 @@ class Timing(NamedTuple):
 
     Parameters
     ----------
-    pace : Pace    sampling of the clip before
-    before : Poses    the clip before, sampled at that pace
-    matching : Matching    pairs of frames of the sampled clip and of the clip after
+    pace : Pace    sampling of the old clip
+    before : Poses    the old clip, sampled at that pace
+    matching : Matching    pairs of frames of the sampled clip and of the new clip
     """
 
     pace: Pace
@@ -80,7 +80,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
     Parameters
     ----------
     before, after : Poses    frames of the same joints
-    rate_ratio : float    frame rate of the clip after, divided by that of the clip before
+    rate_ratio : float    frame rate of the new clip, divided by that of the old clip
 
     Returns
     -------

@@ -50,7 +50,7 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion) -> str:
-    """Return the sentence that says where a version is now that was imported for a branch, and what to do next."""
+    """Return a sentence about an imported version: which branch is at it now, or how to merge it into the branch."""
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
     if not made.moved:
         return (
