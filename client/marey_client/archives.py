@@ -179,7 +179,7 @@ class _Making:
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
-        """Note the revision of an entry, and where the server has its documents, except those of the `earlier` entry."""
+        """Note the revision of an entry, and where the server has its documents, except those of `earlier`."""
         content = _content(entry)
         self.known.add(content)
         for part, digest in entry.parts.items():

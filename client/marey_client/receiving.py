@@ -112,7 +112,7 @@ class _Import:
         return self.dataset.at(head)
 
     def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:
-        """Return the digests of the commits that the dataset has. If it has a commit, it has all commits before that, too."""
+        """Return the digests of the commits that the dataset has; if it has one, it has all commits before that."""
         known: set[str] = set()
         for digest, record in reversed(history):
             if digest not in known and not self.dataset.has(digest):
