@@ -68,7 +68,10 @@ def told_commands() -> list[tuple[str, str]]:
 def test_every_command_that_a_page_tells_exists_with_these_options(page: str, line: str) -> None:
     words = shlex.split(line.rstrip("&").replace("…", ""), comments=True)[1:]
     command: Any = COMMANDS
-    known = {option for parameter in command.params for option in parameter.opts}
+    of_all = {option: parameter for parameter in command.params for option in parameter.opts}
+    known = set(of_all)
+    while words and words[0] in of_all:  # options before the command's name
+        words = words[1 if of_all[words[0]].is_flag else 2 :]
     while words and words[0] in getattr(command, "commands", {}):
         command = command.commands[words.pop(0)]
     assert not hasattr(command, "commands"), f"{page}: {line}"
