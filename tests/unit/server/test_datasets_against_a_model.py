@@ -357,18 +357,18 @@ def known_items(lab: Lab) -> dict[str, str]:
     return found
 
 
-def run(lab: Lab, known: dict[str, str], count: int = 15) -> None:
+def run(lab: Lab, known: dict[str, str], count: int, length: int) -> None:
     run_state_machine_as_test(
         lambda: DatasetMachine(lab, known),  # type: ignore[arg-type]
         settings=settings(
-            max_examples=examples(count), stateful_step_count=steps(30), deadline=None, print_blob=False,
+            max_examples=count, stateful_step_count=length, deadline=None, print_blob=False, report_multiple_bugs=False,
             suppress_health_check=list(HealthCheck), phases=[Phase.explicit, Phase.generate],
         ),
     )  # fmt: skip
 
 
 def test_a_dataset_behaves_as_its_model(lab: Lab, known_items: dict[str, str]) -> None:
-    run(lab, known_items)
+    run(lab, known_items, examples(15), steps(30))
 
 
 def drop_their_side(patch: pytest.MonkeyPatch) -> None:
@@ -390,4 +390,4 @@ def test_the_model_finds_planted_faults(
 ) -> None:
     plant(monkeypatch)
     with pytest.raises((AssertionError, ApiProblem, pytest.fail.Exception)):
-        run(lab, known_items, 50)
+        run(lab, known_items, 1000, 50)  # in every tier: it ends with the first program that finds the fault
