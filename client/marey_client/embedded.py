@@ -18,6 +18,7 @@ from typing import Any
 from marey_client.credentials import Credential
 from marey_client.errors import MareyError
 from marey_schemas.documents.differences import Difference
+from marey_schemas.lineage import LineageGraph
 
 
 class NotInstalled(MareyError):
@@ -46,6 +47,18 @@ def work(credential: Credential, **options: Any) -> None:
 def draw_difference(difference: Difference, file_type: str) -> bytes:
     """Return a picture of a difference as a file of the type `png` or `svg`."""
     picture: bytes = room("marey_reports.differences.picture", "figures").draw_difference(difference, file_type)
+    return picture
+
+
+def draw_lineage(graph: LineageGraph, file_type: str) -> bytes:
+    """Return a picture of a lineage graph as a file of the type `svg`, `png` or `dot`.
+
+    Raises `MareyError` if the graph is too large for a picture.
+    """
+    try:
+        picture: bytes = room("marey_reports.lineage.picture", "figures").draw_lineage(graph, file_type)
+    except ValueError as error:
+        raise MareyError(str(error)) from error
     return picture
 
 

@@ -24,6 +24,7 @@ from marey_schemas.items import (
     Staleness,
 )
 from marey_schemas.kinds import Kind
+from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queue.jobs import ItemInput
 
 
@@ -109,6 +110,16 @@ class ItemHandle:
     def lineage(self) -> Lineage:
         """Return the inputs of the newest revision, and the results computed from it."""
         return self.transport.get(Lineage, f"{self.url}/lineage")
+
+    def lineage_graph(self, revision: int | None = None, **options: Any) -> LineageGraph:
+        """Return what a revision, by default the newest, was made from, and what was made from it, through all jobs.
+
+        `options` are those of `LineageOptions`, such as `direction="inputs"` and `depth=1`. Raises `NotFound` if there
+        is no such revision.
+        """
+        request = LineageRequest.model_validate({"revision": revision, **options})
+        params = request.model_dump(mode="json", exclude_defaults=True)
+        return self.transport.get(LineageGraph, f"{self.url}/lineage-graph", params)
 
     def staleness(self) -> Staleness:
         """Return whether an input of the item has a newer revision."""

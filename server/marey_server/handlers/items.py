@@ -7,6 +7,7 @@ from pydantic import Field
 from marey_schemas.base import Request
 from marey_schemas.items import Item, ItemChange, ItemCreate, ItemRevert, Lineage, QueryExplanation, Revision, Staleness
 from marey_schemas.kinds import Kind
+from marey_schemas.lineage import LineageGraph, LineageRequest
 from marey_schemas.queries.grammar import MOST_CHARACTERS
 from marey_schemas.sizes import MIB
 from marey_server.errors import NotFoundProblem
@@ -214,6 +215,18 @@ class LineageResource(Resource):
         return await self.answer(items.read_lineage, project, kind_of(kind), item, revision_number=query.revision)
 
 
+class LineageGraphResource(Resource):
+    """Lineage of a revision through any number of jobs."""
+
+    path = "/projects/{project}/{kind}/{item}/lineage-graph"
+    tag = "ItemsOfKind"
+
+    @reads(access=Access.READER, query=LineageRequest, answer=LineageGraph)
+    async def get(self, project: str, kind: str, item: str, query: LineageRequest) -> Rendered:
+        """Return the revisions that a revision was made from and that were made from it, and the jobs between them."""
+        return await self.answer(items.read_lineage_graph, project, kind_of(kind), item, query)
+
+
 class StalenessResource(Resource):
     """Staleness of an item."""
 
@@ -257,5 +270,6 @@ RESOURCES: tuple[type[Resource], ...] = (
     Revisions,
     RevisionResource,
     LineageResource,
+    LineageGraphResource,
     StalenessResource,
 )

@@ -18,6 +18,7 @@ from marey_server.store.items.changing import (
 )
 from marey_server.store.items.drafts import Draft, Published, StoredDocument
 from marey_server.store.items.history import list_revisions, read_lineage, read_revision, read_staleness
+from marey_server.store.items.lineage_graphs import read_lineage_graph
 from marey_server.store.items.listing import ItemFilters, explain_query, list_items
 from marey_server.store.items.publishing import publish
 from marey_server.store.items.reading import (
@@ -59,6 +60,7 @@ __all__ = [
     "put_part",
     "read_item",
     "read_lineage",
+    "read_lineage_graph",
     "read_part",
     "read_revision",
     "read_staleness",

@@ -39,14 +39,14 @@ def list_revisions(
 def read_revision(tx: Transaction, project_name: str, kind: Kind, item_id: str, number: int) -> Revision:
     """Return one revision of an item."""
     find_item(tx, projects.require(tx, project_name), kind, item_id)
-    return _shown(tx, [_find_revision(tx, item_id, number)])[0]
+    return _shown(tx, [find_revision(tx, item_id, number)])[0]
 
 
 def _revision_rows() -> Select[Any]:
     return select(revision, user.c.name.label("author")).outerjoin(user, user.c.id == revision.c.author_id)
 
 
-def _find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
+def find_revision(tx: Transaction, item_id: str, number: int) -> Row[Any]:
     row = tx.execute(_revision_rows().where(revision.c.item_id == item_id, revision.c.number == number)).first()
     if row is None:
         raise no_revision(item_id, number)
@@ -75,7 +75,7 @@ def read_lineage(
     """Return the inputs, job and uses of a revision (default: the newest), as far as the caller may see them."""
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head
-    made = _find_revision(tx, item_id, number)
+    made = find_revision(tx, item_id, number)
     how = None if made.job_id is None else tx.execute(select(job).where(job.c.id == made.job_id)).first()
     source = and_(lineage.c.item_id == item_id, lineage.c.number == number)
     inputs = _edges(tx, lineage.c.input_item_id, lineage.c.input_number, source)

@@ -1,0 +1,100 @@
+"""Places of the boxes of a directed graph without circles, in layers from left to right.
+
+The method of Sugiyama, Tagawa and Toda (1981): every box stands to the right of all boxes that have arrows to it; an
+arrow that passes over layers gets a place in each of them; the order within a layer follows the mean positions of the
+neighbours.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+SWEEPS = 12
+"""Number of times that the order of all layers is improved."""
+MOST_PASSED = 100_000
+"""Greatest number of layers that all arrows pass together."""
+
+
+class Layout(NamedTuple):
+    """Nodes by layer, in their order from top to bottom, and for each arrow the nodes that it passes.
+
+    Nodes below the number of boxes are boxes; the others are places that arrows pass through.
+    """
+
+    layers: list[list[int]]
+    routes: list[list[int]]
+
+
+def lay_out(count: int, arrows: Sequence[tuple[int, int]]) -> Layout:
+    """Return the layers of `count` boxes with arrows between them.
+
+    Raises `ValueError` for a circle of arrows, and for arrows that pass more than `MOST_PASSED` layers together.
+    """
+    depth = _depths(count, arrows)
+    if sum(depth[target] - depth[source] for source, target in arrows) > MOST_PASSED:
+        raise ValueError("the lineage is too deep for a picture; choose a smaller depth, or write a .dot file")
+    layers: list[list[int]] = [[] for _ in range(max(depth, default=-1) + 1)]
+    for box, layer in enumerate(depth):
+        layers[layer].append(box)
+    routes = []
+    new = count
+    for source, target in arrows:
+        route = [source]
+        for layer in range(depth[source] + 1, depth[target]):
+            layers[layer].append(new)
+            route.append(new)
+            new += 1
+        routes.append([*route, target])
+    _reorder(layers, routes)
+    return Layout(layers, routes)
+
+
+def _depths(count: int, arrows: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the layer of each box: sources stand directly before the first box that they have an arrow to."""
+    before, after = defaultdict(list), defaultdict(list)
+    for source, target in arrows:
+        before[target].append(source)
+        after[source].append(target)
+    waiting = [len(before[box]) for box in range(count)]
+    order = [box for box in range(count) if not waiting[box]]
+    depth = [0] * count
+    for box in order:
+        for target in after[box]:
+            depth[target] = max(depth[target], depth[box] + 1)
+            waiting[target] -= 1
+            if not waiting[target]:
+                order.append(target)
+    if len(order) < count:
+        raise ValueError("the arrows form a circle")
+    for box in reversed(order):
+        if not before[box] and after[box]:
+            depth[box] = min(depth[target] for target in after[box]) - 1
+    return depth
+
+
+def _reorder(layers: list[list[int]], routes: Sequence[Sequence[int]]) -> None:
+    left, right = defaultdict(list), defaultdict(list)
+    for route in routes:
+        for one, other in pairwise(route):
+            right[one].append(other)
+            left[other].append(one)
+    for sweep in range(SWEEPS):
+        forward = sweep % 2 == 0
+        neighbours = left if forward else right
+        for layer in layers if forward else reversed(layers):
+            _sort_layer(layer, layers, neighbours)
+
+
+def _sort_layer(layer: list[int], layers: Sequence[Sequence[int]], neighbours: dict[int, list[int]]) -> None:
+    """Sort a layer by the mean position of each node's neighbours; a node without neighbours keeps its position."""
+    position = {node: (index + 0.5) / len(one) for one in layers for index, node in enumerate(one)}
+    means = {
+        node: sum(position[other] for other in neighbours[node]) / len(neighbours[node])
+        if neighbours[node]
+        else position[node]
+        for node in layer
+    }
+    layer.sort(key=means.__getitem__)

@@ -1,0 +1,154 @@
+"""Lineage as a graph: revisions, the jobs that created them, and the commits that jobs took inputs from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import datetime
+from posixpath import commonpath
+from typing import Literal, NamedTuple
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Options
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+
+MOST_REVISIONS = 1000
+"""Greatest number of revisions that a graph holds in each direction."""
+MOST_LINKS = 10_000
+"""Greatest number of links that a graph holds in each direction."""
+CUT_OFF = (
+    f"The graph is cut off: it has more than {MOST_REVISIONS:,} revisions or {MOST_LINKS:,} links in one direction. "
+    "The nearest ones are shown."
+)
+"""Note on a graph that is not complete."""
+
+
+class LineageOptions(Options):
+    """Options of a lineage graph: its direction and its depth."""
+
+    direction: Literal["inputs", "results", "both"] = Field(
+        "both", description="`inputs`: what the revision was made from; `results`: what was made from it; `both`."
+    )
+    depth: int = Field(
+        MOST_REVISIONS, ge=1, le=MOST_REVISIONS, description="Greatest number of jobs between the start and a revision."
+    )
+
+
+class LineageRequest(LineageOptions):
+    """Query of a lineage graph: the revision it starts from, its direction and its depth."""
+
+    revision: int | None = Field(None, ge=1, lt=2**31, description="Revision to start from; absent: the newest.")
+
+
+class LineageRevision(Answer):
+    """A revision in a lineage graph."""
+
+    item: str
+    kind: Kind
+    path: str = Field(description="Current folder and name of the item.")
+    revision: int
+    newest: int = Field(description="Newest revision of the item. If it is greater than `revision`, this one is old.")
+    deleted: bool = False
+    distance: int = Field(
+        description="Number of jobs between the start and this revision: negative for inputs, positive for results."
+    )
+    job: str | None = Field(
+        None, description="Job that created the revision, or the parent of the task that did; absent: not a job."
+    )
+    created_at: datetime
+
+
+class LineageLink(Answer):
+    """A revision that a job used in order to create another one."""
+
+    source: int = Field(description="Position of the revision that was used in `revisions`.")
+    result: int = Field(description="Position of the revision that was created in `revisions`.")
+    role: str = Field(description="Name of the job input for which the source was used.")
+
+
+class LineageJob(Answer):
+    """A job that created revisions of a lineage graph."""
+
+    id: str
+    kind: str
+    seed: int
+    code_versions: tuple[str, ...] = Field((), description="Versions of the code that created the revisions.")
+    commits: tuple[str, ...] = Field((), description="Digests of the commits from which the job took its inputs.")
+    finished_at: datetime | None = None
+
+
+class LineageGraph(Answer):
+    """Revisions that a revision was made from, or that were made from it, through any number of jobs."""
+
+    revisions: tuple[LineageRevision, ...] = Field(description="The revision that the graph starts from is the first.")
+    links: tuple[LineageLink, ...]
+    jobs: tuple[LineageJob, ...]
+    complete: bool = Field(description="False if the graph was cut off, because it has too many revisions or links.")
+
+
+class LineageGroup(NamedTuple):
+    """Revisions of one kind that one job created, and that the same jobs used for the same inputs.
+
+    Parameters
+    ----------
+    revisions : positions in the revisions of the graph, in the order of the graph
+    """
+
+    revisions: tuple[int, ...]
+    kind: Kind
+    job: str | None
+
+
+class GroupLink(NamedTuple):
+    """Links from a group of revisions to a group that was made from it, with the number of revisions that were used."""
+
+    source: int
+    result: int
+    role: str
+    used: int
+
+
+def grouped(graph: LineageGraph) -> tuple[list[LineageGroup], list[GroupLink]]:
+    """Gather the revisions of a graph in groups, so that the lineage of hundreds of clips can be read.
+
+    The start is a group of its own, and the first one.
+    """
+    used_by: list[set[tuple[str, str | None]]] = [set() for _ in graph.revisions]
+    for link in graph.links:
+        used_by[link.source].add((link.role, graph.revisions[link.result].job))
+    members: dict[object, list[int]] = {}
+    for position, one in enumerate(graph.revisions):
+        alike = (one.kind, one.job, frozenset(used_by[position]), one.distance)
+        members.setdefault(alike if position else None, []).append(position)
+    groups = [
+        LineageGroup(tuple(positions), graph.revisions[positions[0]].kind, graph.revisions[positions[0]].job)
+        for positions in members.values()
+    ]
+    group_of = {position: index for index, group in enumerate(groups) for position in group.revisions}
+    used = {(link.source, group_of[link.result], link.role) for link in graph.links}
+    counts = Counter((group_of[source], result, role) for source, result, role in used)
+    return groups, [GroupLink(*key, count) for key, count in sorted(counts.items())]
+
+
+def title_of(graph: LineageGraph, group: LineageGroup) -> str:
+    """Return a title: "raw/walk@2" for one revision, "12 clips in raw" for several."""
+    members = [graph.revisions[position] for position in group.revisions]
+    if len(members) == 1:
+        return f"{members[0].path}@{members[0].revision}"
+    shared = commonpath([one.path.rpartition("/")[0] for one in members])
+    return f"{counted(len(members), group.kind.value)}{f' in {shared}' if shared else ''}"
+
+
+def remarks_on(graph: LineageGraph, group: LineageGroup) -> list[str]:
+    """Return what a reader should know about the revisions of a group: that some are old, that some are deleted."""
+    members = [graph.revisions[position] for position in group.revisions]
+    old = [one for one in members if one.newest > one.revision]
+    deleted = [one for one in members if one.deleted]
+    if len(members) == 1:
+        return [f"newest: {one.newest}" for one in old] + ["deleted" for _ in deleted]
+    counts = (
+        (len(old), "with a newer revision" if len(old) == 1 else "with newer revisions"),
+        (len(deleted), "deleted"),
+    )
+    return [f"{count} {what}" for count, what in counts if count]
