@@ -55,7 +55,7 @@ class _Range:
     quality: float
 
     def specificity(self, offer: MediaType) -> int:
-        """Return how specifically this range matches `offer`; 0 if it does not."""
+        """Return how specifically this range matches `offer`: a higher number is more specific, 0 is no match."""
         main, _, sub = offer.name.partition("/")
         held = {("arrays", offer.arrays)}
         if self.type == "*":
@@ -68,7 +68,7 @@ class _Range:
 
 
 def choose(accept: str | None, offers: tuple[MediaType, ...]) -> MediaType:
-    """Return the offered media type that the client prefers; of equal ones, the first.
+    """Return the offered media type that the client prefers; if it prefers several equally, the first of these.
 
     Raises `NotAcceptableProblem`, which lists the offered types.
     """

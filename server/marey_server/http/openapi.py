@@ -117,22 +117,25 @@ class _Models:
         self.components: dict[str, Schema] = definitions.get("$defs", {})
 
     def reading(self, model: type[BaseModel]) -> Schema:
-        """Return a reference to a model in a request."""
+        """Return a `$ref` to the schema of a model that requests contain."""
         return dict(self._refs[model, "validation"])
 
     def writing(self, model: type[BaseModel]) -> Schema:
-        """Return a reference to a model in an answer."""
+        """Return a `$ref` to the schema of a model that answers contain."""
         return dict(self._refs[model, "serialization"])
 
     def partial(self, model: type[BaseModel]) -> Schema:
-        """Return a reference to a model of which only some fields are present."""
+        """Return a `$ref` to a new schema: that of the model in answers, but without required fields."""
         name = f"Some{model.__name__}"
         full = self.components[self.writing(model)["$ref"].rpartition("/")[2]]
         self.components[name] = {key: value for key, value in full.items() if key != "required"} | {"title": name}
         return {"$ref": _REF.format(model=name)}
 
     def document(self) -> Schema:
-        """Return the schema of any document: `anyOf`, because the open schema also matches the other documents."""
+        """Return the schema that matches every kind of document.
+
+        It uses `anyOf`, not `oneOf`, because the open schema also matches the documents of other schemas.
+        """
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 
 
@@ -184,7 +187,7 @@ def _query_parameters(operation: Operation) -> list[Schema]:
 
 
 def _without_null(schema: Schema) -> Schema:
-    """Remove null from the schema of a parameter: a parameter without a value is left out of the query."""
+    """Remove null from the schema of a query parameter: a client omits a parameter instead of sending null."""
     shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
     shown.pop("title", None)
     choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]

@@ -27,7 +27,7 @@ CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=10
 
 
 class PageQuery(Request):
-    """Query of a page of a list."""
+    """Query parameters that select one page of a list."""
 
     limit: int = Field(DEFAULT_LIMIT, ge=1, le=MAX_LIMIT, description="Greatest number of entries in a page.")
     cursor: str | None = Field(
@@ -36,7 +36,7 @@ class PageQuery(Request):
 
 
 class CountedPageQuery(PageQuery):
-    """Query of a page of a list, optionally with the number of all entries."""
+    """Query parameters that select one page of a list, and optionally request the number of all entries."""
 
     count: Literal["exact"] | None = Field(
         None, description="Return the length of the whole list, which is slow for long lists."

@@ -45,7 +45,7 @@ class Lasting:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """Document that was loaded and must still be encoded; one with a digest never changes."""
+    """Document that was loaded and must still be encoded. A document with a `digest` never changes."""
 
     make: MakeTree
     size_bytes: int
@@ -60,7 +60,7 @@ Content = BaseModel | Mapping[str, Any] | bytes
 class Reply:
     """Answer of a handler: a model, a document tree, bytes with their media type, or nothing.
 
-    `rev` is the state for the ETag; `location` is a path below the API's root.
+    The ETag is made from `rev`; `location` is a path below the API's root.
     """
 
     content: Content | Lasting | Loaded | None = None

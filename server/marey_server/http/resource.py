@@ -120,7 +120,7 @@ class Resource(Exchange):
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Rendered:
-        """Run `function(tx, ...)` and return its result as rendered answer, with the ETag and the declared status."""
+        """Run `function(tx, ...)` and return its result as a rendered answer, with the ETag and the declared status."""
         return await self.answer_with(self._declared_reply, function, *args, **kwargs)
 
     async def answer_with(
@@ -141,7 +141,10 @@ class Resource(Exchange):
         return outcome if isinstance(outcome, Rendered) else await self.render_document(outcome)
 
     async def render_document(self, reply: Reply) -> Rendered:
-        """Render a document that was loaded, in a thread for rendering; until then, its memory is counted."""
+        """Render a loaded document in a rendering thread.
+
+        Until the document is rendered, its memory counts towards the limits on the memory of requests.
+        """
         rendering, answers = self.services.compute_threads.rendering, self.services.answers
         loaded_bytes = reply.content.size_bytes if isinstance(reply.content, Loaded) else 0
         self.holding.grow(loaded_bytes)
@@ -164,7 +167,7 @@ class Resource(Exchange):
 
     @cached_property
     def client(self) -> Client:
-        """Client to which this request counts when clients take turns: a known token, or an address."""
+        """Client for which this request counts in queues: a token that was accepted before, or else an address."""
         token = self.caller.token
         if token is not None and self.services.knows(token):
             return Client(hash_secret(token), is_gone=self.is_gone)
@@ -177,7 +180,10 @@ class Resource(Exchange):
 
     @asynccontextmanager
     async def using_children(self) -> AsyncIterator[None]:
-        """Count this request as one that uses children. Raises `UnavailableProblem` if there are too many."""
+        """Count this request, inside the block, among those that use child processes.
+
+        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
+        """
         if self.principal is None:  # children are shared among users, not among their tokens
             await self.look_up(_identify)
         with self.services.children.request(self._child_user):
@@ -204,9 +210,9 @@ class Resource(Exchange):
             self._in_children.discard(task)
 
     async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Like `compute_in_child`, for a request that does nothing else.
+        """Like `compute_in_child`, but also count the request with `using_children` during the call.
 
-        Raises `UnavailableProblem` if too many requests use children.
+        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
         """
         async with self.using_children():
             order = await self.compute(make)
@@ -215,7 +221,7 @@ class Resource(Exchange):
 
     @property
     def _child_user(self) -> str:
-        """The user whose share of the children is used; all strangers together have the share of one user."""
+        """User whose share of child processes this request uses; callers without a user have one share together."""
         user = self.principal.user_id if self.principal is not None else None
         return user or STRANGERS
 
@@ -451,4 +457,4 @@ def _read_tree(decode: Callable[[], Any], content: Any) -> Any:
 
 
 def _identify(_tx: Transaction) -> None:
-    """Do nothing; every transaction identifies the caller, so this function only starts one."""
+    """Do nothing. It is run in a transaction only because every transaction identifies the caller."""

@@ -44,9 +44,9 @@ class ByteRange:
 
 
 def parse_range(header: str | None, if_range: str | None, etag: str) -> ByteRange | None:
-    """Return the requested range, or None for the whole.
+    """Return the byte range that the Range header requests, or None if the whole blob is to be sent.
 
-    It is also None for several or malformed ranges, and if If-Range names another state.
+    The whole blob is also sent if the header is malformed or requests several ranges, or if If-Range is not `etag`.
     """
     if header is None or (if_range is not None and if_range.strip() != etag):
         return None

@@ -40,7 +40,7 @@ async def local_workers(
     url : address of this server
     token : token of a user who may run jobs, with the scope `work`
     cache : folder where the workers keep inputs
-    log_form, log_level : form and level of their logs, which go to the same place as this server's log
+    log_form, log_level : form and level of the workers' logs, which go to the same place as this server's log
     """
     logging_as_here = {"MAREY_LOG_FORM": log_form, "MAREY_LOG_LEVEL": log_level}
     workers = [_LocalWorker(f"local-{number}", url, token, cache, logging_as_here) for number in range(1, count + 1)]

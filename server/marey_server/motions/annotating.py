@@ -25,8 +25,8 @@ def apply_commands(
 ) -> ChangedAnnotation:
     """Apply commands to an annotation in order, all or none. Needs no database.
 
-    An error is returned, not raised: `put_changed` raises it inside the transaction that stores the answer for repeated
-    requests, so that they get the same answer even if the annotation has changed since.
+    An error is returned, not raised. `put_changed` raises it later, inside the transaction that stores the answer under
+    the idempotency key. So a repeated request gets the same error, even if the annotation has changed since.
     """
     if not is_expected(found.rev, expected_rev):
         return ChangedAnnotation(found.rev, moved_on(found.rev))

@@ -1,12 +1,12 @@
 """Child process of the server that reads untrusted files and computes.
 
-It carries out one order after another, within limits; an order is the call of a function.
+It carries out one order after another, each within limits of memory and time. An order is the call of a function.
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
 Arguments: the pipe's file descriptor, the memory in bytes that orders may use, and functions to call before the first
-order, which load modules. The parent kills this process if an order takes too long, or if its client has closed the
-connection.
+order, which load modules. The parent kills this process if an order takes too long, or if the client that waits for its
+result has closed the connection.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def pack_tree(tree: Any) -> bytes:
 
 
 def unpack_tree(packed: bytes) -> Any:
-    """Return a document of an order, with decoded arrays. Raises `TooLargeProblem`."""
+    """Decode a document that was packed by `pack_tree`, with its arrays. Raises `TooLargeProblem`."""
     try:
         return decode_tree(packed, MSGPACK)
     except CodecError as error:

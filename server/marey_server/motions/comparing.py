@@ -41,7 +41,10 @@ MOST_FIELDS = 1000
 
 @dataclass(frozen=True, slots=True)
 class ComparedSide:
-    """A revision with the documents of its differing parts; `hierarchy` is the skeleton of a motion."""
+    """One of the two compared revisions, with the documents of the parts that differ.
+
+    `hierarchy` is the skeleton of the motion, if the part `motion` differs.
+    """
 
     place: ComparedRevision
     parts: Mapping[str, PartSummary]
@@ -191,7 +194,7 @@ DESCRIBED: dict[str, frozenset[str]] = {
 
 
 def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> list[FieldChange]:
-    """List the changed values of the parts that both revisions have, except the values of members in `DESCRIBED`."""
+    """List changed values in the parts that both revisions have, except the members in `DESCRIBED`."""
     from marey_motion.difference.fields import changed_values
 
     found: list[FieldChange] = []
@@ -205,7 +208,7 @@ def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> li
 
 
 def _described(order: DifferenceOrder, before: Mapping[str, Tree], after: Mapping[str, Tree]) -> dict[str, Any]:
-    """Compare the parts that have a description of their own; return members of `Difference`."""
+    """Compare parts that have their own comparison, such as motions; return the results as members of `Difference`."""
     from marey_motion.difference import fields, layers, skeletons
 
     found: dict[str, Any] = {}

@@ -58,7 +58,7 @@ class Given:
 
 
 class BeginOrder(Message):
-    """Order to start a stream; `measured` is the evaluation's part `evaluation` as bytes."""
+    """Order to start a stream. `measured` is the encoded part `evaluation` of the evaluation to which it refers."""
 
     request: CoverageStreamCreate
     skeleton: Tree | None

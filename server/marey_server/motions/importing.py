@@ -49,7 +49,10 @@ class SourceFile:
 
 @dataclass(frozen=True, slots=True)
 class PreparedImport:
-    """File that was read and encoded, ready to be stored; if there is nothing to store, its entry in the answer."""
+    """File of an import after it was read, ready to be stored.
+
+    If there is nothing to store, `entry` is the entry of the file in the answer.
+    """
 
     name: str
     sources: tuple[SourceFile, ...] = ()
@@ -78,7 +81,7 @@ def plan(names: Sequence[str]) -> list[PlannedFile]:
 
 
 def planned_entry(planned: PlannedFile) -> PreparedImport | None:
-    """Return the entry of a file that is not read itself, or None."""
+    """Return the entry of a file that is not read on its own (a companion file, or a refused name), or else None."""
     with LOADING:
         from marey_motion.importing.files import planned_entry
 
@@ -89,7 +92,7 @@ def planned_entry(planned: PlannedFile) -> PreparedImport | None:
 def file_order(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> bytes:
-    """Return the order by which a child process reads a file with its companion."""
+    """Return the order to read a file in a child process, together with its companion file if it has one."""
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton
 
@@ -147,7 +150,7 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 
 
 def mapping_order(file: PreparedImport) -> bytes:
-    """Return the order by which a child process derives the joint mapping and axes of a file's skeleton."""
+    """Return the order to derive the joint mapping and axes of a file's skeleton in a child process."""
     with LOADING:
         from marey_server.motions.reading import MappingOrder, ReadDocument
 
@@ -222,7 +225,10 @@ def publish(tx: Transaction, project: str, files: Sequence[PreparedImport]) -> l
 
 
 def _runs(files: Sequence[PreparedImport]) -> Iterator[list[PreparedImport]]:
-    """Split files into runs that are published together; a graph is a separate run, because it names earlier models."""
+    """Split files into groups of consecutive files that are stored together.
+
+    Each graph is a group of its own, because it can name models of earlier files, which must be stored first.
+    """
     for is_graph, run in itertools.groupby(files, lambda file: file.graph is not None):
         if is_graph:
             yield from ([file] for file in run)
@@ -255,7 +261,10 @@ def _publish(tx: Transaction, row: ProjectRow, files: Sequence[PreparedImport]) 
 
 
 def graph_draft(tx: Transaction, project: str, graph: ImportedGraph) -> Draft:
-    """Return the draft of a graph with models of the project. Raises `InvalidProblem`."""
+    """Return the draft of a graph whose nodes refer to models of the project by name.
+
+    Raises `InvalidProblem` if a model is missing or ambiguous.
+    """
     with LOADING:
         from marey_motion.errors import MotionError
         from marey_motion.importing.graphs import FEW, NamedModel, graph_item

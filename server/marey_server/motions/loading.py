@@ -1,4 +1,4 @@
-"""Lock for imports of the motion library, which the server loads only when a request needs it."""
+"""Lock around `import` statements of the motion library, which the server loads only when a request needs it."""
 
 from __future__ import annotations
 

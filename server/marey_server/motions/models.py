@@ -113,7 +113,7 @@ def load_model(tx: Transaction, project: str, found: FoundModel) -> LoadedModel:
 
 
 def pack_model(loaded: LoadedModel, tree: dict[str, Any] | None, mapping: dict[str, Any] | None) -> bytes:
-    """Return the documents of a model as a packed `PackedModel`."""
+    """Return a model with its tree and mapping as the bytes of a `PackedModel`."""
     return PackedModel(
         model=pack_tree(loaded.model),
         hierarchy=pack_tree(loaded.hierarchy),

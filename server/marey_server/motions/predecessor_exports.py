@@ -50,7 +50,7 @@ class PredecessorOptions:
 def unchanged_original(kind: Kind, parts: Parts, options: PredecessorOptions) -> StoredOriginal | None:
     """Return the file that a model, a tree or a graph was imported from, if the requested part is unchanged.
 
-    Arrays of the parts may be references to stored ones.
+    The documents in `parts` may contain references to stored arrays in place of the arrays.
     """
     if options.layout is not None:
         return None
@@ -116,7 +116,10 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
 
 
 def _alignment(part: Mapping[str, Any]) -> bytes:
-    """Return the time function, and the sections between keyframes in canonical frames."""
+    """Return the predecessor's alignment file: the time function, and the sections between keyframes.
+
+    Sections are ranges of frames on the canonical timeline.
+    """
     from marey_motion.formats.predecessor.alignment import write_predecessor_alignment
 
     info = AlignmentInfo.model_validate(part)

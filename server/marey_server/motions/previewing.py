@@ -79,7 +79,7 @@ class PreviewOrder(Message):
 def read_preview(tx: Transaction, project: str, kind: Kind, item_id: str, request: EditPreviewRequest) -> PreviewSource:
     """Read the inputs of a preview.
 
-    Raises `NotFoundProblem`, and `TooLargeProblem` if only a job may do so much work.
+    Raises `NotFoundProblem`, and `TooLargeProblem` if the edit is so large that only a job may compute it.
     """
     if kind is not Kind.CLIP:
         raise NotFoundProblem(f"Only clips can be edited, not an item of the kind {kind}.", code="not-a-clip")
@@ -182,7 +182,8 @@ def make_preview(packed: bytes) -> bytes:
 def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
     """Return the clips that the edit creates.
 
-    Raises `TooLargeProblem` if only a job may do so much work, and `InvalidProblem`.
+    Raises `TooLargeProblem` if the edit is so large that only a job may compute it, and `InvalidProblem` if a command
+    cannot be applied.
     """
     from marey_motion.editing.registry import edit_clip
     from marey_motion.errors import MotionError

@@ -25,7 +25,7 @@ _SKELETONS_KEPT = 64
 
 
 class FileOrder(Message):
-    """Order to read a file with its companion."""
+    """Order to read a file, together with its companion file if it has one."""
 
     planned: PlannedFile
     content: bytes
@@ -48,14 +48,14 @@ class FileOrder(Message):
 
 
 def packed_skeleton(given: GivenSkeleton | None) -> tuple[str, int, bytes] | None:
-    """Return a stored skeleton in the form of `FileOrder`."""
+    """Return a stored skeleton as the value of the field `skeleton` of `FileOrder`."""
     if given is None:
         return None
     return given.item, given.revision, encode_tree(given.hierarchy, MSGPACK, arrays="blocks")
 
 
 class ReadDocument(Message):
-    """Document that was checked and encoded; digests are computed by the receiver."""
+    """Document that a child process has checked and encoded; the server computes its digests."""
 
     schema_name: str
     body: bytes
@@ -79,7 +79,7 @@ _SKELETONS: LruCache[bytes, PreparedDocument] = LruCache(max_entries=_SKELETONS_
 
 
 class ReadDraft(Message):
-    """Item that a file becomes."""
+    """Item to be created from a file."""
 
     name: str
     kind: Kind
@@ -97,7 +97,10 @@ class ReadDraft(Message):
 
 
 class ReadGraph(Message):
-    """Graph of models of the predecessor; a node is its action, name, id, type and transitions."""
+    """Graph of models, read from a file of the predecessor.
+
+    Each node is the tuple of its action, name, model id, type and transitions.
+    """
 
     name: str
     collection: str

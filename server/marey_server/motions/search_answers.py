@@ -47,14 +47,17 @@ CM = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SearchLimits:
-    """Greatest costs of a search, in nanoseconds of one thread (estimated)."""
+    """Limits on the estimated computing time of a search, in nanoseconds of one thread.
+
+    `work` limits the search itself, `drawing_work` limits the drawing of samples for models without a stored tree.
+    """
 
     work: float
     drawing_work: float
 
 
 class SearchOrder(Message):
-    """Order to search the models of each step."""
+    """Order to run a search. A search has one or more steps; each searches one model for one motion."""
 
     request: SearchRequest
     models: SearchedModels

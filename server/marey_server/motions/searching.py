@@ -42,7 +42,7 @@ class FoundSearchable:
 
     @property
     def key(self) -> SearchableKey:
-        """The digests of the documents; empty for those that do not exist."""
+        """The digests of the model, its tree and its mapping; an empty string if there is no tree or no mapping."""
         tree, mapping = ("" if part is None else part.digest for part in (self.tree, self.mapping))
         return self.model.part.digest, tree, mapping
 
@@ -63,7 +63,7 @@ class LoadedSearchable:
     mapping: dict[str, Any] | None
 
     def pack(self) -> bytes:
-        """Return the documents as a packed `PackedModel`."""
+        """Return the documents as the bytes of a `PackedModel`."""
         return models.pack_model(self.model, self.tree, self.mapping)
 
 
@@ -71,9 +71,9 @@ class LoadedSearchable:
 class Searchable:
     """Model that can be searched.
 
-    `stored` is true if the tree is stored with the model, and false if it was drawn for the search. `drawing_work` is
-    the estimated cost of drawing the tree, in nanoseconds. `log_likelihoods` are the log-likelihoods of the examples
-    in ascending order.
+    `stored` is true if the tree is stored with the model, and false if it was built for the search from random samples.
+    `drawing_work` is the estimated computing time for drawing these samples, in nanoseconds. `log_likelihoods` are the
+    log-likelihoods of the examples in ascending order.
     """
 
     usable: UsableModel
@@ -122,7 +122,8 @@ def _find(tx: Transaction, project: str, item_id: str) -> FoundSearchable:
 def usable_searchables(models: SearchedModels, seed: int, most_work: float) -> list[Searchable]:
     """Return the model of each step, parsed or from the cache.
 
-    Raises `TooLargeProblem` if all trees together that must be drawn would take too long.
+    Some models have no stored tree, so samples are drawn to build one. Raises `TooLargeProblem` if that would take too
+    long for all these models together.
     """
     usable: dict[str, Searchable] = {}
     for one in models.found:
@@ -179,7 +180,7 @@ def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> S
 
 
 def require_drawable(work: float, most_work: float) -> None:
-    """Raise `TooLargeProblem` if the trees that a request needs would take more than some seconds to draw."""
+    """Raise `TooLargeProblem` if drawing samples for the missing trees of a request costs more than `most_work`."""
     if work > most_work:
         raise TooLargeProblem(
             "Without trees, drawing samples from models with so many keyframes, joints or steps takes too "

@@ -104,7 +104,10 @@ def write_walk_graph(source: WalkSource, trial: str | None, form: WalkGraphForma
 
 
 def _require_rows(clips: Sequence[DatabaseClip], records: Iterable[TrialRecord]) -> None:
-    """Check that clips follow one another without gaps and that trials displayed no other rows. Raises `ValueError`."""
+    """Raise `ValueError` if the rows of clips have gaps, or if trials displayed rows outside the clips.
+
+    A row is a frame in the database of all clips.
+    """
     rows = 0
     for clip in clips:
         if clip.start != rows or clip.stop < rows:

@@ -78,7 +78,7 @@ class ChildTask(Generic[T]):
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def assign(self, child: ChildProcess | None) -> None:
-        """Set the child that runs this task; None once it has ended."""
+        """Set the child that runs this task, or None once the task has ended."""
         with self._lock:
             self._child = child
 
@@ -90,8 +90,9 @@ class ChildTask(Generic[T]):
                 self._child.abort()
 
     def abandon(self) -> None:
-        """Cancel the task, because its client has closed the connection; if a child works on it, it is killed after a
-        moment.
+        """Cancel the task, because its client has closed the connection.
+
+        If a child is still running the task `ABANDONED_S` later, that child is killed.
         """
         if self.future.cancel():
             _after(ABANDONED_S, self.stop, "client-gone")
@@ -322,7 +323,7 @@ class Children:
             task.succeed(outcome.payload)
 
     def _problem_of_end(self, task: ChildTask[Any], status: int) -> ApiProblem:
-        """Return the reason why a child ended while it ran a task, and count it."""
+        """Return the error for a task whose child process ended while running it, and count the end in the metrics."""
         if task.stopped == "closing":
             return _stopping()
         out_of_time = status == -signal.SIGXCPU

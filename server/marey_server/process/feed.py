@@ -1,7 +1,7 @@
 """Wake-ups of waiting requests from the feed of events, which shows the changes of every server process.
 
-One task per process reads the feed after a commit, after a notification of Postgres, and at an interval in case one was
-lost. So requests that wait cost nothing while nothing happens, however many they are.
+One task per process reads the feed after each commit, after each notification of Postgres, and also periodically, in
+case a notification was lost. So requests that wait cost nothing while nothing happens, however many they are.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ async def keeping_house(services: Services) -> AsyncIterator[None]:
 
 
 async def _give_up_lead(services: Services, holder: str) -> None:
-    """Give up the leadership; if the database is unreachable, it ends when its lease expires."""
+    """Give up the leadership; if the database is unreachable, the leadership ends when its lease expires."""
     try:
         await _write(services, leader.give_up_lead, LEAD, holder)
     except ApiProblem as error:
@@ -83,7 +83,10 @@ async def _repeat(services: Services, holder: str, first_s: float, every_s: floa
 
 
 async def _reap(services: Services, holder: str) -> None:
-    """Reclaim every expired lease, page by page, after workers have had time to renew theirs."""
+    """Reclaim every expired lease, page by page.
+
+    After a start or an interruption, this waits for a grace period, in which workers can renew their leases.
+    """
     try:
         leads, may_reap = await _write(services, _look_round, holder, services.start_grace)
         if leads and may_reap:
@@ -94,7 +97,10 @@ async def _reap(services: Services, holder: str) -> None:
 
 
 def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
-    """Return whether this process leads, and whether workers have had time to renew their leases."""
+    """Return whether this process leads, and whether the `grace` period is over.
+
+    In this period after a start or an interruption, workers can renew leases that expired in the meantime.
+    """
     return _leads(tx, holder), grace.over(tx.now_us)
 
 
@@ -111,7 +117,7 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Give waiting jobs the shared results that now exist."""
+    """Give each job that waits for the result of an identical job this result, if the identical job has succeeded."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass
@@ -134,9 +140,9 @@ async def _in_thread(services: Services, function: Callable[P, T], *args: P.args
 
 
 async def _forget_tries(services: Services, holder: str) -> None:
-    """Delete the rows of limits that have ended.
+    """Delete the expired rows of the limits on sign-ins.
 
-    Each try adds three rows, and passwords are hashed one by one, so few rows are added per minute.
+    Each sign-in adds three rows, and passwords are hashed one by one, so few rows are added per minute.
     """
     if await _write(services, _leads, holder):
         while await _write(services, rate_limits.forget_ended) == rate_limits.FORGOTTEN_AT_ONCE:

@@ -62,7 +62,10 @@ def _kind_of_fault(error: Exception) -> str:
 
 
 def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
-    """Return whether a record belongs to an upgrade and not to the schema check of a readiness request."""
+    """Return whether to keep a log record of Alembic: warnings, and upgrades that run.
+
+    Other records, such as those of the schema check in each readiness request, are dropped.
+    """
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
 
 

@@ -34,7 +34,7 @@ REFUSALS_REMEMBERED = 10_000
 
 
 def limited_address(text: str) -> str:
-    """Return the address to which a sign-in counts: the address of the client, or its network of 64 bits for IPv6."""
+    """Return the address for which a sign-in is counted: the client's address, or for IPv6 its /64 network."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:  # a Unix socket has none
@@ -88,7 +88,7 @@ class PasswordLane:
         return await asyncio.wrap_future(self._thread.submit(function, *args, **kwargs))
 
     def close(self) -> None:
-        """Close the thread after the hashes that it has begun."""
+        """Stop the thread after its current hash, and cancel the waiting hashes. Does not wait for the thread."""
         self._thread.shutdown(wait=False, cancel_futures=True)
 
 
@@ -102,7 +102,7 @@ class RefusedTries:
         )
 
     def check(self, attempt: SignInTry) -> None:
-        """Raise `TooManyRequestsProblem` while the limits refuse a try like this one."""
+        """Raise `TooManyRequestsProblem` while a limit applies to this address, or to this account and address."""
         for key in ((None, attempt.address), (attempt.name, attempt.address)):
             until_s, limit = self._until.get(key) or (0.0, "address")
             wait_s = math.ceil(until_s - self._clock())

@@ -122,7 +122,7 @@ class Services:
         return self._tokens_known.get(hash_secret(token)) is not None
 
     def note_use(self, token: str, principal: Principal) -> None:
-        """Record the use of a token, in the database at most once in `NOTE_USE_EVERY_S` for each."""
+        """Record the use of a token; each token is updated in the database at most once per `NOTE_USE_EVERY_S`."""
         self._tokens_known.put(hash_secret(token), True)
         token_id, now = principal.token_id, time.monotonic()
         if token_id is None:

@@ -270,7 +270,7 @@ class Settings(BaseSettings):
 
     @property
     def resolved_database_threads(self) -> int:
-        """Return the number of reading threads; few on SQLite, because its reads never wait."""
+        """Return the number of threads for reads; by default few on SQLite, whose reads never wait for a server."""
         return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property

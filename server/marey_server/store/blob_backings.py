@@ -28,7 +28,10 @@ class BlobBacking(Protocol):
     """Interface of a place that stores the bytes of blobs."""
 
     def write(self, connection: Connection, contents: Mapping[str, Iterable[bytes]]) -> None:
-        """Store the bytes of blobs, given by digest in pieces of `CHUNK_BYTES` of which the last may be shorter."""
+        """Store the bytes of blobs.
+
+        `contents` maps the digest of each blob to its pieces of `CHUNK_BYTES`; the last piece may be shorter.
+        """
         ...
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:

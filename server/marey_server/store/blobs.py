@@ -118,7 +118,10 @@ def put_blob(
 
 
 def require_sender(principal: Principal) -> None:
-    """Check that the caller may upload bytes: users with the scope `write` for any project, and attempts of jobs."""
+    """Raise an error unless the caller may upload bytes.
+
+    Users need a token with the scope `write` for at least one project; attempts of jobs need no scope.
+    """
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to upload data.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
@@ -148,7 +151,7 @@ def places_of_sender(tx: Transaction) -> tuple[str, ...]:
 
 
 def store_blobs(tx: Transaction, contents: Mapping[str, bytes | Spool]) -> None:
-    """Store bytes under their digests; if some are stored already, renew their age."""
+    """Store bytes under their digests; for blobs that are stored already, reset the age to zero."""
     rows = [
         {"digest": digest, "size_bytes": _size_bytes(content), "created_us": tx.now_us}
         for digest, content in contents.items()
@@ -170,9 +173,9 @@ def _chunks(content: bytes | Spool) -> Iterable[bytes]:
 
 
 def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) -> set[str]:
-    """Insert rows keyed by `digest`, or renew the age of existing rows; return the digests of the new ones.
+    """Insert rows keyed by `digest`, or reset the age of existing rows to zero; return the digests of the new rows.
 
-    Either way the rows are locked until the transaction ends, so that garbage collection cannot take them.
+    New and existing rows are locked until the transaction ends, so that garbage collection cannot delete them.
     """
     new: set[str] = set()
     added = tx.insert_or_ignore(table).returning(table.c.digest)
@@ -187,7 +190,7 @@ def insert_new(tx: Transaction, table: Table, rows: Iterable[dict[str, Any]]) ->
 
 
 def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
-    """Renew the age of rows and lock them; return the digests of the rows that exist."""
+    """Reset the age of rows to zero, and lock these rows; return the digests of those that exist."""
     there: set[str] = set()
     for some in _batched(sorted(digests)):
         chosen = table.c.digest.in_(some)
@@ -200,8 +203,9 @@ def _renew(tx: Transaction, table: Table, digests: Iterable[str]) -> set[str]:
 
 
 def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
-    """Record that the caller has uploaded the bytes and may refer to them: an attempt only in its own requests, a user
-    in the projects `places`.
+    """Record that the caller has uploaded the bytes of a blob and may refer to the blob.
+
+    A user may refer to it in the projects `places`, an attempt of a job only in its own requests.
     """
     caller = tx.principal
     if caller.kind == "attempt":
@@ -214,8 +218,9 @@ def add_holder(tx: Transaction, digest: str, places: Iterable[str]) -> None:
 
 
 def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
-    """Return those of the digests that the caller may refer to, and keep their blobs from being deleted before the end
-    of this write.
+    """Return the subset of digests that the caller may refer to.
+
+    The blobs of these digests cannot be deleted before the end of this transaction.
     """
     return _renew(tx, blob, readable(tx, digests))
 
@@ -270,7 +275,7 @@ def missing(tx: Transaction, digests: Iterable[str]) -> list[str]:
 
 
 def require_readable(tx: Transaction, digest: str) -> int:
-    """Return the size of a blob in bytes. Raises `NotFoundProblem` if the caller may not read such a blob."""
+    """Return the size of a blob in bytes. Raises `NotFoundProblem` if it is missing or the caller may not read it."""
     return sizes_of_readable(tx, [digest])[digest]
 
 
@@ -322,9 +327,9 @@ def _held(tx: Transaction, digests: Iterable[str], *, since_us: int) -> set[str]
 def _within_reach(caller: Principal) -> tuple[ColumnElement[bool], ...]:
     """Return the condition for rows of `blob_holder` whose bytes may be used with a user's token.
 
-    With a token that may read in all projects, all bytes of the user may be used; with another token, the bytes of the
-    projects to which it is limited, and, if one of its scopes is for all projects, bytes that were uploaded for every
-    project.
+    With a token that may read in all projects, the condition holds for all uploads of the user. With another token, it
+    holds for uploads to the projects to which the token is limited. If one of the token's scopes is for all projects,
+    it also holds for bytes that were uploaded for every project.
     """
     if scopes.allows(caller.scopes, "read"):
         return ()

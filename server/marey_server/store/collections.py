@@ -82,7 +82,7 @@ def list_collections(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the collections at and below `path` in the order of paths, without the root; or the deleted ones."""
+    """List the collections at and below `path`, sorted by path, without the root; or, with `deleted`, deleted ones."""
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
     statement = select(collection).where(

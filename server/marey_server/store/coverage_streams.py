@@ -147,7 +147,7 @@ def answered_before(stream: Stream, said: str) -> Tree | None:
 
 
 def require_offset(stream: Stream, offset: int) -> None:
-    """Raise `CoverageOffset` with the current offset if the stream does not continue at the given one."""
+    """Raise `CoverageOffset`, which contains the current offset of the stream, if `offset` is not that offset."""
     if stream.offset != offset:
         raise _elsewhere(stream)
 

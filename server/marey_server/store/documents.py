@@ -51,7 +51,7 @@ class PreparedDocument:
 
 
 def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocument:
-    """Check a document against its schema (`schema`, or else the one it names) and encode its arrays.
+    """Check a document against `schema`, or by default the schema that it names, and encode its arrays.
 
     Raises `InvalidProblem` with one entry for each fault.
     """
@@ -75,7 +75,7 @@ def prepare_document(tree: Any, *, schema: str | None = None) -> PreparedDocumen
 def document_of_bytes(schema: str, canonical: bytes, arrays: Mapping[str, bytes]) -> PreparedDocument:
     """Return a document that another process of this server has checked and encoded.
 
-    `canonical` is its JSON with references to arrays, which are given by JSON Pointer.
+    `canonical` is its canonical JSON with references in place of arrays; `arrays` maps JSON Pointers to encoded arrays.
     """
     return _of_canonical(schema, canonical, lambda pointer, _: arrays[pointer])
 
@@ -243,8 +243,9 @@ def _require_files(tx: Transaction, contents: Iterable[PreparedDocument]) -> dic
 
 
 def _refer(tx: Transaction, references: Iterable[tuple[str, str, str]]) -> None:
-    """Record references of documents to blobs; each consists of the document's digest, a JSON Pointer, and the blob's
-    digest.
+    """Record which documents refer to which blobs.
+
+    Each reference consists of the digest of the document, a JSON Pointer into it, and the digest of the blob.
     """
     columns = ("document_digest", "pointer", "blob_digest")
     rows = [dict(zip(columns, one, strict=True)) for one in references]
@@ -318,7 +319,10 @@ def load_bodies(tx: Transaction, digests: Collection[str]) -> dict[str, Tree]:
 def _attach_stored(
     tx: Transaction, bodies: Mapping[str, Tree], convert: Callable[[EncodedArray], Any] | None = None
 ) -> None:
-    """Replace the references in documents, given by digest, by their arrays, each passed through `convert`."""
+    """Replace references to arrays in documents by the stored arrays, each converted by `convert`.
+
+    `bodies` maps the digests of documents to their trees.
+    """
     loaded: dict[str, Any] = {}
     for row in tx.run(_BLOBS_OF_DOCUMENTS, {"digests": padded(bodies)}):
         holder, key = _place(bodies[row.document_digest], row.pointer)

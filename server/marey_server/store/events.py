@@ -158,7 +158,7 @@ def newest_number(tx: Transaction) -> int:
 
 
 def read_news(tx: Transaction, after: int) -> News:
-    """Return the topics of the waiting requests that the events after the one numbered `after` concern."""
+    """Read the events after the one numbered `after`; return the topics of the waiting requests that they wake up."""
     number = _number(tx)
     rows = tx.execute(
         select(number.label("number"), event.c.project_id, event.c.subject)
@@ -177,7 +177,7 @@ def read_news(tx: Transaction, after: int) -> News:
 
 
 def _waiting_for_key(tx: Transaction, keys: Iterable[tuple[str, str]]) -> set[str]:
-    """Return the kinds of jobs that can run once a job with the same concurrency key has ended."""
+    """Return the kinds of queued jobs with one of the given pairs of project and concurrency key."""
     return {
         kind
         for project_id, key in keys

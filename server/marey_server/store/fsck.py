@@ -233,7 +233,7 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_holding(tx: Transaction, row: Row[Any], owner: Column[str]) -> list[StoreDefect]:
-    """Check the counters of a project or a user, whom the column `owner` of items names."""
+    """Check the counters of items and bytes of a project or user; `owner` is the column of `item` that names it."""
     counted, recorded = quotas.count_held(tx, owner, row.id), quotas.read_held(tx, row.id)
     return (
         []
@@ -283,11 +283,11 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Check that each proposal has the commits of its state, and that its branches exist while it is open."""
+    """Check that each proposal has the fields that its state needs, and that its branches exist while it is open."""
     of_dataset = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.kind == RefKind.BRANCH.value)
     branches = set(tx.execute(select(dataset_ref.c.name).where(*of_dataset)).scalars())
     return [
-        StoreDefect("proposal-corrupt", row.id, f"the proposal {one.number} has not what its state {one.state} needs")
+        StoreDefect("proposal-corrupt", row.id, f"the proposal {one.number} lacks what its state {one.state} needs")
         for one in tx.execute(select(proposal).where(proposal.c.dataset_id == row.id))
         if not _is_consistent(one, branches)
     ]

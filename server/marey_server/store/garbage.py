@@ -1,8 +1,8 @@
 """Garbage collection: deletes unreferenced documents and blobs, abandoned uploads and streams, expired keys and tokens.
 
 A read finds the candidates. Each batch is then deleted in a transaction of its own that locks the rows and checks them
-again. A write that starts to refer to a document or blob renews its row first, so it either sees that the row is gone
-or keeps it from being deleted.
+again. A write that adds a reference to a document or blob first updates the time in the row of the document or blob. So
+the write either sees that the row is gone, or prevents its deletion.
 """
 
 from __future__ import annotations
@@ -60,7 +60,10 @@ class Collected:
 
 
 def collect_garbage(database: Database, *, grace_us: int = GRACE_US) -> Collected:
-    """Delete data without references for `grace_us`; may run at any time and in several processes at once."""
+    """Delete documents and blobs that have had no references for `grace_us`, and expired rows of other tables.
+
+    May run at any time, and in several processes at once.
+    """
     return Collected(
         documents=_collect(database, document, delete_documents, grace_us),
         blobs=_collect(database, blob, delete_blobs, grace_us),
@@ -84,7 +87,10 @@ def _collect(
 
 
 def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> list[str]:
-    """Return the next digests without references: at most `BATCH` rows, and `BATCH_BYTES` or one row."""
+    """Return the next unreferenced digests, at most `BATCH`.
+
+    Their rows have at most `BATCH_BYTES` together; a single row may have more.
+    """
     rows = select(table.c.digest, table.c.size_bytes).where(table.c.digest > behind, *_garbage(tx, table, grace_us))
     chosen: list[str] = []
     left_bytes = BATCH_BYTES
@@ -97,7 +103,7 @@ def _candidates(tx: Transaction, table: Table, grace_us: int, behind: str) -> li
 
 
 def _garbage(tx: Transaction, table: Table, grace_us: int) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for rows that may be deleted, apart from staged documents."""
+    """Return conditions for rows that may be deleted; the caller must exclude staged documents itself."""
     old = table.c.created_us < tx.now_us - grace_us
     if table is document:
         return old, ~exists().where(revision_part.c.document_digest == document.c.digest)

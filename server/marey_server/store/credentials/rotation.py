@@ -17,11 +17,12 @@ from marey_server.store.transaction import Transaction
 
 
 def rotate_token(tx: Transaction, token_id: str, request: TokenRotation) -> NewToken:
-    """Replace the token of this request by a successor, and end it after `grace_s`; its own predecessor ends at once.
+    """Replace the token of this request by a successor; the token ends after `grace_s`, its predecessor at once.
 
     The secret of the successor is derived from the secret of the token and from `rotation_id`. So a repeated request
-    gets the same successor, although no secret is stored. Raises `ForbiddenProblem` for any other token, and
-    `ConflictProblem` if the token was rotated with another `rotation_id`, or its successor was revoked.
+    gets the same successor, although no secret is stored. Raises `ForbiddenProblem` if `token_id` is not the token of
+    this request, and `ConflictProblem` if the token was rotated with another `rotation_id`, or if its successor was
+    revoked.
     """
     principal = tx.principal
     if principal.kind != "user" or principal.token_id != token_id:

@@ -69,9 +69,9 @@ _ATTEMPT_TOKEN = Prepared(
 
 
 class TokenFilter(NamedTuple):
-    """Filter of a list of tokens: by user (by default the caller), by prefix, and by end.
+    """Filter of a list of tokens: by user (by default the caller), by prefix, and by time of expiry.
 
-    `everybody` selects the tokens of all users, `ends_within_s` those that end within this number of seconds.
+    `everybody` selects the tokens of all users, `ends_within_s` the tokens that expire within this number of seconds.
     """
 
     user: str | None = None
@@ -119,7 +119,7 @@ def _resolve_user(tx: Transaction, prefix: str, secret: str) -> Principal:
 def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
     """Return the principal of an attempt's token.
 
-    Raises `LeaseLostProblem` if the attempt has lost the job, or its author the right to run it.
+    Raises `LeaseLostProblem` if the attempt has lost the job, or if the author of the job has lost the right to run it.
     The token is valid while the attempt holds its job. After the end of the attempt, for `REPLAY_GRACE_US`, it only
     allows a repeated `complete` or `fail`, which gets the stored answer.
     """
@@ -207,7 +207,11 @@ def _labels_of(tx: Transaction, request: TokenCreate) -> Mapping[str, str] | Non
 
 
 def _end_of(tx: Transaction, request: TokenCreate) -> int | None:
-    """Return when a new token ends; without a requested time, at most the end of the caller's own token."""
+    """Return the time at which a new token expires, None if it never expires.
+
+    By default, the new token expires no later than the caller's own token. Raises `ForbiddenProblem` if the request
+    explicitly sets a later time.
+    """
     own_us, lifetime_s = tx.principal.expires_us, request.expires_in_s
     wanted_us = None if lifetime_s is None else tx.now_us + lifetime_s * 1_000_000
     if own_us is None or (wanted_us is not None and wanted_us <= own_us):
@@ -272,9 +276,10 @@ def _id_of(tx: Transaction, name: str) -> str:
 def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) -> None:
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
-    With `with_created`, also revoke the tokens that were created with this token, its successors and predecessors, and
-    in turn those connected with these. Otherwise, tokens created with this token are recorded as created with the token
-    that created it, and its successor becomes that of its predecessor. A token may always revoke itself.
+    With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
+    any of these, and so on. Without `with_created`, only this token is revoked. The tokens created with it are then
+    recorded as created with the token that created it, and its successor as the successor of its predecessor. A token
+    may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:
@@ -317,8 +322,9 @@ def lock_own(tx: Transaction) -> Row[Any]:
 
 
 def _lock_tokens(tx: Transaction, user_id: str | None) -> None:
-    """Let only one transaction at a time create, rotate or revoke tokens of a user, so that none escapes a revocation
-    of all tokens that were created with another.
+    """Let only one transaction at a time create, rotate or revoke tokens of a user.
+
+    Otherwise a revocation with `with_created` could miss a token that is being created at the same time.
     """
     tx.lock(f"user_tokens {user_id}")
 
@@ -329,7 +335,7 @@ def revoke_named(tx: Transaction, name: str) -> None:
 
 
 def end_tokens(tx: Transaction, user_id: str, which: EndTokens) -> None:
-    """Revoke tokens of a user, except the one of this request. The caller has checked the rights of the principal."""
+    """Revoke tokens of a user, except the token of this request. Does not check whether the principal may do this."""
     if which is EndTokens.NONE:
         return
     others = and_(token.c.user_id == user_id, token.c.id != (tx.principal.token_id or ""))

@@ -91,7 +91,8 @@ def stored_high_water_us(connection: Connection) -> int:
 def save_high_water(connection: Connection, now_us: int) -> int:
     """Store a time after `now_us`, so that no restart uses an earlier time, whatever the wall clock says.
 
-    The stored time is a second ahead, and is returned. Until that time, no other needs to be stored.
+    Returns the stored time: a second after `now_us`, or the time that was stored before if that is still later. Until
+    the clock reaches it, no other time needs to be stored.
     """
     stored = stored_high_water_us(connection)
     if now_us < stored:
@@ -109,10 +110,10 @@ def set_high_water(connection: Connection, us: int) -> None:
 
 
 def micros_of(moment: datetime) -> int:
-    """Return a time of a document as it is stored."""
+    """Convert a `datetime` of a document to microseconds since the epoch, the form in which times are stored."""
     return (moment - _EPOCH) // timedelta(microseconds=1)
 
 
 def datetime_of(us: int) -> datetime:
-    """Return a stored time as the `datetime` of documents."""
+    """Convert a stored time, in microseconds since the epoch, to the `datetime` that documents contain."""
     return _EPOCH + timedelta(microseconds=us)

@@ -62,7 +62,7 @@ class _QueuedCall:
 def finish(future: Future[Any], function: Callable[[], Any]) -> None:
     """Set a future to the result or the error of a function.
 
-    A future cannot hold a `StopIteration`, so a request that waits for it would wait for ever.
+    A `StopIteration` is replaced by a `RuntimeError`: a future cannot hold it, so the waiting request would never end.
     """
     try:
         result = function()
@@ -123,7 +123,7 @@ class FairLine(Generic[T]):
 class Lane:
     """Threads that run the calls of a `FairLine`.
 
-    `most_each` limits the calls of one client, and those of all strangers, that run at the same time.
+    `most_each` limits how many calls run at the same time for one client, and for all strangers together.
     """
 
     def __init__(self, name: str, threads: int, *, most_each: int | None = None) -> None:
@@ -150,7 +150,7 @@ class Lane:
         return future
 
     def close(self, *, wait: bool = True) -> None:
-        """Begin no further calls; with `wait`, first run those that are queued."""
+        """Accept no further calls. With `wait`, finish the queued calls first; otherwise cancel them."""
         if not wait:
             with self._lock:
                 while (call := self._line.take()) is not None:

@@ -57,7 +57,7 @@ def sqlite_file(url: str | URL) -> Path | None:
 
 @contextmanager
 def alone(file: Path) -> Iterator[Connection]:
-    """Connect to an SQLite file that no other process has open, in one transaction.
+    """Open an SQLite file exclusively, and run the block in one transaction.
 
     Raises `DatabaseUnusable` if another process has it open.
     """

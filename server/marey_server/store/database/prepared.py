@@ -105,7 +105,7 @@ class _Form:
 
 
 def _members(names: Sequence[str], given: Sequence[Any]) -> Iterable[tuple[str, Any]]:
-    """Return the members of a list, or of a list of tuples, by the names of their parameters."""
+    """Pair each parameter name with its value from a list, or from a list of tuples, which is flattened."""
     nested = bool(given) and isinstance(given[0], tuple)
     return zip(names, chain.from_iterable(given) if nested else given, strict=True)
 

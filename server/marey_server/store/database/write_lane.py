@@ -76,7 +76,7 @@ class WriteLane:
                 finish(one.future, partial(self._write, one.principal, one.function))
 
     def _take(self) -> list[_Write]:
-        """Remove the next writes from the lines, at most `MOST_TOGETHER`."""
+        """Remove and return the next writes from the queues, at most `MOST_TOGETHER`."""
         taken: list[_Write] = []
         with self._lock:
             while len(taken) < MOST_TOGETHER:
@@ -108,7 +108,10 @@ class WriteLane:
 
 
 def _run(tx: Transaction, one: _Write) -> Callable[[], Any]:
-    """Run a write and return its completion, to be called after the commit; a refused write is rolled back."""
+    """Run a write under a savepoint, and roll it back if it raises an `ApiProblem`.
+
+    Returns a function to be called after the commit, which returns the result of the write or raises that error.
+    """
     own = tx.beside(one.principal)
     run_text(tx.connection, "SAVEPOINT this_write")
     try:

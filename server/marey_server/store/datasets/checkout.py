@@ -32,10 +32,10 @@ from marey_versions.tree.reading import Tree
 
 
 def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest) -> CheckoutAnswer:
-    """Replace the content of a dataset's folder by that of a version, which the next commit of the folder follows.
+    """Replace the content of a dataset's folder by a version, which becomes the parent of the folder's next commit.
 
-    Items of the folder keep their ids where an entry was moved or changed. An entry that was removed since gets its
-    item back, or else a new item.
+    An item whose entry has moved or changed keeps its id. For an entry of the version that the folder lacks, its
+    deleted item is restored if possible; otherwise a new item is created.
 
     Raises `ConflictProblem` if the folder has changes that no commit has recorded, unless they are to be discarded, or
     if another request changes the folder, and `InvalidProblem` if too many entries differ.
@@ -90,7 +90,7 @@ class _Checkout:
     state: FolderState
 
     def apply(self, compared: Sequence[ComparedEntry]) -> None:
-        """Change the folder, in an order in which every place is free when an item comes to it."""
+        """Change the folder, in an order that frees each path before an item is created there or moved there."""
         documents = self._documents(one.after for one in compared if one.after is not None)
         of_kind: defaultdict[str, list[ComparedEntry]] = defaultdict(list)
         for one in compared:
@@ -161,7 +161,7 @@ class _Checkout:
         items.publish(self.tx, self.project, [draft], author_id=self.tx.principal.user_id)
 
     def _can_restore(self, kind: Kind, item_id: str) -> bool:
-        """Return whether an item is deleted and no other item has its former place."""
+        """Return whether an item is deleted and no other item has taken its former folder and name."""
         former = (
             select(item.c.name, collection.c.path)
             .join(collection, collection.c.id == item.c.collection_id)

@@ -220,7 +220,7 @@ def author_of(tx: Transaction) -> str:
 
 
 def _require_checked_out(found: Row[Any], parent: str | None) -> None:
-    """Raise `ConflictProblem` if the folder was not made from the newest commit of the branch."""
+    """Raise `ConflictProblem` if the commit checked out in the folder is not the newest commit of the branch."""
     if found.folder_commit != parent:
         raise ConflictProblem(
             f"The folder {found.path!r} has the entries of another version than the newest one of this branch. "

@@ -111,9 +111,9 @@ _PARTS = (
 
 
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
-    """Return conditions that hold for the parts of the wanted revisions, and for few others.
+    """Return conditions that select the parts of the wanted revisions, and the parts of a few other revisions.
 
-    If the condition compared pairs of an id and a number, SQLite would scan the whole table.
+    The conditions compare ids and numbers separately: if they compared pairs, SQLite would scan the whole table.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))

@@ -23,7 +23,7 @@ from marey_versions.tree.reading import Tree
 
 @dataclass(frozen=True)
 class FolderState:
-    """Entries of the present content of a folder, and the items that they record, by key."""
+    """Current content of a folder: its entries, and the items from which they were made, both by entry key."""
 
     entries: Mapping[str, Value]
     items: Mapping[str, Row[Any]]

@@ -104,7 +104,10 @@ def list_commits(
 def _changing(
     tx: Transaction, commits: Sequence[Row[Any]], path: str, limit: int
 ) -> tuple[list[Row[Any]], Sequence[Row[Any]]]:
-    """Return those of successive commits that changed a path, and the one, if any, at which the next page begins."""
+    """Return the commits that changed a path, at most `limit`, and the commit, if any, at which the next page begins.
+
+    In `commits`, each commit is followed by its first parent.
+    """
     reader = ChunkReader(StoredChunks(tx))
     found: list[Row[Any]] = []
     for place, one in enumerate(commits[:MOST_EXAMINED]):
@@ -128,7 +131,7 @@ def _changes_at(reader: ChunkReader, before: str, after: str, path: str) -> Iter
 
 
 def _prefixes_of(path: str) -> tuple[str, ...]:
-    """Return the prefixes of the keys of the entries at a path and below it, in the order of the keys."""
+    """Return key prefixes that match exactly the entries at a path and below it, in key order."""
     return (key_of(path, ""), f"{path}/") if path else ("",)
 
 
@@ -213,7 +216,7 @@ def _entries_at(tx: Transaction, tree: str, path: str, *, after: str = "") -> It
 
 
 class EntryRevision(NamedTuple):
-    """Entry of a version, and a revision of the project with its content."""
+    """Entry of a version, and a revision in the project that has the content of the entry."""
 
     entry: DatasetEntry
     item: str

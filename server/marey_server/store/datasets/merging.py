@@ -1,4 +1,4 @@
-"""Merges of versions into branches, and changes of single commits that are repeated or undone."""
+"""Merges of versions into branches, and cherry-picks and reverts of single commits."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def prepare_merge(
     """Compute the merge of a version into a branch.
 
     Raises `InvalidProblem` if the branch has all commits of the version, or if a side has more than `most` changes,
-    and `ConflictProblem` if the branch is not at the expected commit, or if the two have several nearest common
-    commits.
+    and `ConflictProblem` if the branch is not at the expected commit, or if the version and the branch have several
+    nearest common commits (merge bases).
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -76,11 +76,11 @@ def prepare_merge(
 
 
 def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest, *, undo: bool) -> PreparedMerge:
-    """Compute the version of a branch in which the changes of one commit are repeated, or undone.
+    """Compute the cherry-pick of a commit onto a branch, or with `undo` the revert of the commit.
 
-    This merges the commit into the branch, with the parent of the commit as the common base; `undo` exchanges commit
-    and parent. Raises `InvalidProblem` for a commit of a merge without a choice of its parent, and if the branch would
-    not change.
+    A cherry-pick merges the commit into the branch, with the parent of the commit as the merge base; a revert merges
+    the parent, with the commit as the merge base. Raises `InvalidProblem` if the commit is a merge and the request does
+    not choose one of its parents, and if the branch would not change.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -114,7 +114,7 @@ def _parent_of(picked: Commit, parent: int | None) -> str | None:
 def _start(
     tx: Transaction, found: Row[Any], request: CombineRequest, theirs: str | None, message: str
 ) -> PreparedMerge:
-    """Return a merge that is not computed yet; it is finished if an earlier request has recorded it."""
+    """Return a merge that is not computed yet; `commit.recorded` is set if an earlier request has recorded it."""
     recorded = recorded_as(tx, found.id, request.write_id)
     ours = head_of(tx, found.id, request.into, None if recorded else request.expected)
     if ours is None:
@@ -129,7 +129,7 @@ def _start(
 def _combine(
     tx: Transaction, project_id: str, request: CombineRequest, started: PreparedMerge, most: int | None = None
 ) -> PreparedMerge:
-    """Merge what differs between the base and theirs into ours."""
+    """Merge three ways: apply the changes between `base` and `theirs` to the tree of `ours`; list conflicts."""
     store = StoredChunks(tx)
     answer, commit = started.answer, started.commit
     base, ours, theirs = (
@@ -164,7 +164,7 @@ def record_merge(
     merge: PreparedMerge,
     mover: Mover | None = None,
 ) -> MergeAnswer:
-    """Record the result of a merge or of picked changes on behalf of the `mover`, by default the caller; return it.
+    """Record the result of a merge, cherry-pick or revert on behalf of `mover`, by default the caller; return it.
 
     A preview is returned without being recorded.
 
@@ -206,9 +206,9 @@ def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConf
 
 
 def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | None:
-    """Return the nearest commit that both sides have, None if they have none.
+    """Return the merge base: the nearest common commit of two commits, None if they have none in common.
 
-    Raises `ConflictProblem` if there are several, none of which precedes another.
+    Raises `ConflictProblem` if there are several merge bases, none of which is an ancestor of another.
     """
     nearest = nearest_common(CommitReader(tx, dataset_id).read, ours, theirs)
     if len(nearest) > 1:

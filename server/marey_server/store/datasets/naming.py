@@ -166,7 +166,7 @@ def read_ref(tx: Transaction, project: str, name: str, ref: str) -> Ref:
 
 
 def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> Ref:
-    """Create a branch or a tag at a version. Raises `ConflictProblem` if the name is taken by either."""
+    """Create a branch or a tag at a version. Raises `ConflictProblem` if another branch or tag has the name."""
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     digest = resolve(tx, row.id, request.at)

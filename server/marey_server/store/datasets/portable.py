@@ -1,4 +1,4 @@
-"""Content of versions in the form that is the same on every server: no document refers to ids of this one."""
+"""Content of versions in a form that is the same on every server: documents contain no ids of this server."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from marey_versions.records import RevisionKey, portable_document, references_in
 
 
 def load_contents(tx: Transaction, project: str, request: ContentsRequest) -> dict[str, Any]:
-    """Load revisions of a project by their content digests, and documents of them with encoded arrays.
+    """Load the requested revisions of a project by content digest, and the requested documents with encoded arrays.
 
-    A revision or document that the project does not have is None. If the documents together are too large, those at
-    the end are left out; the first one is always loaded.
+    A revision or document that the project does not have is None. If the documents together are too large, the last
+    ones are left out; the first document is always loaded.
     """
     project_row = projects.require(tx, project)
     wanted = {*request.revisions, *(one.content for one in request.documents)}
@@ -63,7 +63,7 @@ def _loaded(tx: Transaction, held: Mapping[str, RevisionKey], request: ContentsR
 
 
 def _that_fit(digests: list[str | None], sizes: Mapping[str, int]) -> list[str | None]:
-    """Return the first digests of documents that together have at most `MOST_BYTES_AT_ONCE`, and at least one."""
+    """Return the first digests, at least one, whose documents together have at most `MOST_BYTES_AT_ONCE`."""
     size_bytes = 0
     for place, digest in enumerate(digests):
         size_bytes += 0 if digest is None else sizes[digest]

@@ -1,7 +1,8 @@
 """Versions from archives and other servers: their revisions and commits, which keep their digests.
 
-The revision of an entry gets an item that is deleted at once, so that no folder changes; a checkout restores it at its
-place. A revision that is no entry, such as the skeleton of clips, gets an item in the folder `IMPORTED`.
+Every received revision belongs to an item. For a revision that is the content of an entry, a new item is created and
+deleted at once, so that no folder changes; a checkout restores this item at the path of the entry. For other revisions,
+such as the skeleton of clips, an item is created in the folder `IMPORTED`.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[st
 
 @dataclass(frozen=True)
 class PreparedReceipt:
-    """Commit from elsewhere, whose tree was computed and is the one that it names."""
+    """Commit from an archive or another server; its tree was computed, and has the digest that the commit names."""
 
     record: CommitRecord
     entries: int
@@ -165,8 +166,8 @@ def record_receipt(
 ) -> Commit:
     """Record a commit from elsewhere; recording it again has no effect.
 
-    If the request names a branch without commits, it begins at the commit. Raises `ConflictProblem` if the branch has
-    commits, and the errors of `require_move`.
+    If the request names a branch without commits, the branch is set to this commit. Raises `ConflictProblem` if the
+    branch has other commits, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

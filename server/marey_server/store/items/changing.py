@@ -109,7 +109,7 @@ def put_part(
 def set_parts(
     tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, parts: Mapping[str, str], message: str
 ) -> None:
-    """Create a revision with exactly the given stored documents, by part, unless the newest revision has these.
+    """Create a revision whose parts are exactly the given stored documents, unless the newest revision has these parts.
 
     The documents must come from the server itself, because the caller's access to them is not checked. Raises
     `PreconditionFailedProblem` if another request changes the item.

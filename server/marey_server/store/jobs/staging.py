@@ -151,7 +151,7 @@ def staged_drafts(
 
 
 def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Renew the age of documents that an earlier job staged, so that they are not deleted; return whether all exist."""
+    """Reset the age of documents that an earlier job staged, so that they are kept; return whether all exist."""
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
     for start in range(0, len(wanted), IN_LIST):

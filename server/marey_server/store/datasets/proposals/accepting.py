@@ -44,7 +44,7 @@ WAITING_MERGE = ProposalMerge()
 
 @dataclass(frozen=True)
 class PreparedAcceptance:
-    """Merge of a proposal that was computed, but not recorded, or the error because of which there is none."""
+    """Merge of a proposal that was computed, but not recorded; or the error if the merge could not be computed."""
 
     request: MergeRequest
     merge: PreparedMerge | None
@@ -64,7 +64,7 @@ def prepare_acceptance(
 
 
 def prepare_waiting(tx: Transaction, project: str, name: str, number: int) -> PreparedAcceptance | None:
-    """Compute the merge of a proposal that is to be merged as soon as nothing is missing; return None for others."""
+    """Compute the merge of a proposal with a pending `when_green` request; return None for other proposals."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = find_proposal(tx, found.id, number)
     return _prepare(tx, project, name, row, WAITING_MERGE) if is_waiting(row) else None
@@ -100,7 +100,7 @@ def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
 
 
 def _obstacles(prepared: PreparedAcceptance, rule: Protection | None) -> Iterator[Missing]:
-    """Yield the reasons against a merge that result from the two versions."""
+    """Yield what prevents a merge of the two versions: an error, conflicts, or a source that is not up to date."""
     if prepared.refusal is not None and prepared.refusal.error_code != LARGE_MERGE:
         yield Missing(code=prepared.refusal.error_code, detail=prepared.refusal.detail)
     if prepared.merge is None:
@@ -154,10 +154,10 @@ def _shown(merge: PreparedMerge | None, missing: tuple[Missing, ...]) -> Mergeab
 def merge_proposal(
     tx: Transaction, project: str, name: str, number: int, request: ProposalMerge, prepared: PreparedAcceptance | None
 ) -> Proposal:
-    """Merge a proposal, or, with `when_green`, merge it later if something is missing.
+    """Merge a proposal. With `when_green`, merge it later if approvals, checks or other requirements are missing.
 
-    Raises `ConflictProblem` if the proposal has ended, if something is missing, or if a branch has moved since the
-    merge was prepared, and the errors of `require_move`.
+    Raises `ConflictProblem` if the proposal has ended, if a requirement is missing without `when_green`, or if a branch
+    has moved since the merge was prepared, and the errors of `require_move`.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

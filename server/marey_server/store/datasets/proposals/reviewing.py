@@ -62,8 +62,9 @@ def report_check(
 ) -> ProposalCheck:
     """Record the state of a check of the newest commit, and merge the proposal if it waits for nothing else.
 
-    Raises `ConflictProblem` if the proposal has ended, if its newest commit is another one, or if a success is reported
-    of a job that has not succeeded or has read other versions, and `NotFoundProblem` if the project has no such job.
+    Raises `ConflictProblem` if the proposal has ended, or if its newest commit is not the commit of the report. Also
+    raises it if the report is a success and names a job that has not succeeded or has read other versions. Raises
+    `NotFoundProblem` if the project has no such job.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
