@@ -357,7 +357,7 @@ class Resource(Exchange):
             self.body_type = negotiation.body_type(self.request.headers.get("Content-Type"))
 
     def _most_bytes(self, body: RequestBody) -> int:
-        """Return the greatest size of the body; callers without a token may send short ones only."""
+        """Return the greatest allowed size of the body in bytes; the limit is lower for callers without a token."""
         return body.max_bytes if self.caller.token is not None else min(body.max_bytes, GUEST_BODY_BYTES)
 
     @property

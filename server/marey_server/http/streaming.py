@@ -98,7 +98,8 @@ class BlobSender(Resource):
     ) -> Rendered | None:
         """Answer with the blob according to Range, If-Range and If-None-Match. Raises `NotFoundProblem`.
 
-        `cache_control` is for addresses that do not contain the digest; `headers` are sent with the bytes.
+        By default, clients may cache the blob for a year; pass another `cache_control` if the URL does not
+        contain the digest. `headers` are sent with the bytes.
         """
         etag = entity_tag(digest.removeprefix("sha256:"), "bytes")
         wanted = parse_range(self.request.headers.get("Range"), self.request.headers.get("If-Range"), etag)

@@ -74,7 +74,10 @@ class BeginOrder(Message):
 
 
 class StreamOrder(Message):
-    """Order about a stored stream: its settings, the skeleton of its poses, its state, and the next frames."""
+    """Order to add `frames` to a stored stream, or to compute its coverage if `frames` is None.
+
+    `rig` is the skeleton of the stream's poses with its joint mapping, as bytes.
+    """
 
     settings: Tree
     rig: bytes | None
@@ -141,7 +144,7 @@ def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
 
 
 def look_order(stream: Stream) -> bytes:
-    """Return the order to compute the coverage of each cell of a stream."""
+    """Return the order to compute the coverage of a stream in each cell, which is a range of speeds and turn rates."""
     return StreamOrder(settings=stream.settings, rig=stream.rig, state=stream.state).pack()
 
 
@@ -289,7 +292,10 @@ def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
 
 @lru_cache(maxsize=CACHED_BODIES)
 def body_of(rig: bytes) -> MatchingBody:
-    """Return the body of a stream's skeleton. Raises `MotionError` if joints that define a direction are not mapped."""
+    """Return the `MatchingBody`, which contains the skeleton of a stream with its mapped joints.
+
+    Raises `MotionError` if joints that define a direction are not mapped.
+    """
     from marey_motion.documents import mapping_from_document, skeleton_from_document
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints

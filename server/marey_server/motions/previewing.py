@@ -201,7 +201,7 @@ def _edited(source: PreviewSource, most_work: float) -> tuple[EditedClip, ...]:
 
 
 def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
-    """Return a clip and its body; the mapping is parsed only if a command needs it. Raises `MotionError`."""
+    """Return a clip, and its skeleton with a mapping that is parsed when a command needs it. Raises `MotionError`."""
     from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
     from marey_motion.editing.take import EditedBody
     from marey_motion.rigs import JointMapping, map_joints, require_trust

@@ -284,7 +284,7 @@ def _found_step(result: SearchResult, number: int, one: Searchable, found: Found
 
 
 def placement_of(start: StartPlacement) -> Placement:
-    """Return position and heading of the canonical frame."""
+    """Return the start position and heading in the world as a `Placement` of the canonical frame."""
     from marey_motion.alignment.aligned import Placement
 
     return Placement(radians(start.heading_deg), start.x, start.z)

@@ -146,7 +146,8 @@ def _parse_packed(packed: bytes, seed: int, most_work: float) -> Searchable:
 def parse_searchable(loaded: LoadedSearchable, seed: int, most_work: float) -> Searchable:
     """Return the parsed model with a tree.
 
-    Raises `InvalidProblem` if its numbers are not valid, and `TooLargeProblem` if drawing a tree would take too long.
+    Raises `InvalidProblem` if its numbers are not valid, and `TooLargeProblem` if drawing samples for a
+    missing tree would take too long.
     """
     from marey_motion.documents import mapping_from_document
     from marey_motion.errors import MotionError

@@ -2,7 +2,7 @@
 
 Every request costs a few milliseconds of the event loop, also a refused one. Two hundred connections that send nothing
 but such requests keep everybody else waiting for seconds. So if the event loop is late, a client that was refused
-several times waits for its next refusal, and the event loop has time for others.
+several times must wait before it is refused again, and the event loop has time for others.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ class UploadHashes:
             return (running.digest(), running.copy) if running.offset == upload.length else None
 
     def forget(self, upload_id: str) -> None:
-        """Remove the hash of an upload that has ended, and a copy that did not become a blob."""
+        """Remove the hash of an upload that has ended, and delete its copy unless it became a blob."""
         running = self._hashes.pop(upload_id)
         if running is not None and running.copy is not None:
             running.copy.unlink(missing_ok=True)

@@ -226,7 +226,7 @@ def hold(tx: Transaction, digests: Iterable[str]) -> set[str]:
 
 
 def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
-    """Protect the blobs named by a job's parameters or result; readers of the job's project may then read them.
+    """Prevent the deletion of blobs that a job's parameters or result name; readers of its project may then read them.
 
     Raises `ConflictProblem` (`missing-blobs`) if one is not stored or the caller may not refer to it.
     """
@@ -237,7 +237,10 @@ def keep_for_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> None:
 
 
 def share_with_job(tx: Transaction, job_id: str, digests: Iterable[str]) -> bool:
-    """Protect the blobs of the result that a job gets from an identical job; return whether all are still stored."""
+    """Prevent the deletion of the blobs in a result that a job gets from an identical job.
+
+    Returns whether all these blobs are still stored.
+    """
     wanted = set(digests)
     if wanted - _renew(tx, blob, wanted):
         return False

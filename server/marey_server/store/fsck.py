@@ -301,9 +301,7 @@ def _is_consistent(one: Row[Any], branches: set[str]) -> bool:
 
 
 def find_faults(tx: Transaction) -> list[str]:
-    """Return descriptions, for the operator, of faults because of which the server cannot serve requests; empty if
-    there are none.
-    """
+    """Return descriptions, for the operator, of faults that prevent the server from serving requests."""
     faults = []
     if not schema_at_head(tx.connection):
         faults.append("the database's tables are not those of this version: run `marey db upgrade`")

@@ -160,7 +160,7 @@ def _sweep_strays(database: Database, grace_us: int) -> int:
 
 
 def _remove_stray(tx: Transaction, digest: str) -> int:
-    """Remove the bytes if there is no row; the lock on the row's key keeps others from storing them meanwhile."""
+    """Remove a blob's bytes if it has no row; the lock on the row's key keeps others from storing them meanwhile."""
     row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
     if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
         return 0

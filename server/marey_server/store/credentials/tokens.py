@@ -300,7 +300,10 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
 
 
 def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
-    """Return the query for the ids of tokens, their predecessors and successors, and the tokens created with these."""
+    """Return a query for the ids of tokens and of all tokens connected with them, recursively.
+
+    A token is connected with its predecessor, with its successor, and with the tokens that were created with it.
+    """
     chain = select(token.c.id, token.c.successor_of).where(which).cte("chain", recursive=True)
     connected = or_(
         token.c.created_by == chain.c.id, token.c.successor_of == chain.c.id, token.c.id == chain.c.successor_of

@@ -206,7 +206,10 @@ class Database:
     def queue_read(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `read` for a client in a thread, or in a reserved one. Raises `UnavailableProblem` if too many wait."""
+        """Run `read` for a client in a thread, or with `reserved` in a reserved thread.
+
+        Raises `UnavailableProblem` if too many calls wait.
+        """
         lane = self._reserved if reserved else self._ordinary
         return lane.submit(client, self.read, principal, function)
 

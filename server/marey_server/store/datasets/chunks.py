@@ -1,4 +1,4 @@
-"""Chunks of trees in the database."""
+"""Database storage of the chunks of which trees of dataset entries consist."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHUNKS = Prepared(
 
 
 class StoredChunks:
-    """Chunks of the database; new ones are collected, and stored by `store_chunks`."""
+    """Chunks in the database. New chunks are collected in `new`; `store_chunks` stores them."""
 
     def __init__(self, tx: Transaction) -> None:
         self._tx = tx

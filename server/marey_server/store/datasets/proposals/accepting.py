@@ -57,7 +57,7 @@ class PreparedAcceptance:
 def prepare_acceptance(
     tx: Transaction, project: str, name: str, number: int, request: ProposalMerge
 ) -> PreparedAcceptance | None:
-    """Compute the merge of a proposal; return None if it has ended."""
+    """Compute the merge of a proposal; return None if the proposal is not open."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = find_proposal(tx, found.id, number)
     return None if row.state != ProposalState.OPEN else _prepare(tx, project, name, row, request)

@@ -95,7 +95,7 @@ def _rows(dataset_id: str) -> Select[Any]:
 
 
 def is_waiting(row: Row[Any]) -> bool:
-    """Return whether a proposal is to be merged when nothing is missing; a later commit ends this."""
+    """Return whether a proposal waits to be merged (`when_green`); a new commit in its source cancels the request."""
     return row.when_green_id is not None and row.when_green_head == row.head_now
 
 
