@@ -139,8 +139,18 @@ def list_jobs(
     context: typer.Context,
     project: ProjectName,
     state: Annotated[
-        str | None,
-        typer.Option(help="List only jobs in this state: waiting, queued, running, succeeded, failed or cancelled."),
+        list[str] | None,
+        typer.Option(
+            help="List only jobs in this state: waiting, queued, running, succeeded, failed or cancelled; may be "
+            "repeated."
+        ),
+    ] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="List only jobs of this kind, such as retarget; may be repeated.")
+    ] = None,
+    author: Annotated[str | None, typer.Option(help="List only jobs that this user submitted.")] = None,
+    tasks_of: Annotated[
+        str | None, typer.Option(metavar="JOB", help="List the tasks of this job; absent: jobs that are not tasks.")
     ] = None,
     limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs to list, newest first.")] = 50,
     as_json: AsJson = False,
@@ -148,8 +158,12 @@ def list_jobs(
     """Show the jobs of a project, newest first."""
     from itertools import islice
 
+    filters = {
+        "state": ",".join(state or ()) or None, "kind": ",".join(kind or ()) or None, "author": author,
+        "parent": tasks_of,
+    }  # fmt: skip
     with connect(context) as marey:
-        jobs = list(islice(marey.project(project).jobs(filters={"state": state}), limit))
+        jobs = list(islice(marey.project(project).jobs(filters=filters), limit))
     if as_json:
         return print_json(jobs)
     rows = [(one.id, one.kind, one.state, _done(one), one.author, one.created_at) for one in jobs]

@@ -91,6 +91,14 @@ def test_the_readme_told_in_a_shell(run: CommandLine, takes: Path, tmp_path: Pat
     jobs = json.loads(run("job", "ls", "readme", "--json").stdout)
     assert "succeeded" in run("why", jobs[0]["id"]).stdout
     assert json.loads(run("job", "show", jobs[0]["id"], "--json").stdout)["result"]["clips"] == 2
+    assert listed(run, "readme", "--kind", "retarget") == [jobs[0]["id"]]
+    assert listed(run, "readme", "--kind", "evaluate", "--kind", "retarget", "--state", "succeeded") == [jobs[0]["id"]]
+    assert listed(run, "readme", "--kind", "evaluate") == listed(run, "readme", "--author", "nobody") == []
+    assert listed(run, "readme", "--tasks-of", jobs[0]["id"]) == []
+
+
+def listed(run: CommandLine, *arguments: str) -> list[str]:
+    return [one["id"] for one in json.loads(run("job", "ls", *arguments, "--json").stdout)]
 
 
 def test_a_folder_is_listed_with_what_stands_directly_in_it(run: CommandLine, takes: Path) -> None:
