@@ -359,14 +359,21 @@ def test_wrong_versions_and_full_lists_are_refused(team: Team, monkeypatch: pyte
 
 
 @on_sqlite
-def test_a_check_by_a_job_succeeds_only_with_a_job_that_read_the_commit(team: Team, server: Server) -> None:
+@pytest.mark.parametrize("count", [1, 33], ids=["one job", "a fan-out"])
+def test_a_check_by_a_job_succeeds_only_with_a_job_that_read_the_commit(team: Team, server: Server, count: int) -> None:
     motion = {**MOTION, "skeleton": {"item": team.items[0], "revision": 1}, "joints": ["a"]}
-    clip = ok(team.ben.post(f"{LAB}/clips", json={"name": "w", "parts": {"motion": motion}}), 201)["id"]
-    change = {"change": "put", "path": "walk", "item": clip}
-    ok(team.ada.post(f"{GAITS}/commits", json={"branch": "trial", "message": "m", "changes": [change]}), 201)
+    changes = []
+    for place in range(count):
+        parts = {"motion": {**motion, "frame_rate_hz": 30 + place}}
+        clip = ok(team.ben.post(f"{LAB}/clips", json={"name": f"w{place}", "parts": parts}), 201)["id"]
+        changes.append({"change": "put", "path": f"walk{place}", "item": clip})
+    ok(team.ada.post(f"{GAITS}/commits", json={"branch": "trial", "message": "m", "changes": changes}), 201)
     team.propose()
-    wanted = {"kind": "export", "inputs": {"clips": [{"dataset": "gaits", "version": "trial"}]}}
-    made = ok(team.ben.post(f"{LAB}/jobs", json=wanted), 202)["id"]
+    inputs = {"clips": [{"dataset": "gaits", "version": "trial"}], "skeleton": {"item": team.items[0]}}
+    wanted = {"kind": "retarget", "inputs": inputs, "into": "retargeted"}
+    created = ok(team.ben.post(f"{LAB}/jobs", json=wanted), 202)
+    assert (created["size"] is None) == (count == 1)
+    made = created["id"]
     ok(check(team.ben, 1, "pending", job=made))
     refused(check(team.ben, 1, "succeeded", job=made), 409, "job-not-succeeded")
     refused(check(team.ben, 1, "pending", job="job_of_nobody"), 404, "no-job")

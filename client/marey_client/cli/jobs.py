@@ -173,23 +173,19 @@ def list_jobs(
 @job.command("show")
 def show_job(context: typer.Context, job_id: JobId, as_json: AsJson = False) -> None:
     """Show a job and its attempts."""
+    from marey_schemas.queue.jobs import commits_of
+
     with connect(context) as marey:
         found = marey.jobs.get(job_id)
         attempts = list(marey.jobs.attempts(job_id))
     if as_json:
         return print_json({**found.model_dump(mode="json"), "attempts": attempts})
     shown = found.model_dump(mode="json", exclude={"rev", "inputs"}, exclude_none=True)
-    if commits := _commits_of(found):
-        shown["from commits"] = ", ".join(commits)
+    if commits := commits_of(found.inputs):
+        shown["from commits"] = ", ".join(sorted(commits))
     print_pairs((name, json.dumps(value) if isinstance(value, dict) else value) for name, value in shown.items())
     rows = [(one.fence, one.worker, one.started_at, one.ended_at, one.outcome, one.detail) for one in attempts]
     return print_table(("fence", "worker", "started", "ended", "outcome", "detail"), rows)
-
-
-def _commits_of(found: Job) -> list[str]:
-    """Return the commits of datasets from which the inputs of a job were taken."""
-    pins = (pin for many in found.inputs.values() for pin in many if isinstance(pin, dict))
-    return sorted({pin["commit"] for pin in pins if pin.get("commit")})
 
 
 @job.command("log")

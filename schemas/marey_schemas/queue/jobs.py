@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime
 from enum import StrEnum
 from typing import Any, Literal
@@ -175,6 +176,17 @@ class JobOutput(Answer):
     created: bool = Field(description="False if the item had the same content before.")
 
 
+def commits_of(inputs: Mapping[str, Any]) -> set[str]:
+    """Return the digests of the commits from which the inputs of a job were taken, as the job records them."""
+    found: set[str] = set()
+    for recorded in inputs.values():
+        if isinstance(recorded, Mapping):
+            found.update(recorded.get("commits", ()))
+        else:
+            found.update(pin["commit"] for pin in recorded if "commit" in pin)
+    return found
+
+
 class Job(Answer):
     """Job with its state."""
 
@@ -184,7 +196,9 @@ class Job(Answer):
     state: JobState
     params: dict[str, Any]
     inputs: dict[str, Any] = Field(
-        description="Inputs by name: items with their revisions, or `{job}` for outputs of an unfinished job."
+        description="Inputs by name: items with their revisions, and the commits they were taken from; or `{job}` "
+        "for outputs of an unfinished job. Instead of the items that a fan-out gave to its tasks, it has their number "
+        "and their commits."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str

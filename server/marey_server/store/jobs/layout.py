@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Row
 
 from marey_schemas.queue.job_kinds import KindDeclaration
-from marey_schemas.queue.jobs import JobCreate, Resources
+from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
 from marey_server.store.jobs.endings import Ended
@@ -115,7 +115,9 @@ def _spread(head: NewJob) -> list[NewJob]:
     kind = head.submission.kind
     head.size, head.gathers = len(shares), kind.gathering is not None
     if kind.fan_out is not None:
-        head.pins = {**head.pins, kind.fan_out: {"count": len(head.pins[kind.fan_out])}}
+        given = head.pins[kind.fan_out]
+        commits = sorted(commits_of({kind.fan_out: given}))
+        head.pins = {**head.pins, kind.fan_out: {"count": len(given), **({"commits": commits} if commits else {})}}
     if head.state == "queued":
         head.state, head.dependencies_left = "running", len(shares)
     state = {"running": "queued", "failed": "cancelled"}.get(head.state, head.state)

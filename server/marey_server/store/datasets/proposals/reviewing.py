@@ -9,7 +9,7 @@ from sqlalchemy import Row, delete, insert, select
 from marey_schemas.datasets.proposal_states import CheckState
 from marey_schemas.datasets.proposals import CheckReport, ProposalCheck, Review, ReviewCreate
 from marey_schemas.items import Page
-from marey_schemas.queue.jobs import JobState
+from marey_schemas.queue.jobs import JobState, commits_of
 from marey_server.errors import ConflictProblem, NotFoundProblem
 from marey_server.store import listing, projects
 from marey_server.store.datasets.naming import find_dataset
@@ -95,7 +95,7 @@ def _require_job(tx: Transaction, project_id: str, job_id: str, state: CheckStat
             code="job-not-succeeded",
             context={"state": found.state},
         )
-    read = {pin["commit"] for pins in found.inputs.values() for pin in pins if "commit" in pin}
+    read = commits_of(found.inputs)
     if read and head not in read:
         raise ConflictProblem(
             f"The job {job_id} read versions of the dataset, but not the newest commit of the proposal.",
