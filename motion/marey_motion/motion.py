@@ -40,7 +40,7 @@ class Motion(NamedTuple):
 
         Returns
         -------
-        Motion    its numbers; rotations brought to unit length, signs made continuous
+        Motion    the same motion; its quaternions have unit length and signs that are continuous over time
         """
         moved = np.zeros((clip.frame_count, 0, 3)) if clip.translations is None else clip.translations
         rotations = _unit_and_continuous(clip.rotations.astype(np.float64))

@@ -31,9 +31,9 @@ class FollowedBones:
 
     Parameters
     ----------
-    rotations : (F, 4·J) float32    local rotations; the clip's own where no bone has moved
-    largest_turn_deg : mapping of str to float    by name of each joint that was turned, its largest turn in any frame,
-        degrees
+    rotations : (F, 4·J) float32    local rotations; those of the clip if no bone has moved
+    largest_turn_deg : mapping of str to float    largest turn of each turned joint over all frames, in degrees, by the
+        name of the joint
     """
 
     rotations: NDArray[np.float32]
@@ -47,20 +47,24 @@ class FollowedBones:
         name, most = max(self.largest_turn_deg.items(), key=lambda item: item[1])
         return CheckWarning(
             "bones-moved-by-translations",
-            f"joints move against their parents, so that {len(self.largest_turn_deg)} bones point elsewhere than their "
-            f"rotations say, that of {name} by up to {most:.1f} degrees; where they really point was followed",
+            f"joints move relative to their parents, so that the directions of {len(self.largest_turn_deg)} bones differ "
+            f"from those that their rotations give, most at {name}: up to {most:.1f} degrees; the result follows the "
+            "directions between the positions of the joints",
             joints=tuple(self.largest_turn_deg),
             values={"largest_turn_deg": most},
         )
 
 
 def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
-    """Rotate each joint by the shortest rotation from its bone's direction without translations to the real one.
+    """Turn joints so that bones keep their directions when the translations of the clip are removed.
+
+    Each joint is turned by the shortest rotation from the direction that its bone has without the translations to the
+    direction that it has with them.
 
     Parameters
     ----------
     clip : Clip    F frames of J joints
-    joints : mapping of str to int    joints by standard name whose bones are compared
+    joints : mapping of str to int    indices of the joints to correct, by standard name
 
     Returns
     -------
@@ -91,9 +95,10 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
 
 
 def _turns(rigid: AnyFloats, moved: AnyFloats, bones: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Compute the shortest rotations (B, F, 4) of bones (B, 2) between positions (F, J, 3), and their angles (B, F).
+    """Compute the shortest rotations (B, F, 4) of bones from `rigid` to `moved`, and their angles (B, F) in radians.
 
-    Angles are in radians. A bone that has no length on either side does not turn.
+    `rigid` and `moved` (F, J, 3) are positions of the joints; `bones` (B, 2) are the first and last joint of each bone.
+    A bone that has no length in `rigid` or in `moved` does not turn.
     """
     from marey_motion import moved_bones_kernels as kernels
 

@@ -17,10 +17,11 @@ def _length(x, y, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, turns, halves, opposite):  # type: ignore[no-untyped-def]
-    """Fill `turns` (B, F, 4) with the shortest rotations of B bones from positions `rigid` to `moved` (F, J, 3).
+    """Fill `turns` (B, F, 4) with the shortest rotations of B bones from their directions in `rigid` to `moved`.
 
-    `halves` (2, B, F) receives sine and cosine of half of each angle. Bones shorter than `shortest_bone` do not turn;
-    `opposite` (B, F) marks bones that turn by nearly half a circle, which are left out.
+    `rigid` and `moved` (F, J, 3) are positions of joints. `halves` (2, B, F) receives the sine and cosine of half of
+    each angle. Bones shorter than `shortest_bone` do not turn. `opposite` (B, F) marks bones that turn by nearly 180
+    degrees; the caller must compute their rotations and angles.
     """
     for b in range(starts.shape[0]):
         s, e = starts[b], ends[b]
@@ -47,9 +48,10 @@ def shortest_turns(rigid, moved, starts, ends, shortest_bone, nearly_opposite, t
 
 @compiled
 def turn_joints(world, parents, joints, turns, out):  # type: ignore[no-untyped-def]
-    """Turn some of the global rotations `world` (F, J, 4), and fill `out` (F, 4·J) with the new local rotations.
+    """Turn B joints in the world, and fill `out` (F, 4·J) with the resulting local rotations of all joints.
 
-    `joints` (B,) are turned by `turns` (B, F, 4). `parents` (J,) is the hierarchy.
+    `world` (F, J, 4) are the global rotations before. Rotation b of `turns` (B, F, 4) turns joint b of `joints` (B,).
+    `parents` (J,) are the indices of the parents.
     """
     turned = np.empty((parents.shape[0], 4))
     for f in range(world.shape[0]):

@@ -29,9 +29,9 @@ def resample_clip(clip: Clip, frame_rate_hz: float, *, seam: LoopSeam | None = N
     ----------
     clip : Clip    F frames
     frame_rate_hz : float    frames per second
-    seam : LoopSeam, optional    the transition from one round of a loop to the next (`looping.loop_seam`), None for
-        other clips. A round is sampled at even distances; if it does not last a whole number of samples, it becomes
-        slower or faster by less than half a sample.
+    seam : LoopSeam, optional    the transition from the end of a loop to its start (`looping.loop_seam`); None if the
+        clip is not a loop. The samples of a loop are evenly spaced; if the loop does not last a whole number of sample
+        intervals, its duration is rounded to the nearest whole number of them.
 
     Returns
     -------

@@ -253,10 +253,10 @@ def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
 def _paired(
     source: Skeleton, source_mapping: JointMapping, target: Skeleton, target_mapping: JointMapping
 ) -> tuple[JointPair, ...]:
-    """Pair the joints of both skeletons with the same standard joint, each target joint once.
+    """Pair joints of the two skeletons that have the same standard name; each target joint is in at most one pair.
 
-    The root is left out unless it is also the pelvis: otherwise it is a point on the floor, and no bone defines its
-    direction.
+    The standard joint `root` is not paired: a root that is not also the pelvis is a point on the floor, and no bone
+    defines its axes.
     """
     for skeleton, mapping in ((source, source_mapping), (target, target_mapping)):
         for name in mapping.joints.values():
@@ -309,10 +309,10 @@ def _hip_height_ratio(
     target: Skeleton,
     target_axes: Mapping[str, JointAxes],
 ) -> float:
-    """Compute the height of the target's pelvis above its toes, upright, divided by that of the source.
+    """Compute the height of the target's pelvis above its toes, divided by the same height of the source.
 
-    Bone lengths are added up, because many files have a rest pose that is not upright. A part that is known of one
-    skeleton only is left out of both.
+    The heights of upright bodies are sums of bone lengths, because many files have a rest pose that is not upright. If
+    a part of the height is known for only one of the skeletons, both sums omit it.
     """
     parts = []
     for skeleton, axes, which in ((source, source_axes, "source"), (target, target_axes, "target")):
@@ -332,9 +332,9 @@ def _hip_height_ratio(
 def _heights(
     skeleton: Skeleton, joints: Mapping[str, int], up: NDArray[np.float64], side: str
 ) -> tuple[float, float, float]:
-    """Measure the height of pelvis over hip, the leg's length and the foot's height, in metres; NaN if unknown.
+    """Measure three heights of a side in metres: pelvis above hip, hip above ankle in a straight leg, ankle above toe.
 
-    `up` is the direction of the trunk in the pelvis' frame.
+    `up` is the direction of the trunk in the pelvis' frame. The first and last heights are NaN if they are unknown.
     """
     missing = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints]
     if missing:
@@ -356,7 +356,7 @@ def _heights(
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
-    """Check that both have the same joints, hierarchy and rest rotations; lengths may differ."""
+    """Check that both skeletons have the same joint names, hierarchy and rest rotations; lengths may differ."""
     if source.joint_names != target.joint_names or not np.array_equal(source.parents, target.parents):
         return False
     turned = quaternions.angle_between(source.rest_rotations, target.rest_rotations)

@@ -1,9 +1,9 @@
-"""Handling of joints above the joint that carries the body, such as a static reference on the floor or a root that
-moves with the body.
+"""Handling of joints above the joint that carries the body (the carrier, usually the pelvis).
 
-Joints above the carrier only move the whole body, and the carrier may undo their motion. If both are blended
-separately, their motions no longer cancel and the body leaves its path. These functions therefore exchange the two: the
-carrier becomes the first joint, and the root follows it.
+Examples are a static reference on the floor and a root that moves with the body. Joints above the carrier move the
+whole body, and the motion of the carrier may cancel theirs. If the root and the carrier are blended separately, their
+motions no longer cancel, and the body leaves its path. These functions therefore swap the two: the carrier becomes the
+first joint, and the root follows it.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ STILL = 1e-5
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:
-    """Place a joint in the world and let the root follow.
+    """Move and turn the carrier to given positions and rotations in the world by moving the root.
 
-    The root moves along, and the joints it carries keep their rotations; translations of `carrier` and of joints above
-    it are merged into the root's translations.
+    The joints above the carrier keep their local rotations. Translations of the carrier and of the joints above it are
+    merged into the root's translations.
 
     Parameters
     ----------
     motion : Motion    F frames
     skeleton : Skeleton    its joints
     carrier : int    joint that carries the body
-    places : (F, 3) float64    its positions in the world, metres
-    spins : (F, 4) float64    its rotations in the world
+    places : (F, 3) float64    new positions of the carrier in the world, metres
+    spins : (F, 4) float64    new rotations of the carrier in the world
 
     Returns
     -------
-    Motion    the motion with the carrier there
+    Motion    the motion with the carrier at these positions and rotations
     """
     above = skeleton.path_to_root(carrier)[:0:-1]
     arm = np.zeros((motion.frame_count, 3))
@@ -113,7 +113,7 @@ def body_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
 
 
 def root_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: bool) -> Motion:
-    """Undo `body_first`; the travel of the body becomes the root's.
+    """Undo `body_first`: make the root the first joint again, and move the body by the root's translations.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def root_first(motion: Motion, skeleton: Skeleton, carrier: int, *, root_stays: 
 
     Returns
     -------
-    Motion    the motion in the skeleton's own order
+    Motion    the motion with the root and the carrier in their own places
     """
     if not carrier:
         return motion

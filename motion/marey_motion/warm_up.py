@@ -69,9 +69,10 @@ def kernel_sources() -> list[Path]:
 def discard_outdated_kernels() -> None:
     """Remove all compiled code if it was compiled from other sources or by another compiler than those installed.
 
-    The cache of the compiler compares each kernel with its own file only, but a kernel contains copies of the kernels
-    that it calls, and the names of the types of its arguments. Modification times cannot be used: files of an installed
-    package have the times of the archive, which are the same for every version.
+    The compiler's cache detects only changes in the file that defines a kernel. A compiled kernel also contains copies
+    of the kernels that it calls and the names of the types of its arguments, which other files may define. Modification
+    times cannot be used: files of an installed package have the times of the archive, which are the same for every
+    version.
     """
     if _origin() == _recorded_origin() or not os.access(STAMP.parent, os.W_OK):
         return
@@ -101,7 +102,7 @@ def _is_done() -> bool:
 
 
 def _record(state: str) -> None:
-    """Record the origin and state of the compiled code beside it, if that folder is writable."""
+    """Write the digest of the sources and the state to `STAMP`, if its folder is writable."""
     if os.access(STAMP.parent, os.W_OK):
         STAMP.write_text(f"{_origin()} {state}", "utf-8")
 
@@ -131,7 +132,7 @@ def _compile(stage: str) -> None:
 
 
 def _read(clip: Clip) -> None:
-    """Read, check, write and retarget a walk, and turn a moved bone."""
+    """Read, check, write and retarget a walk; retarget it once more with a joint that has translations."""
     from marey_motion.formats import ImportOptions, read_motion, write_motion
     from marey_motion.gait import game_skeleton
     from marey_motion.retargeting import plan_retarget, retarget
@@ -187,7 +188,7 @@ def _match(clip: Clip) -> None:
 
 
 def _compare(points: NDArray[np.float32]) -> None:
-    """Align a motion with itself by every method, and search for its own poses."""
+    """Align a motion with itself by every method, and search it for the poses nearest to its own poses."""
     from marey_motion.alignment.dtw import RangeBounds, align, distances, warped_distance
     from marey_motion.evaluation.similarity import nearest_poses
 
@@ -219,7 +220,7 @@ def _align(clip: Clip) -> None:
 
 
 def _measure(clip: Clip) -> None:
-    """Measure the coverage of a clip as if it were being recorded."""
+    """Measure the coverage of a clip with the code for live recordings, which receives frames as they arrive."""
     from marey_motion.evaluation.online import OnlineCoverage
     from marey_motion.matching.body import MatchingBody
     from marey_motion.rigs import map_joints
@@ -246,7 +247,7 @@ def _model(clip: Clip) -> None:
 
 
 def _search(clip: Clip) -> None:
-    """Search a model of a single motion for two steps, and refine them."""
+    """Search for two steps in a model trained on a single motion, and refine the result."""
     from marey_motion.modelling.mixture import LatentMixture
     from marey_motion.modelling.primitive import FunctionalComponents, MotionPrimitive
     from marey_motion.modelling.search.step_search import search_steps

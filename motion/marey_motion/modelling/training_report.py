@@ -34,9 +34,9 @@ class ExampleReport:
     Parameters
     ----------
     log_likelihood : natural logarithm of its density
-    held_out_log_likelihood : the same under a mixture fitted without the example; None if it was not requested
-    left_out_error_cm : mean distance of its joints after reconstruction by the other examples' components, of the same
-        number as in the model
+    held_out_log_likelihood : its log-likelihood under a mixture fitted without it; None if it was not requested
+    left_out_error_cm : mean distance of its joints from their reconstruction by components of the other examples; as
+        many components as the model has
     outlier : whether its likelihood is much lower than those of the others
     """
 
@@ -52,7 +52,11 @@ class ExampleReport:
 
 @dataclass(frozen=True)
 class Durations:
-    """Durations of motions in seconds; `outside_share` of them are more than 5 % outside the examples' range."""
+    """Shortest, mean and longest duration of the examples or of samples, in seconds.
+
+    `outside_share` is the share of these motions that are more than 5 % shorter than the shortest example or more than
+    5 % longer than the longest example.
+    """
 
     least_s: float
     mean_s: float
@@ -70,9 +74,9 @@ class TrainingReport:
     mixture_method : see `FittedMixture`
     candidates : mixtures compared, with their criteria
     log_likelihood : mean log-likelihood of the examples
-    held_out_log_likelihood : mean log-likelihood of the examples, each under a mixture fitted without it
+    held_out_log_likelihood : mean log-likelihood of the examples, each under a mixture fitted without that example
     examples : reports of the examples, in the order of the aligned set
-    time_error_frames : root mean square error of time functions that are rebuilt from splines and kept components
+    time_error_frames : root mean square difference between the examples' time functions and those rebuilt by the model
     """
 
     spatial_energy: Floats
@@ -110,13 +114,13 @@ def report_on(
     ----------
     primitive : MotionPrimitive    the model
     aligned : AlignedSet    m examples
-    poses : (m, N, D) float64    their poses, with consistent signs
-    spatial, temporal : PrincipalExamples    components before any was dropped
+    poses : (m, N, D) float64    poses of the examples; their quaternions have consistent signs
+    spatial, temporal : PrincipalExamples    all components of the examples, also those that the model does not keep
     latents : (m, L) float64    latent vectors of the examples
     fitted : FittedMixture    mixture and candidates
     options : ModelOptions    options of the training
-    seed : int    seed of the samples
-    threads : int    threads for leaving examples out
+    seed : int    seed of the samples that are drawn from the model
+    threads : int    number of threads for the leave-one-out reconstructions
     progress : callable    called as progress(steps done, total where known, name of the step)
 
     Returns
@@ -181,7 +185,7 @@ def _examples(
 
 
 def _at(errors: ReconstructionErrors, components: int) -> int:
-    """Find the index of a number of components in the errors; the last index if there are fewer."""
+    """Find the index of the errors with this many components; the last index if none was measured with so many."""
     return min(components, len(errors.components) - 1)
 
 
@@ -193,7 +197,7 @@ def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
 def _feet(
     primitive: MotionPrimitive, aligned: AlignedSet, poses: Floats, sampled: Floats | None
 ) -> tuple[FootQuality | None, FootQuality | None]:
-    """Measure feet of the examples and of samples; None if the skeleton has no known feet."""
+    """Measure the feet in the examples and in samples; None twice if the skeleton has no known feet."""
     joints = find_landmarks(primitive.skeleton).ground_joints
     if not joints:
         return None, None

@@ -17,7 +17,7 @@ def verdict_of(trained: TrainedPrimitive) -> str:
 
     Returns
     -------
-    str    for people
+    str    text for users
     """
     report, primitive = trained.report, trained.primitive
     count = len(report.examples)

@@ -173,7 +173,7 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
 
 
 def perpendicular(vector: ArrayLike, direction: ArrayLike) -> AnyFloats:
-    """Compute the part of a vector at a right angle to a direction, at unit length.
+    """Compute the component of a vector that is perpendicular to a direction, scaled to unit length.
 
     Parameters
     ----------
@@ -243,8 +243,8 @@ def unroll(q: ArrayLike, axis: int = 0) -> AnyFloats:
 def angular_velocity(q: ArrayLike, frame_rate_hz: float) -> AnyFloats:
     """Differentiate rotations over time.
 
-    The result at a frame is the mean of the rates of the shortest rotations from the frame before and to the frame
-    after; at the ends, these rates are extrapolated linearly.
+    The shortest rotation from each frame to the next gives a rate for the time between them. The result at a frame is
+    the mean of the rates before and after it; for the first and last frame, the rates are extrapolated linearly.
 
     Parameters
     ----------
@@ -288,7 +288,10 @@ def _rotated(q: Floats, v: Floats) -> Floats:
 
 
 def _between_opposite(start: Floats, end: Floats, wished: NDArray[Any] | None) -> Floats:
-    """Find rotations between nearly opposite vectors (n, 3): half a turn about a normal of `start`, then the rest."""
+    """Find rotations (n, 4) from `start` (n, 3) to nearly opposite unit vectors `end` (n, 3).
+
+    Each is half a turn about an axis perpendicular to `start`, then the small rotation from there to `end`.
+    """
     candidates = [cross(start, end), np.eye(3)[np.argmin(np.abs(start), axis=-1)]]
     if wished is not None:
         candidates.insert(1, np.asarray(wished, dtype=np.float64))

@@ -34,8 +34,8 @@ def from_matrix(matrix: ArrayLike) -> AnyFloats:
 
     Notes
     -----
-    All four of Shepperd's (1978) forms are laid out as rows of 4·q·qᵀ; the row with the largest diagonal is exact
-    wherever the others cancel.
+    Shepperd's (1978) four formulas for q are the rows of the matrix 4·q·qᵀ. The row with the largest diagonal element
+    is used, because it has no cancellation.
     """
     (m,), dtype = widened((matrix, 3))
     if m.shape[-2:] != (3, 3):
@@ -118,7 +118,7 @@ def from_rotation_vector(vector: ArrayLike) -> AnyFloats:
 
 
 def as_rotation_vector(q: ArrayLike) -> AnyFloats:
-    """Convert quaternions to axis times angle, of at most half a turn (the logarithmic map).
+    """Convert quaternions to rotation vectors: unit axis times angle, from 0 to pi (the logarithmic map).
 
     Parameters
     ----------
@@ -165,8 +165,9 @@ def from_euler(order: str, angles_rad: ArrayLike, *, intrinsic: bool = True) -> 
 def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
     """Convert quaternions to Euler angles about three axes; see `from_euler`.
 
-    The middle angle is in -pi/2 to pi/2, or in 0 to pi where first and last axis are the same. In gimbal lock only the
-    sum or the difference of the outer angles is defined; the angle of the rotation that acts first is then zero.
+    The middle angle is from -pi/2 to pi/2, or from 0 to pi if the first and last axes are the same. In gimbal lock,
+    only the sum or the difference of the first and last angles is defined; the angle of the rotation that acts first is
+    then set to zero.
 
     Parameters
     ----------
@@ -184,7 +185,8 @@ def as_euler(q: ArrayLike, order: str, *, intrinsic: bool = True) -> AnyFloats:
 
     Notes
     -----
-    Bernardes and Viollet (2022): half the sum and half the difference of the outer angles are each one arctangent.
+    Method of Bernardes and Viollet (2022): one arctangent gives half the sum of the first and last angles, another one
+    half their difference.
     """
     axes = _euler_axes(order)
     if len(axes) != 3:
@@ -229,7 +231,7 @@ def _euler_axes(order: str) -> tuple[int, ...]:
 
 
 def _euler_block(axes: tuple[int, ...], angles: Floats, result: Floats, *, intrinsic: bool) -> None:
-    """Fill `result` (4, n) from `angles` (turns, n), multiplying one turn about a coordinate axis at a time."""
+    """Fill `result` (4, n) with n products of rotations by `angles` (len(axes), n) about the coordinate axes `axes`."""
     half = 0.5 * np.ascontiguousarray(angles)
     cosines, sines = np.cos(half), np.sin(half)
     turns = list(zip(axes, cosines, sines, strict=True))

@@ -2,11 +2,11 @@
 
 `twist` points along the bone: from the joint towards the next one. `swing` is perpendicular to it and points to the
 body's left when the limb hangs down or the trunk is upright: it is the axis about which knees and elbows hinge. The
-swing axis of an arm turns with the arm when the arm is raised sideways, so that in a T-pose with palms down it is up on
-the left, down on the right.
+swing axis of an arm turns with the arm when the arm is raised sideways: in a T-pose with palms down, the swing axis of
+the left arm points up, and that of the right arm points down.
 
-The twist can usually be computed from offsets alone. The swing of a limb can be computed from the rest pose only if
-that is the pose of a standing body. In many files all bones are on one line at rest; the swing is then determined from
+The twist can usually be computed from offsets alone. The swing of a limb can be computed from the rest pose only if the
+rest pose is that of a standing body. In many files all bones are on one line at rest; the swing is then determined from
 a motion.
 """
 
@@ -197,7 +197,7 @@ class _PosedBody:
     rotations: Floats
 
     def way(self, start: str, end: str) -> Floats | None:
-        """Compute unit directions (K, 3) between standard joints; zero if they coincide, None if one is not mapped."""
+        """Compute unit directions (K, 3) between standard joints; None if one is unmapped, zero if both coincide."""
         if start not in self.joints or end not in self.joints:
             return None
         return _unit(self.positions[:, self.joints[end]] - self.positions[:, self.joints[start]])
@@ -240,7 +240,7 @@ class _PosedBody:
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
     def _level(self, names: tuple[str, ...]) -> Floats | None:
-        """Find positions (K, 3) of the first mapped one of these joints; for a pair, the middle of left and right."""
+        """Find the positions (K, 3) of the first of `names` that is mapped; of a left and a right joint, their middle."""
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):
@@ -250,7 +250,7 @@ class _PosedBody:
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:
-        """Parts of the body that are posed as in standing in the first frame, so that axes can be read from them."""
+        """Parts of the body that are posed as if standing in the first frame, so that it shows their axes."""
         left, up = self.hips_left[0], self.up[0]
         legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
         if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):
@@ -264,7 +264,10 @@ class _PosedBody:
         return frozenset(parts)
 
     def foot(self, side: str) -> Floats | None:
-        """Compute directions (K, 3) from ankle to toe; to the toe's tip where its joint is straight below the ankle."""
+        """Compute unit directions (K, 3) from ankle to toe.
+
+        If the toe joint is straight below the ankle, the directions end at the tip of the toe instead.
+        """
         shank, foot = self.way(f"{side}_knee", f"{side}_ankle"), self.way(f"{side}_ankle", f"{side}_toe")
         if foot is None or shank is None or float(np.mean(np.sum(foot * shank, axis=-1))) < ALONG:
             return foot
@@ -346,7 +349,7 @@ def _swing(standard: str, body: _PosedBody) -> Floats:
 
 
 def _leg_hinge(side: str, body: _PosedBody) -> Floats:
-    """Find the axis about which a knee bends and the shank turns backwards; the body's left if it does not bend."""
+    """Find the axes (K, 3) about which a knee bends backwards; the body's left if the knee never bends."""
     thigh, shank = body.way(f"{side}_hip", f"{side}_knee"), body.way(f"{side}_knee", f"{side}_ankle")
     if len(body.positions) > 1 and thigh is not None and shank is not None:
         bend = np.cross(thigh, shank)
@@ -356,7 +359,10 @@ def _leg_hinge(side: str, body: _PosedBody) -> Floats:
 
 
 def _arm_hinge(side: str, joint: str, body: _PosedBody) -> Floats:
-    """Find the axis about which an elbow stretches; if it does not bend, the body's left, turned with a raised arm."""
+    """Find the axes (K, 3) about which an elbow extends.
+
+    If the elbow never bends, return the body's left, rotated as the arm is rotated from hanging down to its pose.
+    """
     upper, fore = body.way(f"{side}_shoulder", f"{side}_elbow"), body.way(f"{side}_elbow", f"{side}_wrist")
     if len(body.positions) > 1 and upper is not None and fore is not None:
         bend = np.cross(fore, upper)

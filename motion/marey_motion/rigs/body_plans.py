@@ -1,7 +1,8 @@
-"""Choice of the pairs of limbs that are legs and arms of a person, and of their bending joints, by proportions.
+"""Recognition of the legs and arms of a person, and of the joints at which they bend, by proportions.
 
-A cape, wings or the bones of a skirt are pairs of chains as well, and twist bones lie between the joints that bend. The
-score of an interpretation is a sum of logarithms, one for each proportion, of its frequency among people.
+A skeleton can have other pairs of chains, such as a cape, wings or the bones of a skirt, and twist bones between the
+joints that bend. Every interpretation of the chains has a score: the sum of the logarithms of how frequent each of its
+proportions is among people.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ SHORTER = -1.5
 
 @dataclass(frozen=True)
 class Build:
-    """Proportions of a limb among people, each as its usual value and the spread of its logarithm."""
+    """Usual proportions of an arm or a leg of a person: each is the usual value and the spread of its logarithm."""
 
     ratio: tuple[float, float]  # upper by lower long bone
     end: tuple[float, float]  # what follows, to the tip of toes or fingers, by both long bones
@@ -57,7 +58,10 @@ ARM_BY_LEG_LIMITS = (0.3, 1.2)
 
 @dataclass(frozen=True)
 class LimbReading:
-    """A pair of limbs with the joints at which the upper and the lower long bone start and the lower bone ends."""
+    """Interpretation of a pair of chains as arms or legs, with a score.
+
+    `places` are the positions in each chain of hip, knee and ankle, or of shoulder, elbow and wrist.
+    """
 
     pair: LimbPair
     places: tuple[int, int, int]
@@ -66,7 +70,7 @@ class LimbReading:
 
     @property
     def triple(self) -> tuple[int, int, int]:
-        """Indices of the three joints on the first side."""
+        """Indices of hip, knee and ankle, or shoulder, elbow and wrist, of the first of the two limbs."""
         a, b, c = (self.pair.limbs[0].chain[place] for place in self.places)
         return a, b, c
 
@@ -75,8 +79,9 @@ class LimbReading:
 
         Parameters
         ----------
-        side : int    0 or 1
+        side : int    0 for the first limb of the pair, 1 for the second
         place : int    0 to 3 for hip, knee, ankle and toe, or their counterparts in an arm; -1 for the joint before
+            the hip or shoulder
 
         Returns
         -------
@@ -90,7 +95,7 @@ class LimbReading:
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """Legs and arms, with a score of how common such a body is: at least 0 for most people, less for others."""
+    """Legs and arms, and a score of how common their proportions are: at least 0 for most people, less for others."""
 
     legs: LimbReading
     arms: LimbReading
@@ -134,9 +139,10 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Make the key that sorts interpretations of limbs by score, then by joints.
+    """Make the key that sorts interpretations of limbs: highest score first, then by joints.
 
-    Of joints at the same position, the lower ones start the long bones, and the upper one is the wrist or ankle.
+    Of several joints at the same position, the one farthest down the chain is preferred as hip, knee, shoulder or
+    elbow, and the one nearest to the root as ankle or wrist.
     """
     a, b, c = reading.places
     return -round(reading.worth, 6), -a, -b, c
@@ -158,7 +164,11 @@ def _worth(tree: BoneTree, pair: LimbPair, places: tuple[int, int, int], build: 
 
 
 def _worth_of_joints_between(tree: BoneTree, pair: LimbPair, start: int, stop: int) -> float:
-    """Score the joints inside a long bone by whether they bend it; joints without length do not count."""
+    """Score the extra joints between the ends of a long bone.
+
+    Twist joints that divide a straight bone evenly cost least, joints that bend it cost most. Joints at the position of
+    their parent are not counted.
+    """
     count = sum(bone > SHORTEST_BONE_M for bone in pair.bones[start:stop]) - 1
     if count < 1:
         return 0.0

@@ -95,7 +95,7 @@ def find_body(skeleton: Skeleton) -> GeometryMatch | None:
 
 
 def _doubts(skeleton: Skeleton, plan: BodyPlan, rivals: list[BodyPlan]) -> tuple[str, ...]:
-    """List other candidates for the legs or arms whose proportions are hardly less common."""
+    """Describe other chains that may be the legs or arms, because their proportions are nearly as common."""
     doubts = []
     for limb, joints, reading, others in (
         ("legs", "hip, knee and ankle", plan.legs, [one.legs for one in rivals]),
@@ -119,7 +119,7 @@ def _neck(tree: BoneTree, plan: BodyPlan) -> tuple[float, list[int]]:
 
 
 def _neck_chain(tree: BoneTree, start: int) -> list[int]:
-    """List joints upwards to where the chain branches, ends, or turns as hair does at the back of a head."""
+    """List joints from `start` up to where the chain branches, ends, or bends sharply, as hair behind a head does."""
     skeleton = tree.skeleton
     chain = [start]
     while len(following := _branches(tree, chain[-1])) == 1 and tree.lengths[following[0]] > SHORTEST_BONE_M:

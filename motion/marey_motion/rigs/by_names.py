@@ -72,7 +72,7 @@ def best_match(skeleton: Skeleton) -> NameMatch | None:
 
 
 def _by_name(names: Names) -> dict[JointName, int]:
-    """Find joints by their names; of "UpLeg_L" and its helper "__UpLeg_L", the plainer name is the joint."""
+    """Index joints by parsed name; if parsed names are equal, as for UpLeg_L and __UpLeg_L, the shorter name wins."""
     joints: dict[JointName, int] = {}
     for index in sorted(range(len(names)), key=lambda joint: len(names[joint])):
         joints.setdefault(parse_name(names[index]), index)
@@ -100,7 +100,7 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 
 
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
-    """List prefixes that all names of a file may share: the beginnings of names that end like the rig's pelvis."""
+    """List possible shared prefixes of the joint names: what precedes the rig's name of the pelvis in any name."""
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]
         for name in pelvis

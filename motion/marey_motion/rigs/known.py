@@ -16,11 +16,12 @@ Names = str | tuple[str, ...]
 
 @dataclass(frozen=True, eq=False)
 class KnownRig:
-    """Names of one rig's joints; several names of a joint are alternatives, the first that is found counts.
+    """Names of one rig's joints; if a joint has several alternative names, the first that is found is used.
 
-    `signature` distinguishes rigs that name the body alike: names of further joints, or a prefix of most names, written
-    "prefix*". More than half of the signature must be found. `everyday` marks a list of words that belong to no tool;
-    it is chosen only if it names more of a body than the names of every tool.
+    `signature` distinguishes rigs that use the same names for the body: it lists names of further joints, or a prefix
+    of most names, written "prefix*". More than half of the signature must be found. `everyday` marks names that are
+    everyday words and belong to no particular tool; they are chosen only if they match more essential joints than the
+    names of every tool.
     """
 
     name: str

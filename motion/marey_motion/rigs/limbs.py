@@ -41,7 +41,7 @@ class Limb:
 
 @dataclass(frozen=True, eq=False)
 class LimbPair:
-    """Two limbs of equal build on one joint."""
+    """Two limbs that branch from the same joint and have the same number of bones of nearly equal lengths."""
 
     parent: int
     limbs: tuple[Limb, Limb]
@@ -49,7 +49,7 @@ class LimbPair:
 
     @cached_property
     def bones(self) -> tuple[float, ...]:
-        """Mean lengths of both sides' bones, in the skeleton's unit."""
+        """Length of each bone, averaged over the two limbs, in the skeleton's unit."""
         return tuple((a + b) / 2 for a, b in zip(self.limbs[0].bones, self.limbs[1].bones, strict=True))
 
 
@@ -117,7 +117,7 @@ class BoneTree:
 
     @cached_property
     def limb_pairs(self) -> tuple[LimbPair, ...]:
-        """All pairs of sibling chains of equal build and three joints or more."""
+        """All pairs of chains that branch from one joint, have matching bone lengths and at least three joints each."""
         pairs = []
         for parent, children in enumerate(self.skeleton.children):
             long = [child for child in children if self.depth[child] >= 3]
@@ -174,7 +174,10 @@ class BoneTree:
 
 
 def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
-    """Match two limbs of equal build, or their common part before one of them continues into an object it holds."""
+    """Make a pair of two limbs if their bones match; None otherwise.
+
+    If only the first bones match, as when one hand holds an object, both limbs are shortened to these bones.
+    """
     shorter = min(len(first.chain), len(second.chain)) - 1
     for a, b in ((first, second), *((first.cut(k), second.cut(k)) for k in range(shorter, LEAST_COMMON_BONES - 1, -1))):
         asymmetry = _asymmetry(a, b)
@@ -184,7 +187,7 @@ def _paired(parent: int, first: Limb, second: Limb) -> LimbPair | None:
 
 
 def _asymmetry(first: Limb, second: Limb) -> float:
-    """Compute the difference of two chains' bones as a share of their length; infinite if they differ in build."""
+    """Sum the differences of two chains' bone lengths, as a share of their length; infinite if bone counts differ."""
     if len(first.bones) != len(second.bones):
         return float("inf")
     a, b = np.array(first.bones), np.array(second.bones)

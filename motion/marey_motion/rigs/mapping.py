@@ -67,7 +67,7 @@ class JointMapping:
 
         Raises
         ------
-        MappingError    naming the ones that this mapping lacks
+        MappingError    naming the standard names that this mapping lacks
         """
         names = tuple(standard_names)
         missing = [name for name in names if name not in self.joints]
@@ -156,8 +156,8 @@ def require_trust(mapping: JointMapping) -> JointMapping:
 def symmetric_joints(skeleton: Skeleton, mapping: JointMapping) -> NDArray[np.int32]:
     """Pair each joint with its partner on the other side of the body.
 
-    Partners come from the mapping if it has both sides; otherwise from names that differ only in their side; otherwise
-    from the joints below, since the parents of partners are partners.
+    Partners come from the mapping if it contains both of them. Otherwise they are joints whose names differ only in the
+    side. Joints that still have no partner become partners if they are the parents of two partners.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ def readings(names: Sequence[str]) -> tuple[Names, ...]:
 
 
 def _marked(names: Names) -> Names:
-    """List the names that must share a mark: all except the root's, since exporters often add the root themselves."""
+    """List the names that must all contain a mark: those of all joints except the root, which exporters often add."""
     return names[1:]
 
 

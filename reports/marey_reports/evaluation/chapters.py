@@ -174,7 +174,7 @@ def baseline_chapter(result: EvaluationResult) -> Section:
         rows.append([*row, metric.unit])
     about = (
         f"{HOW_POOLED} The baseline is the same suite over generated clips, one for each speed and turn rate: "
-        "what this way of following reaches when nothing is missing."
+        "it shows what the same motion matching reaches when no data is missing."
         if base is not None
         else f"{HOW_POOLED} No baseline was evaluated beside them."
     )
