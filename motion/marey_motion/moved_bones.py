@@ -47,9 +47,9 @@ class FollowedBones:
         name, most = max(self.largest_turn_deg.items(), key=lambda item: item[1])
         return CheckWarning(
             "bones-moved-by-translations",
-            f"joints move relative to their parents, so that the directions of {len(self.largest_turn_deg)} bones differ "
-            f"from those that their rotations give, most at {name}: up to {most:.1f} degrees; the result follows the "
-            "directions between the positions of the joints",
+            f"joints move relative to their parents, so that the directions of {len(self.largest_turn_deg)} bones "
+            f"differ from those that their rotations give, most at {name}: up to {most:.1f} degrees; the result "
+            "follows the directions between the positions of the joints",
             joints=tuple(self.largest_turn_deg),
             values={"largest_turn_deg": most},
         )

@@ -122,7 +122,7 @@ class TokenCreate(Request):
 
 
 class TokenRotation(Request):
-    """Request to replace the token that it was sent with by a successor with the same rights and the same expiry."""
+    """Request to replace the token that authenticates it by a new token with the same rights and the same expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",

@@ -31,11 +31,11 @@ class Options(Request):
 
     @classmethod
     def of(cls, extended: BaseModel) -> Self:
-        """Return an instance of this class with the values from a model that has at least the same fields."""
+        """Return an instance with the values of `extended`, which must have at least the fields of this class."""
         return cls(**{name: getattr(extended, name) for name in cls.model_fields})
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with other values, which are validated."""
+        """Return a copy in which the fields named in `changes` have new values; the copy is validated."""
         return type(self)(**{**dict(self), **changes})
 
 

@@ -240,7 +240,7 @@ class _PosedBody:
         return _unit(trunk - _dot(trunk, self.hips_left) * self.hips_left)
 
     def _level(self, names: tuple[str, ...]) -> Floats | None:
-        """Find the positions (K, 3) of the first of `names` that is mapped; of a left and a right joint, their middle."""
+        """Find positions (K, 3) of the first of `names` that is mapped; for a pair, the middle of left and right."""
         for name in names:
             joints = (name,) if name in CENTRE_JOINTS else tuple(f"{side}_{name}" for side in SIDES)
             if all(joint in self.joints for joint in joints):
@@ -250,7 +250,10 @@ class _PosedBody:
 
     @cached_property
     def readable_parts(self) -> frozenset[str]:
-        """Parts of the body that are posed as if standing in the first frame, so that it shows their axes."""
+        """Names of the parts of the body whose axes can be computed from the first frame.
+
+        These are the parts that have the pose of a standing body in that frame.
+        """
         left, up = self.hips_left[0], self.up[0]
         legs = [way[0] for side in SIDES if (way := self.way(f"{side}_hip", f"{side}_ankle")) is not None]
         if left @ self.shoulders_left[0] < 0.7 or not np.any(up) or any(leg @ up > -0.7 for leg in legs):

@@ -1,4 +1,8 @@
-"""Picture of a difference: corresponding frames, rotations over time, paths of the root, and segments."""
+"""Picture of the difference between two revisions of a motion or of an annotation.
+
+For motions it shows corresponding frames, changed rotations over time and the paths of the root; for annotations, the
+segments and keyframes.
+"""
 
 from __future__ import annotations
 
@@ -63,11 +67,11 @@ _THINNEST, _NAME_ROOM = 0.004, 0.16
 
 
 def draw_difference(difference: Difference, file_type: FileType) -> bytes:
-    """Draw a difference between motions or annotations that was requested with values to draw.
+    """Draw the difference between two motions or two annotations.
 
     Parameters
     ----------
-    difference : with `plot` or `annotations`
+    difference : has `motion` and `plot`, or `annotations`; `plot` is computed only on request
     file_type : type of the file
 
     Returns
@@ -161,7 +165,7 @@ def _name_runs(panel: Axes, motion: MotionDifference) -> None:
 
 
 def _draw_changes(figure: Figure, panel: Axes, plot: DifferencePlot, shown: NDArray[np.intp], top: float) -> None:
-    """Draw the changes of the joints over time; frames that correspond to none are left in the colour `UNKNOWN`."""
+    """Draw the changes of the joints over time; frames without a match in the other revision are coloured `UNKNOWN`."""
     times = np.array(plot.frames) / plot.frame_rate_hz
     if not len(shown):
         panel.set_yticks([])

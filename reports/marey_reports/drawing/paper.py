@@ -188,7 +188,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis, from `wanted` to 2 · `wanted`, so that the axis shows the values without outliers."""
+    """Choose the end of an axis so that it shows all but the largest values: at least `wanted`, at most twice that."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))
@@ -204,7 +204,7 @@ def nice_ceiling(value: float) -> float:
 
 
 def warm_colours() -> Colormap:
-    """Make a colour map from yellow to brown that differs from an empty page at its light end."""
+    """Make a colour map from yellow to brown; even its lightest colour is visible on a white page."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 

@@ -21,7 +21,10 @@ HEADING_PAIRS = ("hip", "shoulder")
 
 @dataclass(frozen=True)
 class Camera:
-    """A parallel view of the ground from `direction_rad` about +Y (0 looks from +Z), `tilt_rad` from above."""
+    """Camera with parallel projection.
+
+    `direction_rad` is its direction about +Y (0: it looks from +Z); `tilt_rad` is its angle above the horizontal.
+    """
 
     direction_rad: float
     tilt_rad: float
@@ -41,12 +44,14 @@ class StickFigure:
 
     Parameters
     ----------
-    bones : (n, 2) indices of the points at the outer and the inner end of each bone; joints come before end sites
-    sides : (n,) LEFT, CENTRE or RIGHT
-    pelvis : the joint that figures are centred on
-    head : bone on whose line the middle of the head is, and its position from the inner (0) to the outer (1) end; None
-        if no head is known
-    facing : joints of the left side and their partners of the right, from which the facing direction is computed
+    bones : (n, 2) indices of the points at the outer and the inner end of each bone; the points are all joints, then
+        all end sites
+    sides : (n,) LEFT, CENTRE or RIGHT for each bone
+    pelvis : index of the joint that is at the centre of a drawn figure
+    head : index of the bone of the head, and the position of the centre of the head along it, from 0 (inner end) to 1
+        (outer end); None if no head is known
+    facing : indices of joints of the left side, and of the same joints of the right side, from which the facing
+        direction is computed
     """
 
     bones: Indices
@@ -58,11 +63,11 @@ class StickFigure:
 
 @dataclass(frozen=True)
 class Stances:
-    """A body at K moments.
+    """Points of a body at K moments.
 
     Parameters
     ----------
-    points : (K, P, 3) positions over the floor, centred on the pelvis, metres
+    points : (K, P, 3) positions in metres; x and z are relative to the pelvis, y to the floor
     facing : (K, 2) unit (x, z) directions in which the body faces, None if its joints do not determine them
     """
 
@@ -114,7 +119,7 @@ def runs_of(bones: Indices) -> list[Indices]:
 
 
 def stances_at(clip: Clip, body: StickFigure, frames: Indices) -> Stances:
-    """Compute the poses of the body in the given frames (K,) only."""
+    """Compute the positions and facing directions of the body in the frames `frames` (K,) of a clip."""
     points = kinematics.forward_kinematics(
         clip.skeleton,
         clip.poses[frames].astype(np.float64),

@@ -76,7 +76,7 @@ def draw_strips(
     Parameters
     ----------
     cell_in : width and height of a cell, inches
-    legend : names and colours of further elements besides the two sides
+    legend : further elements to name in the legend, besides the left and right sides: their names and colours
     """
     width, height = cell_in
     columns = len(moments.names)
@@ -192,7 +192,7 @@ def _draw_way(axes: Axes, way: Floats, frame: Rectangle) -> None:
 
 
 class _Shapes(NamedTuple):
-    """A body's lines: for each side the runs of points that bones join, and the bones themselves (n, 2)."""
+    """A body's bones by side, joined to long lines and also one by one (n, 2); bone and size of its head."""
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]

@@ -161,7 +161,7 @@ def recording_chapter(result: EvaluationResult, figures: Figures) -> Section:
 
 
 def baseline_chapter(result: EvaluationResult) -> Section:
-    """Write the chapter that compares the suite's numbers with those of generated clips that fill every cell."""
+    """Write the chapter on the suite's numbers, beside those of a suite over generated clips that fill every cell."""
     base = result.baseline
     heads = ["measure", "this dataset", *(["generated baseline"] if base is not None else []), "unit"]
     rows: list[Sequence[Cell]] = []

@@ -14,12 +14,12 @@ from marey_reports.drawing.words import span
 
 
 class CoverageGap(NamedTuple):
-    """Rectangle of neighbouring cells that lack data, and the seconds to record there.
+    """Rectangle of neighbouring cells of speed and turn rate that lack data, and the seconds to record there.
 
     Parameters
     ----------
-    turn_rates_deg_s, speeds_m_s : lowest and highest value
-    missing_s : seconds of data missing in total
+    turn_rates_deg_s, speeds_m_s : centres of the outermost cells, lowest first
+    missing_s : seconds of data missing in all cells of the rectangle together
     """
 
     turn_rates_deg_s: tuple[float, float]
@@ -35,8 +35,8 @@ class CoverageGap(NamedTuple):
 def find_holes(coverage: Coverage) -> list[CoverageGap]:
     """Combine the cells without enough data into few rectangles, the largest deficit first.
 
-    First, neighbouring cells of one side (left, straight on, right) are joined along the turn rate; then, equal runs of
-    cells are joined along the speed. A rectangle is described by the centres of its outermost cells, which are trials.
+    First, neighbouring cells of equal speed are joined to runs; a run contains only left turns, only right turns or
+    only straight motion. Then, runs over the same turn rates at neighbouring speeds are joined to rectangles.
     """
     lacking = coverage.deficit_s > 0.0
     speeds, turns = (_centres(edges) for edges in (coverage.speed_edges_m_s, coverage.turn_rate_edges_deg_s))

@@ -40,10 +40,11 @@ def render_model_report(
 
     Parameters
     ----------
-    subject : the same model with its examples
+    trained : the model with its training report
+    subject : the same model with its examples, for drawing
     figures : figures by name, as returned by `draw_alignment_figures` and `draw_model_figures`; some may be missing
     title : heading of the page, for example the name of the model
-    origin : origin of the examples, from the part `model`
+    origin : field `provenance` of the part `model`: origin of the model and of its examples
     """
     sections = [
         warning_chapter(trained),

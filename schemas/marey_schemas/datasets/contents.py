@@ -1,4 +1,4 @@
-"""Content of versions by digest: requests for it, and versions that come from elsewhere."""
+"""Requests for revisions by their digests, and versions received from an archive or another server."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ PartName = Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 def _require_time(text: str) -> str:
-    """Return the text if it is a time in the one form that digests of commits cover."""
+    """Return the text; raise ValueError unless it is a time in the format that digests of commits require."""
     if datetime.strptime(text, TIME_OF_COMMIT).strftime(TIME_OF_COMMIT) != text:  # noqa: DTZ007
         raise ValueError("the time must be written like 2026-11-23T10:00:00.000000Z")
     return text
 
 
 class PartOfContent(Request):
-    """Address of a document: a part of the revisions with a content digest."""
+    """Address of a document: the content digest of a revision, and the name of one of its parts."""
 
     content: Digest = Field(description="Content digest of the revision.")
     part: PartName
 
 
 class ContentsRequest(Request):
-    """Request for revisions of a project by their content digests, and for documents of them."""
+    """Request for revisions of a project by their content digests, and for documents of such revisions."""
 
     revisions: tuple[Digest, ...] = Field((), max_length=MOST_CONTENTS)
     documents: tuple[PartOfContent, ...] = Field((), max_length=MOST_CONTENTS)

@@ -26,7 +26,7 @@ class Side(StrEnum):
 
 
 class Resolution(Request):
-    """Decision of one conflict."""
+    """Decision about a conflict: the side whose version of an entry is kept."""
 
     path: EntryPath
     kind: Kind
@@ -34,7 +34,7 @@ class Resolution(Request):
 
 
 class CombineRequest(Request):
-    """Request to apply or undo the changes of other commits on a branch."""
+    """Base of requests that apply changes from other commits to a branch, or undo changes of a commit on it."""
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
@@ -53,7 +53,7 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to repeat or undo the changes of one commit on a branch."""
+    """Request to apply the changes of one commit to a branch again (cherry-pick), or to undo them (revert)."""
 
     version: Version = Field(description="Commit whose changes are repeated or undone.")
     parent: Literal[1, 2] | None = Field(

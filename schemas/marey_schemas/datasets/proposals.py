@@ -176,7 +176,7 @@ class ProposalCheck(Answer):
 
 
 class Missing(Answer):
-    """Reason for which a proposal cannot be merged yet."""
+    """Reason why a proposal cannot be merged yet."""
 
     code: str
     detail: str

@@ -25,7 +25,10 @@ class ExampleRef(Request):
 
 
 class AlignedPlacement(Request):
-    """Place of the body in the first frame of the source: a canonical point p was at R(heading) p + (x, y, z) there."""
+    """Position and heading of the body in the first frame of the source clip.
+
+    A point p of the aligned clip is at R(heading_rad)·p + (x, y, z) in the source, where R turns about +Y.
+    """
 
     heading_rad: Metres = 0.0
     x: Metres = 0.0
@@ -35,9 +38,9 @@ class AlignedPlacement(Request):
 
 
 class AlignmentInfo(Request):
-    """Part `info` of an aligned clip: its set of examples, and the mapping to its source.
+    """Part `info` of an aligned clip: the set of examples it belongs to, and the mapping to its source clip.
 
-    Part `motion` holds its canonical frames.
+    The part `motion` contains the frames of the aligned clip.
     """
 
     schema_: Literal["marey/alignment@1"] = Field("marey/alignment@1", alias="schema")

@@ -1,4 +1,4 @@
-"""References of stored documents to bytes outside of them: arrays, and files.
+"""References from stored documents to bytes that are stored separately: arrays and files.
 
 In a stored document, an array is replaced by `{"dtype", "shape", "content"}`.
 """
@@ -21,9 +21,9 @@ def is_array_reference(value: Any) -> bool:
 
 
 def members_of(tree: Any) -> list[tuple[str, Any]]:
-    """List the members of a tree with their JSON Pointers, an object or list before its own members.
+    """List the JSON Pointer and value of every node of a document; objects and lists precede what they contain.
 
-    Numbers and text in lists are left out, because they have no names and are not references.
+    Numbers and texts in lists are left out: they have no names, so they cannot be references.
     """
     found: list[tuple[str, Any]] = []
 
@@ -46,9 +46,9 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Return the references of a stored document by JSON Pointer: its arrays, and the digests of files that it names.
+    """Return the references in a stored document by JSON Pointer: first those to arrays, then the digests of files.
 
-    Files are named in the fields that the schema has for them, and in members called `blob`.
+    Digests of files are in certain fields of the schema, and in members called `blob`.
     """
     fixed = _FILE_POINTERS.get(schema, ())
     arrays, files = {}, {}

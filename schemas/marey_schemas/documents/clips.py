@@ -90,7 +90,7 @@ class ClipSource(Request):
 
 
 class TakeRecord(Request):
-    """Record of the take that a clip comes from; lists show it, and queries refer to it."""
+    """Facts about the recording that a clip comes from; lists of clips show them, and queries can filter by them."""
 
     subject: str | None = Field(None, description="Performer, under a pseudonym.")
     action: str | None = Field(None, description="What the performer does.")

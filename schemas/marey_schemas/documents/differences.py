@@ -24,7 +24,7 @@ MatchedFloats = Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)]
 
 
 class DifferenceOptions(Options):
-    """Options of a difference: the sizes of changes of motion above which their times are listed."""
+    """Options of a comparison: thresholds; times at which a motion changed by more than a threshold are listed."""
 
     threshold_deg: float = Field(
         1.0,
@@ -159,14 +159,14 @@ class MotionDifference(Answer):
 
 
 class SegmentChange(Answer):
-    """Change of a segment: added or removed if one of the two is absent, otherwise moved, relabelled or both."""
+    """Change of a segment: added if `before` is absent, removed if `after` is absent, else moved or relabelled."""
 
     before: SegmentDocument | None = None
     after: SegmentDocument | None = None
 
 
 class KeyframeChange(Answer):
-    """Change of a keyframe: added or removed if one of the two is absent, otherwise moved, relabelled or both."""
+    """Change of a keyframe: added if `before` is absent, removed if `after` is absent, else moved or relabelled."""
 
     before: KeyframeDocument | None = None
     after: KeyframeDocument | None = None

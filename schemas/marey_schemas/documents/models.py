@@ -90,13 +90,13 @@ class MixtureDocument(Request):
 
 
 class Noted(Request):
-    """Base class of records about the training of a model; undeclared members are allowed and ignored."""
+    """Base class of records about the origin and training of a model; undeclared members are allowed."""
 
     model_config = ConfigDict(extra="allow")
 
 
 class PredecessorOrigin(Noted):
-    """Origin of a model that was imported from the predecessor."""
+    """Origin of a model that was imported from Marey's predecessor."""
 
     animated_joints: tuple[JointName, ...] = Field(
         (), max_length=MOST_JOINTS, description="Joints that the model animates."
@@ -201,7 +201,7 @@ def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
 
 
 def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
-    """Return the origin of an imported part `model`; empty if an older document records it in another form."""
+    """Return the origin of a model imported from Marey's predecessor, from its part `model`; empty if unreadable."""
     try:
         return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
     except ValidationError:
@@ -209,7 +209,7 @@ def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
 
 
 def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the examples' log-likelihoods in a part `model`; empty if an older document has another form."""
+    """Return the log-likelihoods of the examples from a part `model`; empty if they are in an older, unknown form."""
     try:
         examples = TrainingNotes.model_validate(model.get("training") or {}).examples
     except ValidationError:

@@ -1,4 +1,7 @@
-"""Imported files of models, trees and graphs, which are exported unchanged as long as the part is unchanged."""
+"""Imported files of models, trees and graphs.
+
+A file is exported again byte for byte as long as the part that the import created from it is unchanged.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ CONTENT = {
 
 
 class StoredOriginal(Request):
-    """Imported file, with the digest of the content that the import created from it."""
+    """Imported file, and the digest (`content`) of the members of the part that the import created from the file."""
 
     name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest
@@ -30,7 +33,10 @@ class StoredOriginal(Request):
 
 
 def content_digest(part: str, document: Mapping[str, Any]) -> str:
-    """Return the digest of the members of a part that come from its file; arrays may be references."""
+    """Return the digest of those members of a part that an import takes from a file (see `CONTENT`).
+
+    Arrays in `document` may be references.
+    """
     return document_digest({name: document.get(name) for name in CONTENT[part]})
 
 

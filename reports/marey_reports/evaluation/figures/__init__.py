@@ -93,9 +93,9 @@ def draw_figure(
     Parameters
     ----------
     name : one of `FIGURES`
-    trial : name of the trial to show, such as "switching v=1.5 w=-50". Without it, figures of one trial show the one
-        that was followed worst, and the others the whole suite
-    other : the result to compare with, drawn second
+    trial : name of the trial to show, such as "switching v=1.5 w=-50". Default: the trial
+        that the character follows worst, for figures that show only one trial; otherwise the whole suite
+    other : second result, drawn beside the first for comparison
     labels : names of the two results in a comparison
 
     Raises

@@ -1,4 +1,7 @@
-"""Figure 10: clips as circles of frames, larger where they are popular, with lines for the transitions."""
+"""Figure 10: each clip as a circle of dots, one per range of frames, and transitions between clips as lines.
+
+Dots are larger for frames that are displayed more often.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ RADIAL_NAMES = 8  # more names than this run outwards, lest they meet
 
 
 class _Line(NamedTuple):
-    """Transitions from one stretch of a clip to another: uids of the clips, middle frames of the stretches, number."""
+    """Jumps from a range of frames to another: uids of both clips, middle frames of both ranges, number of jumps."""
 
     source: str
     left: int
@@ -102,9 +105,10 @@ def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[
 
 
 def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
-    """List all jumps between the circles, the most frequent first; jumps between the same two stretches are one line.
+    """Combine the jumps between clips into lines, the most frequent first.
 
-    A stretch is a dot of a circle, or several dots together, if there would be more than `MOST_LINES` lines otherwise.
+    All jumps from the same range of frames to the same other range form one line. A range is a dot of a circle; if this
+    gave more than `MOST_LINES` lines, a range is several neighbouring dots.
     """
     clips = subject.result.clips
     owners = clips_of_rows(clips, switches[:, :2])

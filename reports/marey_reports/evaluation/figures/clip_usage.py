@@ -32,7 +32,7 @@ TRANSITIONS = "Transitions"
 
 
 class _Use(NamedTuple):
-    """Number of displayed frames and name of each clip, by uid, and number of transitions."""
+    """Use of the clips of a subject: displayed ticks and name by uid, and the number of transitions in total."""
 
     ticks: dict[str, int]
     names: dict[str, str]

@@ -36,14 +36,14 @@ CATEGORIES = len(COLOURS) * len(MARKERS)
 
 
 class _Points(NamedTuple):
-    """Drawn parts of a subject: indices of windows in the coverage, and the clips with a colour of their own."""
+    """Indices of what is drawn of a subject: windows of its coverage, and the clips that have their own colours."""
 
     windows: NDArray[np.int64]
     named: list[int]
 
 
 def draw_points(subjects: Sequence[Subject], _trial: str | None, options: FigureOptions) -> Sketch:
-    """Draw a point per window of one second, of up to `MOST_POINTS` evenly spaced windows."""
+    """Draw a point for each window of one second, or for at most `MOST_POINTS` windows at even intervals."""
     chosen = _choose(subjects, min(options.most_clips, CATEGORIES))
     width = 9.6 if len(subjects) > 1 else 8.6
     keys = 2.5

@@ -37,7 +37,7 @@ DIRECTION_CELL_M_S = 0.25
 
 
 class _Plane(NamedTuple):
-    """Axes of a density: two quantities of the windows, their names, and the size of a cell that seconds refer to."""
+    """Axes of a density map: two quantities of the windows, their names, and the area whose seconds are shown."""
 
     x: Callable[[Coverage], Floats]
     y: Callable[[Coverage], Floats]
@@ -124,7 +124,7 @@ def _draw(subjects: Sequence[Subject], plane: _Plane) -> Sketch:
 
 
 def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
-    """Compute the edges of the fine cells along both axes; the cells contain all trials, and all but a few windows."""
+    """Compute the edges of the fine cells along both axes; together they contain all trials and nearly all windows."""
     spans = []
     for axis, values in enumerate((plane.x, plane.y)):
         found = np.concatenate([values(subject.result.coverage) for subject in subjects])
@@ -138,7 +138,7 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 
 def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the range along each axis that the figure always shows."""
+    """Return the range along each axis that the figure must show, whatever the data: that of the trials."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)
@@ -147,7 +147,7 @@ def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tup
 
 
 def _seconds(subject: Subject, plane: _Plane, edges: tuple[Floats, Floats], cell: tuple[float, float]) -> Floats:
-    """Compute the smoothed seconds of data (FINE, FINE) in an area as large as a trial's cell around each fine cell."""
+    """Compute the smoothed seconds of data (FINE, FINE) in an area of size `cell` around each fine cell."""
     from scipy.ndimage import gaussian_filter
 
     coverage = subject.result.coverage

@@ -97,7 +97,7 @@ def _errors(view: TrialView, negate: bool) -> tuple[_Errors, _Errors]:
 
 
 def _edges(values: Sequence[AnyFloats]) -> AnyFloats:
-    """Compute the edges of bins that contain all but the outermost thousandths, with zero as an edge."""
+    """Compute the edges of bins that contain all values but the lowest and highest thousandth; zero is an edge."""
     together = np.concatenate(values)
     low, high = np.quantile(together, (0.001, 0.999))
     low, high = min(float(low), 0.0), max(float(high), 0.0)

@@ -1,4 +1,4 @@
-"""Figure of the displayed ranges of the most used clips, with their counts."""
+"""Figure of the most used clips, each as a strip whose colours show how often each part was displayed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STRETCHES = 200
 
 
 class _Strip(NamedTuple):
-    """Strip of a clip: mean ticks per frame in each stretch of the clip, and the share of displayed frames."""
+    """Strip of a clip: mean ticks per frame in each of its ranges, and the share of its frames that were displayed."""
 
     uid: str
     name: str
@@ -46,7 +46,7 @@ class _Strip(NamedTuple):
 def draw_frame_use(subjects: Sequence[Subject], trial: str | None, options: FigureOptions) -> Sketch:
     """Draw one strip per clip from beginning to end, the most used first.
 
-    If two evaluations are compared, each row shows both.
+    If two evaluations are compared, each row shows the strips of both side by side.
     """
     usage = [{subject.result.clips[each.clip].uid: each for each in subject.usage(trial)} for subject in subjects]
     uids = _most_used(usage, options.most_clips)

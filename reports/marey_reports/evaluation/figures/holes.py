@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def draw_holes(subjects: Sequence[Subject], _trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw a cell per trial of the grid with the seconds it lacks; an empty cell has enough."""
+    """Draw the grid of trials; each cell shows the seconds of data that it lacks, and is empty if it lacks none."""
     two = len(subjects) > 1
     width, height, gap = (4.0, 3.3, 0.4) if two else (6.2, 3.9, 0.0)
     figure = new_figure(9.9 if two else 7.8, height + (1.15 if two else 0.85))

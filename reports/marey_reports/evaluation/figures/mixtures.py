@@ -34,10 +34,11 @@ def fit_one(values: AnyFloats) -> Normals:
 
 
 def fit_two(values: AnyFloats, second: NDArray[np.bool_]) -> Normals:
-    """Fit two normal distributions by scikit-learn, started from the two groups that `second` makes.
+    """Fit a mixture of two normal distributions with scikit-learn.
 
-    A given start, such as the demanded speed of each tick, makes the fit repeatable. If one group is empty, the values
-    are split at their mean. Values without spread give two equal components.
+    The mask `second` selects the values from which the second distribution starts; the first one starts from the other
+    values. A given start makes the fit repeatable. If one of these groups is empty, the values are split at their mean.
+    Values that are all equal give two equal components.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture

@@ -1,4 +1,4 @@
-"""Subjects of figures: one result, or two under their names, and one trial of them."""
+"""Subjects of figures: the result of one evaluation, or the named results of two, and single trials of them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FigureOptions:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Result and its name in figures; the name is "" if it is the only result."""
+    """Result of an evaluation, and its name in figures: "" if the figure shows only this result."""
 
     label: str
     result: EvaluationResult
@@ -48,11 +48,11 @@ class Subject:
 
     @property
     def prefix(self) -> str:
-        """Name and colon with which a sentence about one of two subjects begins; empty for a single subject."""
+        """Start of a sentence about this subject: its name and a colon; "" if it is the only subject."""
         return f"{self.label}: " if self.label else ""
 
     def column(self, name: str) -> str:
-        """Return the name of a table's column for this subject; of two subjects, each has a column of its own."""
+        """Return the name of this subject's column in a table; if there are two subjects, its label precedes `name`."""
         return f"{self.label}_{name}" if self.label else name
 
     def usage(self, trial: str | None) -> tuple[ClipUsage, ...]:
@@ -81,7 +81,7 @@ class TrialView:
 
     @property
     def switched(self) -> NDArray[np.bool_]:
-        """Mask (S,) of the steps that jump to another place in the clips by choice."""
+        """Mask (S,) of the steps that jump to another frame because a search chose it, not because a clip ended."""
         return np.asarray(self.record.status[1:] == Status.REPLACING)
 
 
@@ -102,11 +102,10 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
 
 
 def choose_trial(subjects: Sequence[Subject], name: str | None, families: Sequence[Family]) -> Trial:
-    """Choose a trial that all subjects have, from the first of the families that contains such a trial.
+    """Choose a trial that all subjects have, called `name` if that is given.
 
-    If `name` is None, choose the trial of this family that the first subject follows worst.
-
-    Raises `MotionError` if the subjects have no such trial in common.
+    The trial is from the first of `families` with a suitable trial; of several, it is the trial that the first subject
+    follows worst. Raises `MotionError` if the subjects have no such trial in common.
     """
     known = [{each.trial.name for each in subject.result.trials} for subject in subjects]
     shared = [each for each in subjects[0].result.trials if all(each.trial.name in names for names in known)]

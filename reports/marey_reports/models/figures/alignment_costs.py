@@ -35,8 +35,8 @@ class CostView(NamedTuple):
 
     Parameters
     ----------
-    costs_cm : (n, m) root mean square distance of joints at frames of the reference and of the clip
-    frames : indices of these frames in the reference, (n,), and in the clip, (m,)
+    costs_cm : (n, m) root mean square distance of joints between n frames of the reference and m frames of the clip
+    frames : indices of the n frames in the reference, and of the m frames in the clip
     """
 
     role: str
@@ -55,7 +55,7 @@ class CostView(NamedTuple):
 
 
 def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None) -> Sketch | None:
-    """Draw the costs of the clips with the median and the highest cost; return None if there is only the reference."""
+    """Draw the costs of two clips: median and highest cost; return None if the reference is the only clip."""
     views = [_view(aligned, role, clip, options) for role, clip in _chosen(aligned)]
     if not views:
         return None
@@ -86,7 +86,7 @@ def draw_alignment_costs(aligned: AlignedSet, options: CostOptions | None = None
     ]
     caption = (
         "How far poses of a clip are from poses of the reference, after the best turn and shift on the floor, for "
-        f"every pair of moments; the line is the path that was taken: {'; '.join(parts)}. A path along a light valley, "
+        f"every pair of moments; the line is the alignment path: {'; '.join(parts)}. A path along a light valley, "
         "without long straight runs, is a good alignment. Clips are rebuilt from their aligned form."
     )
     table = {

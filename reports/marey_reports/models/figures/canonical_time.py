@@ -23,7 +23,7 @@ def percents(frame_count: int) -> NDArray[np.float64]:
 
 
 def mark_keyframes(panel: Axes, keyframes: Mapping[str, int], frame_count: int, *, named: bool = True) -> None:
-    """Draw a line at each keyframe, with the labels of a frame along it, from the top down."""
+    """Draw a vertical line at each keyframe except the first and last frame, and write its labels along the line."""
     labels: dict[int, list[str]] = {}
     for label, frame in keyframes.items():
         if 0 < frame < frame_count - 1:

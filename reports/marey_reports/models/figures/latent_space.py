@@ -88,7 +88,11 @@ def _odd_ones(count: int) -> str:
 
 
 def _pairs(spatial: int, temporal: int) -> list[tuple[int, int]]:
-    """Choose at most three pairs of components: the first of poses against each other, and the first of time."""
+    """Choose at most three pairs of latent dimensions to draw.
+
+    The first spatial component is paired with the second and third one and with the first temporal component. If this
+    gives no pair, the first two temporal components are drawn.
+    """
     pairs = [(0, 1)] if spatial > 1 else []
     if spatial > 2:
         pairs.append((0, 2))
@@ -174,7 +178,7 @@ def _deviations(judged: Floats) -> Floats:
 
 
 def _judged(example: ExampleReport) -> float:
-    """Choose the likelihood by which unusual examples are found: the held-out one where it is known."""
+    """Return the log-likelihood that shows whether an example is unusual: the held-out one if it was computed."""
     held_out = example.held_out_log_likelihood
     return example.log_likelihood if held_out is None else held_out
 

@@ -41,7 +41,7 @@ class Reach(NamedTuple):
 
 
 def reach_of(subject: ModelSubject) -> list[Reach]:
-    """Compute the space that wrists and ankles reach in the examples and in at least 200 samples, without extremes."""
+    """Compute the space that wrists and ankles reach in examples and samples, from the 1 % to the 99 % quantile."""
     frames = evenly(subject.primitive.frame_count, FRAMES)
     drawn = subject.primitive.sample(max(LEAST_REACHING, len(subject.poses)), subject.seed)
     sets = [subject.points(poses) for poses in (subject.poses[:, frames], subject.primitive.poses(drawn, frames))]

@@ -16,7 +16,7 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Draw the errors of searches for targets from examples; return None if they were not measured."""
+    """Draw the errors of searches for positions of hands and feet in examples; None if they were not measured."""
     check = subject.check
     if check is None:
         return None
@@ -28,11 +28,11 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
-    """Draw the errors at the same targets after the search of the tree and after refinement.
+    """Draw the errors at n targets: after the search of the sample tree, and after the refinement of what it found.
 
     Parameters
     ----------
-    searched_cm, refined_cm : (n,) distance of the joint from its target, centimetres
+    searched_cm, refined_cm : (n,) distance of a joint from its target in centimetres, before and after refinement
     about : description of the targets for the caption, without a full stop
     """
     ceiling = 1.02 * max(float(np.max(searched_cm, initial=0.0)), float(np.max(refined_cm, initial=0.0)), 0.1)

@@ -96,7 +96,7 @@ class ModelSubject:
 
 
 def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """Choose evenly spaced indices of all items, or of at most `most` of them."""
+    """Return evenly spaced indices from 0 to `count` - 1, at most `most` of them."""
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, most))).astype(np.int64))
 
 
