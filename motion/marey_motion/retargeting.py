@@ -61,9 +61,9 @@ class RetargetPlan:
     source, target : Skeleton    the skeletons
     scale : float    target metres per source metre of pelvis translation
     pairs : tuple of JointPair    joints that follow the source
-    carried : tuple of str    joints outside the mapping that keep their source rotation, because both rigs are the
-        same
-    at_rest : tuple of str    the target's other joints, which keep their rest rotation
+    carried : tuple of str    target joints outside the mapping that copy the local rotation of the source joint with
+        the same name, because both skeletons are copies of one rig
+    at_rest : tuple of str    target joints that are neither paired nor carried; they keep their rest rotation
     missing : tuple of str    standard joints that only one of the skeletons has
     sources : (K,) int32    source joint that each target joint follows, -1 for none
     corrections : (K, 4) float64    S·Tᵀ of each mapped joint as (w, x, y, z), identity for the others
@@ -372,14 +372,14 @@ def _position_in_world(clip: Clip, joint: int) -> AnyFloats:
 
 
 def _offsets_by_joint(translations: NDArray[np.float32] | None, joints: tuple[int, ...]) -> dict[int, AnyFloats]:
-    """Collect the offsets (F, 3) of the joints whose offset is not constant."""
+    """Return the offsets (F, 3) of the joints with translations, by joint index."""
     return {} if translations is None else {joint: translations[:, slot] for slot, joint in enumerate(joints)}
 
 
 def _position_from_root(
     skeleton: Skeleton, rotations: AnyFloats, joint: int, moved: Mapping[int, AnyFloats] = MappingProxyType({})
 ) -> AnyFloats:
-    """Compute the vectors (F, 3) from the root to a joint in the world; `moved` has the variable offsets (F, 3)."""
+    """Compute vectors (F, 3) from root to joint in the world; `moved` has the offsets (F, 3) of translated joints."""
     position: AnyFloats = np.zeros((len(rotations), 3))
     for step in skeleton.path_to_root(joint)[:-1]:
         offset = moved.get(step, skeleton.offsets[step])

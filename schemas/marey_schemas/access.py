@@ -27,7 +27,7 @@ class Visibility(StrEnum):
 
 
 class Scope(StrEnum):
-    """Permission that a token grants, within the permissions of its user."""
+    """Permission that a token grants; a token never permits more than its user may do."""
 
     READ = "read"
     WRITE = "write"
@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Choice of the tokens that end when a user is changed; the token of the request itself stays valid."""
+    """Tokens of a user to revoke when the user is changed; the token of the request itself stays valid."""
 
     NONE = "none"
     SESSIONS = "sessions"

@@ -28,7 +28,7 @@ class Warned:
 
 
 def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: ModelOptions) -> tuple[Warned, ...]:
-    """List the warnings about a model, the most serious first.
+    """List the warnings about a model: about its examples, then its mixture, then its samples.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def warnings_of(primitive: MotionPrimitive, report: TrainingReport, options: Mod
 
     Returns
     -------
-    tuple of Warned    codes and sentences
+    tuple of Warned    a code and a message for each warning
     """
     return (*_of_examples(primitive, report, options), *_of_mixture(report), *_of_samples(report))
 
@@ -63,8 +63,8 @@ def _of_examples(primitive: MotionPrimitive, report: TrainingReport, options: Mo
             found.append(
                 Warned(
                     "does-not-generalise",
-                    f"an example left out is reconstructed {left_out:.1f} cm off on average, those trained on "
-                    f"{training:.1f} cm: the examples do not cover how this action varies",
+                    f"the mean reconstruction error is {left_out:.1f} cm for an example left out of the training, but "
+                    f"{training:.1f} cm for training examples: they do not cover how this action varies",
                 )
             )
     outliers = sorted((one for one in report.examples if one.outlier), key=_likelihood)
@@ -85,7 +85,7 @@ def _of_mixture(report: TrainingReport) -> list[Warned]:
     slow = [candidate.components for candidate in report.candidates if not candidate.converged]
     if slow:
         found.append(
-            Warned("not-converged", f"the fit of {', '.join(map(str, slow))} components did not come to an end")
+            Warned("not-converged", f"the fit of a mixture of {', '.join(map(str, slow))} components did not converge")
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Summary of a trained model: one sentence, and a few numbers to show in lists."""
+"""Summary of a trained model: one or two sentences, and a few numbers to show in lists."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def verdict_of(trained: TrainedPrimitive) -> str:
 
 
 def headline_of(trained: TrainedPrimitive) -> Headline:
-    """Select the numbers that lists show.
+    """Select the numbers of a trained model that lists of models show.
 
     Parameters
     ----------

@@ -319,7 +319,7 @@ def _twist(standard: str, body: _PosedBody) -> Floats:
 
 
 def _tip(skeleton: Skeleton, joint: int) -> Floats | None:
-    """Return the offset (3,) of the farthest child or end site that can be the end of the joint's bone."""
+    """Return the offset (3,) of the farthest child or end site at a distance that is plausible for a bone's end."""
     ends = [skeleton.offsets[child] for child in skeleton.children[joint]]
     ends += [site.offset for site in skeleton.end_sites if site.joint == joint]
     # The joint's own offset is short where it lies just below an ankle.

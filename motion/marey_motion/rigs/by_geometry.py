@@ -133,7 +133,7 @@ def _neck_chain(tree: BoneTree, start: int) -> list[int]:
 
 
 def _looks_like_neck(tree: BoneTree, plan: BodyPlan, chain: list[int]) -> float:
-    """Score the length and direction of a neck; a chain with a mirrored copy beside it is no neck."""
+    """Score a chain as a neck by its length and direction; a sibling chain of equal length lowers the score."""
     positions = tree.skeleton.rest_global_positions
     parent = plan.arms.pair.parent
     length = float(np.sum(tree.lengths[chain]))
@@ -153,7 +153,7 @@ def _turn(skeleton: Skeleton, a: int, b: int, c: int) -> float:
 
 
 def _branches(tree: BoneTree, joint: int) -> list[int]:
-    """Return the children, except children whose subtree is small compared with the largest."""
+    """Return the children of a joint, without those whose chains are short compared with the longest one."""
     extents = {child: tree.extent(child) for child in tree.skeleton.children[joint]}
     return [child for child, extent in extents.items() if extent >= SMALL_BRANCH * max(extents.values())]
 

@@ -170,7 +170,7 @@ def _draw_header(axes: Axes, top: float, heading: str, takes: str) -> None:
 
 
 def _draw_row(axes: Axes, row: _SheetRow, top: float, cell: float) -> None:
-    """Draw a title, then one cell per moment with both figures over their floor. `top` is in inches."""
+    """Draw a title, then one cell per moment with the figures of source and result. `top` is in inches."""
     _draw_titles(axes, row, top)
     low, high = row.extent_m
     scale = 0.80 * STAGE / max(high - low, 1e-6)

@@ -55,7 +55,7 @@ class StripRow:
 
 
 class StripMoments(NamedTuple):
-    """The columns of a strip: (T, 2) x and z of the centre of each column in metres, and the titles and labels."""
+    """Columns of a strip: x and z (T, 2) of the point at the centre of each in metres, and their titles and labels."""
 
     middles: Floats
     names: Sequence[str]

@@ -48,6 +48,6 @@ class ProtectionRule(Request):
 
 
 class Protection(ProtectionRule):
-    """Rule of a protected branch, as shown with the branch."""
+    """Rule of a protected branch, as included in answers about the branch."""
 
     model_config = ConfigDict(extra="ignore")

@@ -62,13 +62,13 @@ class MotionDocument(Request):
 
 
 class Check(Request):
-    """Finding about a motion: a stable code, the place, and a description."""
+    """Finding of the importer about a motion: a stable code, a message, and the joints and frames concerned."""
 
     code: Annotated[str, StringConstraints(pattern=r"^[a-z0-9-]{1,64}$")]
     message: str
     joints: tuple[str, ...] = ()
     frames: tuple[int, int] | None = Field(
-        None, description="Half-open range of the file's frames that the clip holds."
+        None, description="Half-open range of frames that the finding is about; null: all frames."
     )
     values: dict[str, Any] = Field(default_factory=dict)
 

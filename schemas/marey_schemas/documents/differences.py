@@ -69,8 +69,8 @@ class FrameRun(Answer):
     """Run of frames that correspond to each other in both revisions, or that only one revision has."""
 
     change: Literal["matched", "removed", "inserted"]
-    before: Range = Field(description="Range of frames before; empty for inserted frames.")
-    after: Range = Field(description="Range of frames after; empty for removed frames.")
+    before: Range = Field(description="Range of frames in the revision `before`; empty for inserted frames.")
+    after: Range = Field(description="Range of frames in the revision `after`; empty for removed frames.")
 
 
 class Exceeding(Answer):
@@ -89,7 +89,7 @@ class Exceeding(Answer):
 class JointChange(Exceeding):
     """Change of a joint's local rotation or translation: degrees or centimetres."""
 
-    joint: str = Field(description="Name of the joint after.")
+    joint: str = Field(description="Name of the joint in the revision `after`.")
 
 
 class PathMove(Answer):
@@ -97,7 +97,9 @@ class PathMove(Answer):
 
     turn_deg: float = Field(description="Turn about the vertical axis, left positive.")
     shift_cm: Vector3
-    remaining_cm: float = Field(description="Largest distance between the paths after this movement.")
+    remaining_cm: float = Field(
+        description="Largest distance between the paths that remains once this movement is applied."
+    )
 
 
 class PathChange(Exceeding):
@@ -116,7 +118,7 @@ class PathChange(Exceeding):
 class RestChange(Answer):
     """Changes of a joint in the rest pose."""
 
-    joint: str = Field(description="Name of the joint after.")
+    joint: str = Field(description="Name of the joint in the revision `after`.")
     parent: tuple[str | None, str | None] | None = Field(None, description="Names of the parents, if they differ.")
     offset_cm: float = Field(0.0, description="Length of the change of the offset.")
     rotation_deg: float = Field(0.0, description="Angle of the change of the rest rotation.")
@@ -182,7 +184,7 @@ class AnnotationDifference(Answer):
 
 
 class MappedJoint(Answer):
-    """Joint of a skeleton that is mapped to a standard joint, before and after."""
+    """Joints that are mapped to a standard joint in the two revisions; null if none is mapped."""
 
     standard: str
     before: str | None = None
@@ -221,13 +223,17 @@ class DifferencePlot(Answer):
     """Values to draw: the change of rotations over time, and the paths of the body."""
 
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
-    frame_rate_hz: float = Field(description="Frame rate of the revision after.")
+    frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
     frames: tuple[int, ...] = Field(description="First frame of each row of `rotation_deg`, and the end of the last.")
     rotation_deg: MatchedFloats = Field(
         description="[rows, joints]: largest change within the row's frames; -1: no frame is matched."
     )
-    path_before_m: MatchedFloats = Field(description="[points, 2]: x and z of the path before, metres.")
-    path_after_m: MatchedFloats = Field(description="[points, 2]: x and z of the path after, metres.")
+    path_before_m: MatchedFloats = Field(
+        description="[points, 2]: x and z in metres of the path in the revision `before`."
+    )
+    path_after_m: MatchedFloats = Field(
+        description="[points, 2]: x and z in metres of the path in the revision `after`."
+    )
 
 
 class Difference(Answer):

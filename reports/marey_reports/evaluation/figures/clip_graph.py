@@ -79,7 +79,7 @@ def draw_clip_graph(subjects: Sequence[Subject], trial: str | None, options: Fig
 
 
 def _popularity(subject: Subject, trial: str | None) -> dict[str, Ints]:
-    """Return the number of ticks for which each frame was displayed, by the uid of the clip."""
+    """Count, for each clip by uid, the ticks at which each of its frames was displayed."""
     return {subject.result.clips[usage.clip].uid: usage.popularity for usage in subject.usage(trial)}
 
 

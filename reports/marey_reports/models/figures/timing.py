@@ -78,7 +78,7 @@ def sweep_time(subject: ModelSubject, component: int) -> Floats:
 
 
 def _rates(passed_s: Floats, frame_rate_hz: float) -> Floats:
-    """Compute the speeds (5, N - 1) of the motions relative to the reference."""
+    """Compute the speeds (5, N - 1) of the motions relative to the reference: 2 is twice as fast."""
     return np.asarray(1.0 / (np.diff(passed_s, axis=1) * frame_rate_hz), dtype=np.float64)
 
 
