@@ -64,7 +64,8 @@ def follow_moved_bones(clip: Clip, joints: Mapping[str, int]) -> FollowedBones:
     Parameters
     ----------
     clip : Clip    F frames of J joints
-    joints : mapping of str to int    indices of the joints to correct, by standard name
+    joints : mapping of str to int    joint indices by standard name; the bones between these joints are
+        corrected
 
     Returns
     -------

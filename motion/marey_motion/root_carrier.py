@@ -20,10 +20,10 @@ STILL = 1e-5
 
 
 def carried_at(motion: Motion, skeleton: Skeleton, carrier: int, places: Floats, spins: Floats) -> Motion:
-    """Move and turn the carrier to given positions and rotations in the world by moving the root.
+    """Place the carrier at given positions and rotations in the world; the root moves along.
 
-    The joints above the carrier keep their local rotations. Translations of the carrier and of the joints above it are
-    merged into the root's translations.
+    The translations of the root and the local rotations of the carrier are replaced, and the joints between them keep
+    their local rotations. The carrier and the joints above it have no translations of their own in the result.
 
     Parameters
     ----------

@@ -192,7 +192,7 @@ def _draw_way(axes: Axes, way: Floats, frame: Rectangle) -> None:
 
 
 class _Shapes(NamedTuple):
-    """A body's bones by side, joined to long lines and also one by one (n, 2); bone and size of its head."""
+    """A body's bones by side, both joined to long lines (`runs`) and one by one (n, 2); bone and size of its head."""
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]

@@ -34,7 +34,7 @@ class Resolution(Request):
 
 
 class CombineRequest(Request):
-    """Base of requests that apply changes from other commits to a branch, or undo changes of a commit on it."""
+    """Base of requests that apply changes of other commits to a branch, or undo changes on it."""
 
     into: RefName = Field(MAIN, description="Branch that gets the changes.")
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
@@ -53,7 +53,7 @@ class MergeRequest(CombineRequest):
 
 
 class PickRequest(CombineRequest):
-    """Request to apply the changes of one commit to a branch again (cherry-pick), or to undo them (revert)."""
+    """Request to apply the changes of one commit to a branch (cherry-pick), or to undo them on it (revert)."""
 
     version: Version = Field(description="Commit whose changes are repeated or undone.")
     parent: Literal[1, 2] | None = Field(

@@ -201,7 +201,7 @@ def checked_model(part: Mapping[str, Any]) -> MotionPrimitiveDocument:
 
 
 def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
-    """Return the origin of a model imported from Marey's predecessor, from its part `model`; empty if unreadable."""
+    """Return the origin of a model imported from Marey's predecessor, from its part `model`; empty if not recorded."""
     try:
         return ModelProvenance.model_validate(model.get("provenance", {})).predecessor or PredecessorOrigin()
     except ValidationError:
@@ -209,7 +209,7 @@ def predecessor_origin(model: Mapping[str, Any]) -> PredecessorOrigin:
 
 
 def log_likelihoods(model: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the log-likelihoods of the examples from a part `model`; empty if they are in an older, unknown form."""
+    """Return the log-likelihoods of the examples from a part `model`; empty if an older document has another form."""
     try:
         examples = TrainingNotes.model_validate(model.get("training") or {}).examples
     except ValidationError:

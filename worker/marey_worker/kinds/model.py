@@ -130,7 +130,7 @@ def write_model_report(
 
     Parameters
     ----------
-    origin : origin of the examples, from the part `model`
+    origin : field `provenance` of the part `model`: origin of the model and of its examples
     """
     title = trained.primitive.name
     check = _checked(context, trained, aligned) if params.search_check else None

@@ -138,7 +138,7 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
 
 
 def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the range along each axis that the figure must show, whatever the data: that of the trials."""
+    """Return the smallest ranges of x and y that the figure shows; they contain all trials."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)

@@ -16,7 +16,7 @@ BINS = 30
 
 
 def draw_search_check(subject: ModelSubject) -> Sketch | None:
-    """Draw the errors of searches for positions of hands and feet in examples; None if they were not measured."""
+    """Draw the errors of searches for positions of hands and feet in examples; return None if not measured."""
     check = subject.check
     if check is None:
         return None
