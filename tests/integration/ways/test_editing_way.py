@@ -102,7 +102,7 @@ def test_a_job_is_repeated_from_its_record_and_its_results_are_compared(
     assert differing.motion is not None
 
     in_place = next(one for one in lab.jobs() if one.params.get("in_place"))
-    assert "has replaced its sources" in run("job", "rerun", in_place.id, status=2).stderr
+    assert "wrote new revisions of its inputs" in run("job", "rerun", in_place.id, status=2).stderr
 
 
 def test_a_list_is_searched_sorted_and_limited_to_stale_results(
