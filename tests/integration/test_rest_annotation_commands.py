@@ -136,3 +136,11 @@ def test_readers_may_not_command(owner: httpx.Client, annotation: str, server: S
 
 def _require_done(answer: httpx.Response) -> None:
     assert answer.status_code == 200, answer.text
+
+
+def test_only_clips_get_annotations(owner: httpx.Client, annotation: str) -> None:
+    document = {"document": {"semantic_annotation": {"step": [[0]]}}}
+    (rig,) = owner.get("/projects/lab/skeletons").json()["items"]
+    refused = owner.post(f"/projects/lab/skeletons/{rig['id']}/annotations", json=document)
+    assert (refused.status_code, refused.json()["code"]) == (404, "no-annotations")
+    assert len(owner.get(ANNOTATIONS).json()["items"]) == 1

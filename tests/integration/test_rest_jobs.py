@@ -310,6 +310,22 @@ def test_a_job_whose_failed_dependency_belongs_to_another_is_retried_by_those_wh
     assert (again["retry_of"], again["state"]) == (own["id"], "waiting")
 
 
+def test_a_retry_takes_along_the_dependants_that_the_caller_may_retry(server: Server, owner: httpx.Client) -> None:
+    sam = server.client(server.make_user("sam"))
+    ok(owner.put("/projects/lab/members/sam", json={"role": "contributor"}))
+    failed = submit(sam)
+    own, theirs = submit(sam, after=[failed["id"]]), submit(owner, after=[failed["id"]])
+    ok(sam.post(f"/jobs/{failed['id']}/cancel"))
+    ok(sam.post(f"/jobs/{failed['id']}/retry"), 202)
+
+    def retried() -> set[str]:
+        return {one["retry_of"] for one in ok(owner.get("/projects/lab/jobs"))["items"] if one["retry_of"]}
+
+    assert retried() == {failed["id"], own["id"]}
+    ok(owner.post(f"/jobs/{theirs['id']}/retry"), 202)
+    assert retried() == {failed["id"], own["id"], theirs["id"]}
+
+
 def test_anybody_may_list_the_kinds_of_jobs(server: Server) -> None:
     worker = server.make_user("worker", scopes=("work",))
     for anybody in (server.client(), server.client(worker)):
