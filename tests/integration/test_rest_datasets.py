@@ -301,7 +301,13 @@ def test_a_branch_that_has_not_moved_is_moved_by_a_merge(owner: httpx.Client, ga
     ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
     change(owner, "gaits/a", tags=["slow"])
     made = gaits("on trial", branch="trial")
-    assert ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))["commit"] == made
+    request = {"version": "trial", "write_id": "12345678"}
+    assert ok(owner.post(f"{GAITS}/merges", json=request))["commit"] == made
+    assert ok(owner.post(f"{GAITS}/merges", json=request))["commit"] == made
+    refused(owner.post(f"{GAITS}/merges", json={"version": "trial"}), 422, "already-merged")
+    change(owner, "gaits/a", tags=["fast"])
+    gaits("later")
+    assert ok(owner.post(f"{GAITS}/merges", json=request))["commit"] == made
 
 
 def test_histories_that_crossed_are_not_merged(owner: httpx.Client, two_branches: Callable[..., None]) -> None:

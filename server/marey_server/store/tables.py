@@ -535,6 +535,15 @@ dataset_commit = Table(
     Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
 )
 
+fast_forward = Table(  # merges that moved a branch to an existing commit; other merges are commits with a `write_id`
+    "fast_forward",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("write_id", String(64), primary_key=True),
+    Column("digest", DIGEST, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
 commit_parent = Table(
     "commit_parent",
     metadata,

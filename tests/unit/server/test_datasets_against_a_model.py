@@ -193,8 +193,8 @@ class DatasetMachine(RuleBasedStateMachine):
         self.lab.write(datasets.move_branch, "lab", self.name, name, RefMove(at=at), expected_rev=None)
         self.model.refs[name] = at
 
-    @rule(into=names, which=numbers, take=sides)
-    def merge(self, into: str, which: int, take: Side | None) -> None:
+    @rule(into=names, which=numbers, take=sides, again=st.booleans())
+    def merge(self, into: str, which: int, take: Side | None, again: bool) -> None:
         ours, theirs = self._branch_with_commits(into), self._any_commit(which)
         if ours is None or theirs is None:
             return
@@ -202,7 +202,7 @@ class DatasetMachine(RuleBasedStateMachine):
         base = next(iter(bases), None)
         state, conflicts = self._merged(base, ours, theirs, take)
         resolutions = self._resolutions(conflicts, take)
-        request = MergeRequest(into=into, version=theirs, resolutions=resolutions)
+        request = MergeRequest(into=into, version=theirs, resolutions=resolutions, write_id=secrets.token_hex(8))
         if theirs in bases or len(bases) > 1:
             with refused("already-merged" if theirs in bases else "several-bases", "no-conflict"):
                 self._merge(request)
@@ -212,6 +212,8 @@ class DatasetMachine(RuleBasedStateMachine):
         else:
             made = self._merge(request).commit
             self._made(into, made, state, (ours, theirs) if base != ours else self.model.commits[theirs].parents)
+            if again:  # the answer was lost
+                assert self._merge(request).commit.digest == made.digest
 
     @rule(into=names, which=numbers, undo=st.booleans(), parent=st.none() | st.sampled_from([1, 2]), take=sides)
     def pick(self, into: str, which: int, undo: bool, parent: Any, take: Side | None) -> None:

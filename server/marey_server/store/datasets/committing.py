@@ -34,7 +34,7 @@ from marey_server.store.datasets.history import read_commit, tree_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.projects import ProjectRow
-from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, item, user
+from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.records import CommitRecord, DatasetEntry, RevisionKey, key_of
 from marey_versions.tree.building import build
@@ -117,6 +117,8 @@ def record_commit(
     store_chunks(tx, prepared.chunks)
     store_contents(tx, prepared.contents)
     digest = prepared.existing or _insert(tx, prepared, mover.name)
+    if prepared.existing is not None and prepared.write_id is not None:
+        tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))
     if prepared.of_folder:
         tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
     move_branch_to(tx, prepared, digest, mover)
@@ -146,14 +148,14 @@ def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
-    """Return the digest of the commit that a request with this `write_id` has recorded, or None."""
+    """Return the commit that a request with this `write_id` has recorded or moved a branch to, or None."""
     if write_id is None:
         return None
-    statement = select(dataset_commit.c.digest).where(
-        dataset_commit.c.dataset_id == dataset_id, dataset_commit.c.write_id == write_id
-    )
-    found: str | None = tx.execute(statement).scalar()
-    return found
+    for table in (dataset_commit, fast_forward):
+        statement = select(table.c.digest).where(table.c.dataset_id == dataset_id, table.c.write_id == write_id)
+        if (found := tx.execute(statement).scalar()) is not None:
+            return str(found)
+    return None
 
 
 def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None) -> str | None:
