@@ -1,4 +1,4 @@
-"""Writes the reference pages that come from the code: `python -m docs.generate`, or `--check` to compare only."""
+"""Generates reference pages from the code: `python -m docs.generate`, or with `--check` only compares the pages."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOTE = "<!-- Written by `make docs` from the code; change it there. -->\n\n"
 
 
 def pages() -> dict[str, str]:
-    """Every generated page by file name."""
+    """Return the text of every generated page, by file name."""
     return {
         "command-line.md": command_line_page(),
         "settings.md": settings_page(),
@@ -40,8 +40,8 @@ def pages() -> dict[str, str]:
 
 
 def command_line_page() -> str:
-    """Every command with its arguments and options."""
-    text = "# Command line\n\nExit status: 0 success, 1 refused or failed, 2 wrong usage, 130 interrupted.\n\n"
+    """Return the page of all commands with their arguments and options."""
+    text = "# Command line\n\nExit status: 0 success, 1 refused or failed, 2 wrong usage, 130 interrupted (Ctrl-C).\n\n"
     root = typer.main.get_command(app)
     text += "## marey\n\n" + _parameters(root)
     for name, command in _commands(root, "marey"):
@@ -68,13 +68,13 @@ def _parameters(command: Any) -> str:
 
 
 def _spelled(option: Any, context: typer.Context) -> str:
-    """The spellings of an option and what it takes, as its help shows them."""
+    """Return the spellings of an option and the type of its value, as the help of the command shows them."""
     shown, _ = option.get_help_record(context)
     return f"`{shown}`"
 
 
 def queries_page() -> str:
-    """The grammar of queries and all fields."""
+    """Return the page of the query language and all fields."""
     rows = [
         (f"`{name}`", field.type, ", ".join(f"`{one}`" for one in OPERATORS[field.type]), field.description)
         for name, field in FIELDS.items()
@@ -82,16 +82,19 @@ def queries_page() -> str:
     text = f"""# Queries
 
 A query selects items: `subject = 02 and action ~ walk and frames > 120 and not warning = foot-slide and tag in (night,
-day)`. `marey ls --query`, the parameter `query` of lists in the REST API, and `list(query=...)` of the SDK take one.
+day)`. `marey ls --query`, the parameter `query` of lists in the REST API, and `list(query=...)` of the SDK take a
+query.
 
-* A condition is a field, an operator and a value: `frames > 120`. `=` and `!=` compare whole values, `~` finds part of
-  a text without regard to the case of letters, `in (a, b)` means one of several values, `has take` that there is one.
-* `not`, `and`, `or` and brackets join conditions; `not` binds strongest, then `and`. `a != b` means `not a = b`.
-* If an item has no value for a field, a condition about it is false, and its negation is true: `not select = best` also
-  selects clips without a choice. A field with several values, such as `tag`, meets a condition if one of them does.
-* Values with spaces or special characters are written between quotation marks: `action = "walk, slow"`. A backslash
-  before a quotation mark or another backslash makes it part of the value.
-* Dates are written as 2026-11-23, or as times: 2026-11-23T15:04:05Z. A day is compared as a whole, in UTC.
+* A condition is a field, an operator and a value: `frames > 120`. `=` and `!=` compare the whole value of the field.
+  With `~`, the field must contain the given text; upper and lower case are equal. With `in (a, b)`, the field must
+  have one of the given values. `has take` selects items that have any value in the field `take`.
+* `not`, `and`, `or` and brackets combine conditions; `not` binds strongest, then `and`. `a != b` means `not a = b`.
+* If an item has no value for a field, every condition about this field is false, and the negation of the condition is
+  true: `not select = best` also selects clips without a choice. A field with several values, such as `tag`, meets a
+  condition if one of its values does.
+* Values with spaces or special characters are written between quotation marks: `action = "walk, slow"`. Within the
+  quotation marks, a quotation mark is written with a backslash before it, and so is a backslash.
+* A date is written as a day, 2026-11-23, or as a time, 2026-11-23T15:04:05Z. A day means the whole day, in UTC.
 * A query has at most {MOST_CHARACTERS:,} characters, {MOST_CONDITIONS} conditions and {MOST_COMPARED_VALUES} values.
 
 """
@@ -99,21 +102,22 @@ day)`. `marey ls --query`, the parameter `query` of lists in the REST API, and `
 
 
 def settings_page() -> str:
-    """Every setting of a server."""
+    """Return the page of all settings of a server."""
     rows = []
     for name, field in Settings.model_fields.items():
         default = "" if field.default in (None, PydanticUndefined) else f"`{field.default}`"
         rows.append((f"`{name}`", f"`MAREY_{name.upper()}`", default, field.description or ""))
     return (
         NOTE
-        + "# Settings\n\nFlags of `marey serve` come first, then variables, then `marey.toml`, then the default.\n\n"
+        + "# Settings\n\nIf a setting is given in several places, the first of these counts: the option of "
+        "`marey serve`, the environment variable, the file `marey.toml`, the default.\n\n"
         + _table(("setting", "variable", "default", "meaning"), rows)
     )  # fmt: skip
 
 
 def job_kinds_page() -> str:
-    """Every built-in kind of job."""
-    text = "# Job kinds\n\nA running server answers the same, with full JSON Schemas, at `/api/v1/job-kinds`.\n\n"
+    """Return the page of all built-in job kinds."""
+    text = "# Job kinds\n\nA running server returns this list, with full JSON Schemas, at `/api/v1/job-kinds`.\n\n"
     for kind in job_kinds().values():
         text += f"## {kind.name}\n\n{kind.description}\n\n"
         inputs = [(f"`{name}`", _input(spec), spec.description) for name, spec in kind.inputs.items()]
@@ -124,7 +128,7 @@ def job_kinds_page() -> str:
 
 
 def _properties(schema: dict[str, Any], known: dict[str, Any], within: str = "") -> Iterator[tuple[str, str, str]]:
-    """Name, type and meaning of each member; members of an object stand under its name and their own."""
+    """Yield name, type and meaning of each parameter; members of an object parameter are named `object.member`."""
     for name, each in schema["properties"].items():
         inner = known.get(str(each.get("$ref", "")).rpartition("/")[2])
         if inner is not None and "properties" in inner:
@@ -146,19 +150,20 @@ def _type(schema: dict[str, Any]) -> str:
 
 
 def checks_page() -> str:
-    """Every warning an import may give."""
+    """Return the page of all warnings that an import may give."""
     text = (
-        "# Import checks\n\nA file with warnings is imported nevertheless. `marey show` lists the warnings of a clip "
-        "with joints and frames.\n\n"
+        "# Import checks\n\nA file is imported even if these checks give warnings. `marey show` lists the warnings of "
+        "a clip with joints and frames.\n\n"
     )
     return NOTE + text + _table(("code", "meaning"), [(f"`{code}`", meaning) for code, meaning in checks.CODES.items()])
 
 
 def errors_page() -> str:
-    """Every code of a problem answer."""
+    """Return the page of all error codes of the REST API."""
     text = (
-        "# Errors\n\nErrors are `application/problem+json` (RFC 9457). `code` is stable; `instance` is the request id"
-        " to quote when asking for help; `errors` points at single fields.\n\n"
+        "# Errors\n\nErrors are sent as `application/problem+json` (RFC 9457). The member `code` does not change "
+        "between versions. `instance` is the id of the request; quote it when you ask for help. `errors` lists the "
+        "wrong fields of the request.\n\nIn the table, … is a text that differs from case to case.\n\n"
     )
     classes = {one.__name__: one for one in _subclasses(errors.ApiProblem)}
     found = {(one.code, one.status): one.__doc__.strip().splitlines()[0] for one in classes.values() if one.__doc__}
@@ -168,7 +173,7 @@ def errors_page() -> str:
         (f"`{code}`", str(status), says)
         for (code, status), says in sorted(found.items(), key=lambda each: each[0][::-1])
     ]
-    return NOTE + text + _table(("code", "status", "says"), rows)
+    return NOTE + text + _table(("code", "status", "message"), rows)
 
 
 def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProblem]]:
@@ -178,7 +183,7 @@ def _subclasses(base: type[errors.ApiProblem]) -> Iterator[type[errors.ApiProble
 
 
 def _raised(classes: dict[str, type[errors.ApiProblem]]) -> Iterator[tuple[str, str, str]]:
-    """Code, class and text of every error that is made with a code of its own."""
+    """Yield code, class name and message of each error that the server creates with an explicit `code`."""
     for file in sorted((ROOT / "server").rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in classes):
@@ -189,7 +194,7 @@ def _raised(classes: dict[str, type[errors.ApiProblem]]) -> Iterator[tuple[str, 
 
 
 def _spoken(node: ast.expr) -> str:
-    """A message as it reads, with … for what differs from case to case."""
+    """Return the message that an expression gives, with … in place of values that are known only at run time."""
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):
@@ -209,7 +214,7 @@ def _cell(text: object) -> str:
 
 
 def main() -> int:
-    """Write the pages, or with `--check` fail where one is out of date."""
+    """Write the pages that are out of date, or with `--check` only name them, and return 1 if there are any."""
     stale = [name for name, text in pages().items() if not _is(REFERENCE / name, text)]
     if "--check" in sys.argv[1:]:
         for name in stale:

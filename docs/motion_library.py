@@ -1,4 +1,4 @@
-"""The reference page of the motion library, from its docstrings."""
+"""Generates the reference page of the motion library from the docstrings of the library."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ _HEAD = re.compile(r"^(\w+)\n-+\n", re.MULTILINE)
 
 
 def library_page() -> str:
-    """Write every exported name in full, then every module with its public functions."""
+    """Return the page: each exported name with its whole docstring, then for each module a table of its functions."""
     text = (
         "# Motion library\n\n"
-        "`marey_motion` takes arrays and gives arrays; it knows no server. Right-handed, Y up, metres, seconds,\n"
-        "radians; quaternions are (w, x, y, z). F counts frames, J joints. Install: `pip install 'marey[motion]'`.\n\n"
+        "`marey_motion` works on arrays in memory and needs no server. Axes are right-handed with Y up;\n"
+        "units are metres, seconds and radians; quaternions are (w, x, y, z). In shapes, F is the number of frames\n"
+        "and J the number of joints. To install the library: `pip install 'marey[motion]'`.\n\n"
         "## Exported names\n\n"
     )
     for module, name in exported_names():
@@ -35,7 +36,7 @@ def library_page() -> str:
 
 
 def exported_names() -> list[tuple[str, str]]:
-    """List module and name of everything that the package exports, in the order of its stub."""
+    """Return module and name of everything that the package exports, sorted by name."""
     stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     return sorted(
@@ -57,7 +58,7 @@ def _entry(module: str, name: str) -> str:
 
 
 def _find(module: str, name: str) -> Definition:
-    """Find a definition in a module, or in the module that it imports the name from."""
+    """Return the definition of a name in a module, or in the module from which this module imports the name."""
     tree = ast.parse(_file(module).read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, Definition) and node.name == name:
@@ -68,7 +69,7 @@ def _find(module: str, name: str) -> Definition:
 
 
 def _file(module: str) -> Path:
-    """Find the file of a module, in whichever of the packages it is."""
+    """Return the file of a module of `marey_motion` or `marey_schemas`."""
     roots = [MOTION, MOTION.parent / "schemas"]
     path = Path(*module.split("."))
     files = [root / each for root in roots for each in (path.with_suffix(".py"), path / "__init__.py")]
@@ -87,7 +88,7 @@ def _signature(definition: Definition) -> str:
 
 
 def _split(arguments: str) -> list[str]:
-    """Split at commas outside brackets."""
+    """Split the text of an argument list at commas outside brackets."""
     parts, depth, start = [], 0, 0
     for at, letter in enumerate(arguments):
         depth += (letter in "([{") - (letter in ")]}")
@@ -98,7 +99,7 @@ def _split(arguments: str) -> list[str]:
 
 
 def _described(definition: Definition) -> str:
-    """Turn a docstring into Markdown: paragraphs, a list for each section, examples as code."""
+    """Convert the docstring of a definition to Markdown: paragraphs, a list for each section, examples as code."""
     before, *sections = _HEAD.split(ast.get_docstring(definition) or "")
     text = _paragraphs(before)
     for title, content in zip(sections[::2], sections[1::2], strict=True):
@@ -116,7 +117,7 @@ def _paragraphs(text: str) -> str:
 
 
 def _items(content: str) -> Iterator[str]:
-    """Join the continued lines of each entry."""
+    """Yield each entry of a docstring section in one line, joined with its continuation lines."""
     for line in textwrap.dedent(content).strip().splitlines():
         if line.startswith(" "):
             continue
@@ -130,7 +131,7 @@ def _items(content: str) -> Iterator[str]:
 
 
 def _item(line: str) -> str:
-    """Set the name of an entry in code, and a colon between type and meaning."""
+    """Format an entry of a docstring section: its name as code, then its type, a colon and its meaning."""
     head, _, meaning = line.partition("    ")
     name, colon, kind = head.partition(" : ")
     shown = f"`{name}`, {kind}" if colon else f"`{name}`"
