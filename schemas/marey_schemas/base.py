@@ -39,7 +39,8 @@ class Options(Request):
         return type(self)(**{**dict(self), **changes})
 
 
-def _require_tag(schema: dict[str, Any], model: type[Any]) -> None:
+def require_tag(schema: dict[str, Any], model: type[Any]) -> None:
+    """Add the tag of `model` to the required properties of its JSON Schema."""
     schema["required"] = list(dict.fromkeys((model.tag, *schema.get("required", ()))))
 
 
@@ -49,7 +50,7 @@ class Tagged(Options):
     Documents must contain the tag. In Python it may be omitted, because each class has its own value as default.
     """
 
-    model_config = ConfigDict(json_schema_extra=_require_tag)
+    model_config = ConfigDict(json_schema_extra=require_tag)
     tag: ClassVar[str]
 
     @model_serializer(mode="wrap")

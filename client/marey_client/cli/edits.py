@@ -121,8 +121,7 @@ def show_edit(
         typer.echo(document.title)
     for number, command in enumerate(document.commands):
         given = command.model_dump(mode="json", exclude_defaults=True)
-        values = " ".join(f"{name}={json.dumps(value)}" for name, value in given.items() if name != "command")
-        typer.echo(f"{number:3}  {command.command} {values}".rstrip())
+        typer.echo(f"{number:3}  {command_text(given)}")
     return None
 
 
@@ -171,7 +170,11 @@ def list_commands(
             ],
         )
     typer.echo(_summary(wanted[name]))
-    return print_table(("parameter", "type", "default", "meaning"), parameter_rows(wanted[name]))
+    print_table(("parameter", "type", "default", "meaning"), parameter_rows(wanted[name]))
+    typer.echo("Examples:")
+    for example in wanted[name].examples:
+        typer.echo(f"  --do {shlex.quote(command_text({'command': name, **example}))}")
+    return None
 
 
 # -- what is asked for --
@@ -258,6 +261,33 @@ def parse_command(text: str) -> dict[str, Any]:
             raise WrongUsage(f"{name} has no parameter {key!r}; it has {', '.join(parameters) or 'none'}")
         command[key] = read_value(value, parameters[key])
     return command
+
+
+def command_text(command: dict[str, Any]) -> str:
+    """Return a command as text that `parse_command` reads."""
+    values = (f"{name}={_value_text(value)}" for name, value in command.items() if name != "command")
+    return " ".join((command["command"], *map(_quoted, values)))
+
+
+def _quoted(text: str) -> str:
+    """Return a text that `shlex.split` reads as one word, without the single quotes that people put around commands."""
+    if shlex.quote(text) == text:
+        return text
+    name, _, value = text.partition("=")
+    escaped = value.replace("\\", r"\\").replace('"', r"\"")
+    return f'{name}="{escaped}"'
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list) and value and all(_is_plain(one) for one in value):
+        return ",".join(map(str, value))
+    return json.dumps(value, separators=(",", ":"))
+
+
+def _is_plain(value: Any) -> bool:
+    return value.isalnum() if isinstance(value, str) else isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:

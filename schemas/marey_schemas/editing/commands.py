@@ -7,11 +7,11 @@ degrees where a name ends in `_deg`. Directions and positions are those of the w
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from marey_schemas.base import Tagged
+from marey_schemas.base import Tagged, require_tag
 from marey_schemas.names import ItemId, JointName
 from marey_schemas.options.annotations import ContactOptions
 
@@ -46,10 +46,22 @@ Axis = Annotated[tuple[Metres, Metres, Metres], AfterValidator(_require_directio
 WHOLE_OR_RANGE = "Half-open range of frames; absent: all."
 
 
-class NamedCommand(Tagged):
-    """Base of the commands of an edit."""
+Examples = tuple[dict[str, Any], ...]
+EXAMPLE_SOURCE = "other"
+"""Id of the second clip in the examples of commands that take one."""
 
+
+def _show_examples(schema: dict[str, Any], model: type[NamedCommand]) -> None:
+    require_tag(schema, model)
+    schema["examples"] = [{"command": schema["properties"]["command"]["const"], **each} for each in model.examples]
+
+
+class NamedCommand(Tagged):
+    """Base of the commands of an edit. `examples` are parameters with which the command is documented and tested."""
+
+    model_config = ConfigDict(json_schema_extra=_show_examples)
     tag: ClassVar[str] = "command"
+    examples: ClassVar[Examples]
 
 
 # Frames and time
@@ -58,6 +70,7 @@ class NamedCommand(Tagged):
 class Trim(NamedCommand):
     """Keep a range of frames."""
 
+    examples: ClassVar[Examples] = ({"start": 10, "stop": 170}, {"start": 3})
     command: Literal["trim"] = "trim"
     start: Frame = Field(0, description="The first frame to keep.")
     stop: Frame | None = Field(None, description="The frame after the last one to keep; absent: up to the end.")
@@ -72,6 +85,7 @@ class Trim(NamedCommand):
 class Split(NamedCommand):
     """Cut into several clips; the commands that follow apply to each."""
 
+    examples: ClassVar[Examples] = ({"at": [60, 90]},)
     command: Literal["split"] = "split"
     at: tuple[Annotated[int, Field(ge=1, le=MOST_FRAME)], ...] = Field(
         min_length=1, max_length=1000, description="Cut before each of these frames, in increasing order."
@@ -87,6 +101,10 @@ class Split(NamedCommand):
 class Concatenate(NamedCommand):
     """Append another clip of the same skeleton."""
 
+    examples: ClassVar[Examples] = (
+        {"source": EXAMPLE_SOURCE},
+        {"source": EXAMPLE_SOURCE, "place": "keep", "blend": "slerp", "blend_s": 0.5},
+    )
     command: Literal["concatenate"] = "concatenate"
     source: ItemId = Field(description="The clip to append.")
     place: Literal["seam", "keep"] = Field(
@@ -106,6 +124,7 @@ class Concatenate(NamedCommand):
 class Resample(NamedCommand):
     """Sample the motion at another frame rate."""
 
+    examples: ClassVar[Examples] = ({"frame_rate_hz": 45.0},)
     command: Literal["resample"] = "resample"
     frame_rate_hz: float = Field(
         ge=0.1, le=100_000, allow_inf_nan=False, description="New frame rate, in frames per second."
@@ -115,6 +134,7 @@ class Resample(NamedCommand):
 class Retime(NamedCommand):
     """Play the motion faster or slower, at the same frame rate."""
 
+    examples: ClassVar[Examples] = ({"speed": 0.7},)
     command: Literal["retime"] = "retime"
     speed: float = Field(
         ge=0.01, le=100, allow_inf_nan=False, description="Speed factor; 2: twice as fast, in half the time."
@@ -124,6 +144,7 @@ class Retime(NamedCommand):
 class CloseLoop(NamedCommand):
     """Change poses so that the last frame continues seamlessly with the first one."""
 
+    examples: ClassVar[Examples] = ({}, {"in_place": True, "blend_s": 0.4})
     command: Literal["close_loop"] = "close_loop"
     in_place: bool = Field(
         False, description="Remove the travel and turn of one cycle, so that each cycle starts at the same place."
@@ -141,6 +162,7 @@ class CloseLoop(NamedCommand):
 class Translate(NamedCommand):
     """Shift the whole motion."""
 
+    examples: ClassVar[Examples] = ({"shift_m": [1.0, 0.5, -2.0]},)
     command: Literal["translate"] = "translate"
     shift_m: Shift = Field(description="Shift in metres along x, y and z.")
 
@@ -148,6 +170,7 @@ class Translate(NamedCommand):
 class Rotate(NamedCommand):
     """Turn the whole motion about an axis of the world."""
 
+    examples: ClassVar[Examples] = ({"angle_deg": 30.0}, {"angle_deg": -20.0, "axis": [1.0, 0.0, 0.5], "pivot": "body"})
     command: Literal["rotate"] = "rotate"
     angle_deg: Degrees = Field(
         description="Angle about `axis`, in degrees; about the vertical, positive is to the left."
@@ -162,6 +185,7 @@ class Rotate(NamedCommand):
 class Face(NamedCommand):
     """Turn the whole motion about the vertical so that the body has a given heading in a frame."""
 
+    examples: ClassVar[Examples] = ({"heading_deg": 45.0, "frame": 10},)
     command: Literal["face"] = "face"
     heading_deg: Degrees = Field(0.0, description="Heading in degrees; 0 faces +z, and positive is to the left.")
     frame: Frame = Field(
@@ -172,6 +196,7 @@ class Face(NamedCommand):
 class MoveToOrigin(NamedCommand):
     """Shift the whole motion on the ground so that the body is above the origin in a frame; heights do not change."""
 
+    examples: ClassVar[Examples] = ({"frame": 20},)
     command: Literal["move_to_origin"] = "move_to_origin"
     frame: Frame = Field(0, description="The frame in which the body is above the origin.")
 
@@ -179,6 +204,7 @@ class MoveToOrigin(NamedCommand):
 class Scale(NamedCommand):
     """Scale the path of the body, including its heights. The skeleton is another item and does not change."""
 
+    examples: ClassVar[Examples] = ({"factor": 1.2, "translations": True},)
     command: Literal["scale"] = "scale"
     factor: float = Field(ge=1e-4, le=1e4, allow_inf_nan=False, description="Scale factor, about the origin.")
     translations: bool = Field(False, description="Also scale the translations of joints other than the root.")
@@ -190,6 +216,7 @@ SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 class FlipAxes(NamedCommand):
     """Convert a motion recorded with other axes, such as Blender's Z up, to axes with Y up."""
 
+    examples: ClassVar[Examples] = ({"up": "-x", "forward": "+y"},)
     command: Literal["flip_axes"] = "flip_axes"
     up: SignedAxis = Field("+z", description="The axis of the clip that points up before the conversion.")
     forward: SignedAxis = Field("-y", description="The axis that becomes +z; it is orthogonal to `up`.")
@@ -206,6 +233,9 @@ class FlipAxes(NamedCommand):
 class FixDrift(NamedCommand):
     """Spread a shift and a turn of the body over a range of frames; later frames get the whole shift and turn."""
 
+    examples: ClassVar[Examples] = (
+        {"shift_m": [0.2, 0.0, -0.1], "turn_deg": 10.0, "frames": [20, 80], "profile": "smooth"},
+    )
     command: Literal["fix_drift"] = "fix_drift"
     shift_m: Shift = Field((0.0, 0.0, 0.0), description="Shift of the end of the range, in metres along x, y and z.")
     turn_deg: Degrees = Field(
@@ -223,6 +253,7 @@ class FixDrift(NamedCommand):
 class MoveToGround(NamedCommand):
     """Shift the whole motion vertically so that the ground is at height zero."""
 
+    examples: ClassVar[Examples] = ({}, {"height_m": 0.1})
     command: Literal["move_to_ground"] = "move_to_ground"
     height_m: Metres | None = Field(
         None,
@@ -233,12 +264,14 @@ class MoveToGround(NamedCommand):
 class FindGround(NamedCommand):
     """Estimate the height of the ground from feet in contact with it; the motion does not change."""
 
+    examples: ClassVar[Examples] = ({},)
     command: Literal["find_ground"] = "find_ground"
 
 
 class FindContacts(NamedCommand, ContactOptions):
     """Find the frames in which feet are in contact with the ground; the motion does not change."""
 
+    examples: ClassVar[Examples] = ({"speed_m_s": 0.4},)
     command: Literal["find_contacts"] = "find_contacts"
     height_limit_m: float | None = Field(
         0.1,
@@ -255,12 +288,17 @@ class FindContacts(NamedCommand, ContactOptions):
 class Mirror(NamedCommand):
     """Swap left and right, by the skeleton's own symmetry."""
 
+    examples: ClassVar[Examples] = ({},)
     command: Literal["mirror"] = "mirror"
 
 
 class Smooth(NamedCommand):
     """Smooth rotations and translations over time; the first and last frame do not change."""
 
+    examples: ClassVar[Examples] = (
+        {},
+        {"method": "gaussian", "joints": ["Head", "LeftArm"], "frames": [10, 90], "window_s": 0.3},
+    )
     command: Literal["smooth"] = "smooth"
     method: Literal["savitzky_golay", "gaussian"] = Field(
         "savitzky_golay", description="Filter: savitzky_golay keeps peaks, gaussian flattens them."
@@ -284,6 +322,7 @@ class Smooth(NamedCommand):
 class RotateJoint(NamedCommand):
     """Add a rotation to a joint."""
 
+    examples: ClassVar[Examples] = ({"joint": "LeftArm", "angle_deg": 20.0, "axis": [0.0, 1.0, 0.0], "space": "world"},)
     command: Literal["rotate_joint"] = "rotate_joint"
     joint: JointName = Field(description="Name of the joint.")
     angle_deg: Degrees = Field(description="Angle of the turn, in degrees; less in the frames that are blended.")
@@ -300,6 +339,9 @@ class RotateJoint(NamedCommand):
 class Paste(NamedCommand):
     """Replace the motion of joints by their motion in another clip, stretched in time to fit."""
 
+    examples: ClassVar[Examples] = (
+        {"source": EXAMPLE_SOURCE, "joints": ["LeftArm", "LeftForeArm"], "frames": [20, 80], "source_frames": [0, 40]},
+    )
     command: Literal["paste"] = "paste"
     source: ItemId = Field(description="The clip to copy from.")
     joints: Joints = Field(description="Joints to copy; both skeletons have them, with the same axes.")

@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from marey_schemas.base import Options, Request, Tagged
-from marey_schemas.editing.commands import WHOLE_OR_RANGE, Axis, Frames, NamedCommand, Seconds, Shift
+from marey_schemas.editing.commands import WHOLE_OR_RANGE, Axis, Examples, Frames, NamedCommand, Seconds, Shift
 from marey_schemas.names import JointName
 from marey_schemas.options.contacts import TOE_SPEED_M_S
 
@@ -145,6 +145,9 @@ AnyLimit = Annotated[HingeLimit | ConeLimit, Field(discriminator="kind")]
 class Constrain(NamedCommand):
     """Meet constraints in ranges of frames by inverse kinematics, blended in and out with B-splines."""
 
+    examples: ClassVar[Examples] = (
+        {"constraints": [{"kind": "position", "joint": "LeftHand", "frames": [40, 50], "shift_m": [0.0, 0.05, 0.02]}]},
+    )
     command: Literal["constrain"] = "constrain"
     constraints: tuple[AnyConstraint, ...] = Field(min_length=1, max_length=MOST_CONSTRAINTS)
     solver: Solver = Field(
@@ -196,6 +199,7 @@ class PlantOptions(Options):
 class PlantFeet(NamedCommand, PlantOptions):
     """Keep feet in place while they are in contact with the ground."""
 
+    examples: ClassVar[Examples] = ({},)
     command: Literal["plant_feet"] = "plant_feet"
     contacts: tuple[FootContact, ...] | None = Field(
         None, max_length=100_000, description="Contacts of the feet; absent: detected by the speed of the feet."

@@ -3,8 +3,9 @@
 from typing import Any
 
 import pytest
+from tests.support.edit_examples import commands_of_all
 
-from marey_client.cli.edits import parameter_rows, parse_command
+from marey_client.cli.edits import command_text, parameter_rows, parse_command
 from marey_client.cli.terminal.failures import WrongUsage
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
@@ -39,6 +40,20 @@ from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 def test_a_line_becomes_a_command(text: str, command: dict[str, Any]) -> None:
     assert parse_command(text) == command
     EditDocument.model_validate({"commands": [command]})
+
+
+ODD_VALUES: list[dict[str, Any]] = [
+    {"command": "smooth", "joints": ["Left Arm", "a,b", "it's", '"'], "frames": [10, None]},
+    {"command": "smooth", "joints": ["7", "12"], "root_translation": False},
+    {"command": "rotate_joint", "joint": "a b=c", "axis": [0, 1e-9, -2.5], "angle_deg": 5},
+    {"command": "split", "at": [10]},
+    {"command": "find_contacts", "height_limit_m": None},
+]
+
+
+@pytest.mark.parametrize("command", commands_of_all() + ODD_VALUES)
+def test_the_text_of_a_command_is_read_as_the_same_command(command: dict[str, Any]) -> None:
+    assert parse_command(command_text(command)) == command
 
 
 @pytest.mark.parametrize(

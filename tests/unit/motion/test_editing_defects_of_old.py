@@ -4,7 +4,7 @@ from math import degrees
 
 import numpy as np
 import pytest
-from tests.support.edit_examples import EXAMPLES, SOURCE
+from tests.support.edit_examples import examples_of
 from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound, same_poses
 
 from marey_motion.clip import Clip
@@ -12,7 +12,7 @@ from marey_motion.editing.registry import apply_edit, edit_clip
 from marey_motion.gait import game_skeleton, studio_skeleton
 from marey_motion.kinematics import global_positions
 from marey_motion.skeleton import Skeleton
-from marey_schemas.editing.commands import FindGround, Mirror, Paste, RotateJoint, Smooth, Translate
+from marey_schemas.editing.commands import EXAMPLE_SOURCE, FindGround, Mirror, Paste, RotateJoint, Smooth, Translate
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
 
 
@@ -38,9 +38,11 @@ HISTORY = (
 @pytest.mark.parametrize("name", HISTORY)
 def test_every_command_of_an_edit_history_replays_from_its_json(name: str) -> None:
     walk, other = make_breathing_walk(), make_walk(speed_m_s=2.0)
-    document = EditDocument.model_validate({"commands": [{"command": name, **given} for given in EXAMPLES[name]]})
+    document = EditDocument.model_validate({"commands": examples_of(name)})
     replayed = EditDocument.model_validate_json(document.model_dump_json(by_alias=True))
-    once, again = (edit_clip(walk, one.commands, sources={SOURCE: other})[0].clip for one in (document, replayed))
+    once, again = (
+        edit_clip(walk, one.commands, sources={EXAMPLE_SOURCE: other})[0].clip for one in (document, replayed)
+    )
     assert once.poses.tobytes() == again.poses.tobytes()
     assert once.poses.shape != walk.poses.shape or not np.array_equal(once.poses, walk.poses)
 
@@ -48,7 +50,7 @@ def test_every_command_of_an_edit_history_replays_from_its_json(name: str) -> No
 def test_an_edit_history_can_be_taken_back_step_by_step() -> None:
     """The commands are kept and not the frames: leaving the last one out is to undo it, doing it again to redo it."""
     walk = make_walk()
-    history = [COMMAND_MODELS[name](**EXAMPLES[name][0]) for name in HISTORY]
+    history = [COMMAND_MODELS[name](**COMMAND_MODELS[name].examples[0]) for name in HISTORY]
     states = [walk, *(apply_edit(walk, history[: number + 1]) for number in range(len(history)))]
     for command, undone, done in zip(history, states, states[1:], strict=False):
         assert same_poses(apply_edit(undone, [command]), done, 1e-5), command
@@ -94,9 +96,9 @@ def test_a_change_of_a_range_does_not_leak_out_of_it() -> None:
     for command in (
         Smooth(window_s=0.3, frames=(60, 100)),
         RotateJoint(joint="Head", axis=(1.0, 0.0, 0.0), angle_deg=degrees(0.5), frames=(60, 100)),
-        Paste(source=SOURCE, joints=["LeftArm"], frames=(60, 100)),
+        Paste(source=EXAMPLE_SOURCE, joints=["LeftArm"], frames=(60, 100)),
     ):
-        changed = apply_edit(walk, [command], sources={SOURCE: make_walk(speed_m_s=2.0)})
+        changed = apply_edit(walk, [command], sources={EXAMPLE_SOURCE: make_walk(speed_m_s=2.0)})
         assert np.array_equal(changed.poses[:60], walk.poses[:60]), command
         assert np.array_equal(changed.poses[100:], walk.poses[100:]), command
         assert not np.array_equal(changed.poses[60:100], walk.poses[60:100]), command

@@ -1,20 +1,29 @@
 """Lists of commands: what can be asked for, what goes wrong, and that the same list gives the same bytes."""
 
 import inspect
+from collections.abc import Callable
 from math import degrees
 from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.support.edit_examples import EXAMPLES, FRAMES, SOURCE, commands_of_all
+from tests.support.edit_examples import commands_of_all
 from tests.support.edited_takes import make_breathing_walk, make_walk, require_sound
 
 from marey_motion.clip import Clip
 from marey_motion.editing.registry import COMMANDS, EditedClip, apply_edit, edit_clip
 from marey_motion.errors import EditError, MotionError
-from marey_schemas.editing.commands import Mirror, NamedCommand, Rotate, Scale, Split, Trim
+from marey_schemas.editing.commands import EXAMPLE_SOURCE, Mirror, NamedCommand, Rotate, Scale, Split, Trim
 from marey_schemas.editing.edits import COMMAND_MODELS, EditDocument
+
+FRAMES: dict[str, Callable[[int, dict[str, Any]], int]] = {
+    "trim": lambda frames, given: (given.get("stop") or frames) - given.get("start", 0),
+    "concatenate": lambda frames, given: frames + 180 - (30 if given.get("blend") == "slerp" else 0),
+    "resample": lambda frames, given: int((frames - 1) * 45 / 60) + 1,
+    "retime": lambda frames, given: int((frames - 1) / 0.7) + 1,
+}
+"""Number of frames of all clips that a command makes of a walk of some frames; commands not listed keep the number."""
 
 
 def edit_of(*commands: dict[str, Any]) -> EditDocument:
@@ -22,11 +31,12 @@ def edit_of(*commands: dict[str, Any]) -> EditDocument:
 
 
 def applied(clip: Clip, *commands: dict[str, Any]) -> tuple[EditedClip, ...]:
-    return edit_clip(clip, edit_of(*commands).commands, sources={SOURCE: make_walk(speed_m_s=2.5)})
+    return edit_clip(clip, edit_of(*commands).commands, sources={EXAMPLE_SOURCE: make_walk(speed_m_s=2.5)})
 
 
 def test_every_command_has_a_schema_and_every_schema_a_command() -> None:
-    assert set(COMMANDS) == set(COMMAND_MODELS) == set(EXAMPLES)
+    assert set(COMMANDS) == set(COMMAND_MODELS)
+    assert all(model.examples for model in COMMAND_MODELS.values())
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -40,7 +50,7 @@ def test_the_function_of_a_command_takes_the_model_that_declares_its_parameters(
 def test_the_name_of_a_command_is_its_default_in_python_and_required_in_documents(model: type[NamedCommand]) -> None:
     schema = model.model_json_schema()
     assert "command" in schema["required"]
-    (given, *_) = EXAMPLES[schema["properties"]["command"]["const"]]
+    (given, *_) = model.examples
     command = model(**given)
     assert command.model_dump(exclude_unset=True).keys() == {"command", *given}
     assert EditDocument(commands=(command,)) == edit_of(command.model_dump(mode="json", exclude_unset=True))
@@ -71,7 +81,7 @@ def test_a_saved_edit_gives_the_same_bytes_every_time() -> None:
     again = EditDocument.model_validate_json(edit.model_dump_json(by_alias=True))
     assert again == edit
     walk = make_breathing_walk()
-    sources = {SOURCE: make_walk(speed_m_s=2.5)}
+    sources = {EXAMPLE_SOURCE: make_walk(speed_m_s=2.5)}
     (first,) = edit_clip(walk, edit.commands, sources=sources)
     (second,) = edit_clip(walk, again.commands, sources=sources)
     assert first.clip.poses.tobytes() == second.clip.poses.tobytes()
