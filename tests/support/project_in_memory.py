@@ -9,11 +9,12 @@ from typing import Any
 from marey_motion.clip import Clip
 from marey_motion.documents import clip_to_document, skeleton_to_document
 from marey_schemas.documents.references import RevisionRef
+from marey_schemas.encoding.codecs import MSGPACK, decode_tree
 from marey_schemas.items import Item
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import EvaluateParams
-from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
-from marey_worker.context import Context, NoSuchThing, Task
+from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput, StageRequest
+from marey_worker.context import Context, NoSuchThing, Task, encode_outputs
 
 NOW = "2026-01-01T00:00:00Z"
 PARAMS = EvaluateParams(
@@ -65,7 +66,7 @@ class ProjectInMemory(Context):
         return digest
 
     def stage(self, outputs: Sequence[StagedOutput]) -> None:
-        self.staged += outputs
+        self.staged += StageRequest.model_validate(decode_tree(encode_outputs(outputs), MSGPACK)).outputs
 
     def log(self, text: str) -> None:
         print(text)

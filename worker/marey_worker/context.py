@@ -151,8 +151,7 @@ class Context:
         Raises `RequestRefused` if earlier results could not be stored. The method does not wait until results are
         stored: the supervisor waits for the last ones, while this process runs the next job.
         """
-        tree = StageRequest(outputs=tuple(outputs)).model_dump(by_alias=True)
-        body = encode_tree(tree, MSGPACK, arrays="blocks")
+        body = encode_outputs(outputs)
         while len(self._staging) >= STAGED_AT_ONCE:
             self._value(self._staging.popleft())
         self._staging.append(self._send(lambda request: Stage(request, body)))
@@ -209,6 +208,14 @@ class Context:
         if reply.refusal is not None:
             raise NoSuchThing(reply.refusal, missing) if reply.missing else RequestRefused(reply.refusal)
         return reply.value
+
+
+def encode_outputs(outputs: Sequence[StagedOutput]) -> bytes:
+    """Return a `StageRequest` in MessagePack; arrays that are already encoded are copied into it."""
+    request = StageRequest(outputs=tuple(outputs))
+    fields = request.model_dump(by_alias=True, exclude={"outputs": {"__all__": {"parts"}}})["outputs"]
+    whole = [{**each, "parts": output.parts} for each, output in zip(fields, outputs, strict=True)]
+    return encode_tree({"outputs": whole}, MSGPACK, arrays="blocks")
 
 
 def _decoded(data: bytes) -> Any:

@@ -1,15 +1,23 @@
-"""Staging of results in batches, which are sent while the next results are computed."""
+"""Staging of results in batches, which are encoded and sent while the next results are computed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
+
+from marey_schemas.encoding.arrays import EncodedArray
+from marey_schemas.encoding.arrayspec import require_finite
 from marey_schemas.queue.worker_protocol import StagedOutput
 from marey_worker.context import Context, JobRefused
 
 BYTES_PER_STAGE = 2 << 20
 OUTPUTS_PER_STAGE = 64
+
+_encoder = ThreadPoolExecutor(1, thread_name_prefix="marey-encode")
+"""Thread that encodes arrays of results; compression does not hold Python's lock."""
 
 
 class StagedResults:
@@ -18,7 +26,7 @@ class StagedResults:
     def __init__(self, context: Context) -> None:
         self.names: set[str] = set()
         self._context = context
-        self._ready: list[StagedOutput] = []
+        self._ready: list[Future[StagedOutput]] = []
         self._ready_bytes = 0
 
     @property
@@ -34,7 +42,7 @@ class StagedResults:
         if output.name in self.names:
             raise JobRefused("same-name", f"two results of the job would have the name {output.name}")
         self.names.add(output.name)
-        self._ready.append(output)
+        self._ready.append(_encoder.submit(_with_encoded_arrays, output))
         self._ready_bytes += _array_bytes(output.parts)
         if self._ready_bytes > BYTES_PER_STAGE or len(self._ready) >= OUTPUTS_PER_STAGE:
             self.flush()
@@ -42,7 +50,7 @@ class StagedResults:
     def flush(self) -> None:
         """Send the results that are not yet sent."""
         if self._ready:
-            self._context.stage(self._ready)
+            self._context.stage([encoding.result() for encoding in self._ready])
         self._ready, self._ready_bytes = [], 0
 
 
@@ -50,3 +58,13 @@ def _array_bytes(tree: Any) -> int:
     if isinstance(tree, Mapping):
         return sum(map(_array_bytes, tree.values()))
     return int(getattr(tree, "nbytes", 0))
+
+
+def _with_encoded_arrays(output: StagedOutput) -> StagedOutput:
+    return output.model_copy(update={"parts": _encoded(output.parts)})
+
+
+def _encoded(tree: Any) -> Any:
+    if isinstance(tree, Mapping):
+        return {name: _encoded(value) for name, value in tree.items()}
+    return EncodedArray.of(require_finite(tree)) if isinstance(tree, np.ndarray) else tree
