@@ -8,6 +8,8 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check -q
 PINNED := $(PIP) install --require-hashes --only-binary :all: -r
 MAREY  := $(PIP) install --no-deps --no-build-isolation -e .
 ARGS   ?=
+# Tests start hundreds of processes, each of which would compile the sources again.
+unexport PYTHONDONTWRITEBYTECODE
 EFFORT ?= 4
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadgroup $(ARGS)
 

@@ -13,7 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import version
@@ -229,7 +229,10 @@ async def serve(settings: Settings) -> None:
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    async with serving(settings) as running, warming(running.app.services.children):
+    async with (
+        serving(settings) as running,
+        warming(running.app.services.children) if settings.warm_up else nullcontext(),
+    ):
         for line in greeting(settings, running.address, running.app.services.database):
             log.info("%s", line)
         await stop.wait()

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 import sqlalchemy
 from tests.support.server_process import QUICK_LEASES, ServerProcess, WorkerProcess
@@ -75,6 +76,24 @@ def import_game_skeleton(lab: ProjectHandle, folder: Path) -> str:
     [entry] = lab.imports.upload(list(find_files([file]).files))
     assert entry.skeleton is not None, entry
     return entry.skeleton
+
+
+def children_of(server: ServerProcess) -> list[str]:
+    """Return the modules that the children of a server run."""
+    assert server.process is not None
+    return [child.cmdline()[2] for child in psutil.Process(server.process.pid).children()]
+
+
+def test_a_server_that_does_not_warm_up_starts_children_when_a_request_needs_them(tmp_path: Path) -> None:
+    server = ServerProcess(tmp_path)
+    server.start()
+    try:
+        assert children_of(server) == []
+        with server.client() as marey:
+            import_game_skeleton(make_lab(marey), tmp_path)
+        assert children_of(server) == ["marey_server.motions.child"]
+    finally:
+        server.stop()
 
 
 def clips_by_name(lab: ProjectHandle) -> dict[str, tuple[str, int]]:

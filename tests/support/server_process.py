@@ -29,8 +29,6 @@ READY_S = 120.0
 
 PATIENT = Retries(tries=400, first_s=0.1, longest_s=1.0, total_s=1.5 * READY_S)
 """Outlasts a server that takes all its time to start again."""
-FEW_CHILDREN = "2"
-"""Number of child processes of a server; each that starts with it takes as much processor time as the server itself."""
 QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CANCEL_GRACE_S": "2"}
 
 
@@ -97,7 +95,7 @@ class ServerProcess(MareyProcess):
         self.port = reserved_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._settings = Settings(data=self.data, database_url=database_url, blobs="database")
-        own = {"MAREY_DATA": str(self.data), "MAREY_PORT": str(self.port), "MAREY_CHILD_PROCESSES": FEW_CHILDREN}
+        own = {"MAREY_DATA": str(self.data), "MAREY_PORT": str(self.port), "MAREY_WARM_UP": "false"}
         self.environment = own | environment
         if database_url is not None:
             self.environment["MAREY_DATABASE_URL"] = database_url

@@ -136,6 +136,11 @@ class Settings(BaseSettings):
         description="Processes in which the server reads uploaded files and computes on stored data; no user "
         "can use all of them at the same time. Absent: one more than the number of processors, but 3 to 5.",
     )
+    warm_up: bool = Field(
+        True,
+        description="Compile missing kernels and start the child processes when the server starts. If false, the first "
+        "requests that need them wait for that.",
+    )
     child_requests: int = Field(
         32,
         ge=2,
