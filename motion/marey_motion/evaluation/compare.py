@@ -45,7 +45,7 @@ class MetricChange:
     before, after : means over the trials in which both evaluations define the metric, in the metric's own unit
     change : mean of after - before over these trials
     low, high : bounds of the mean change at `CONFIDENCE`, by bootstrap over trials (bias corrected and accelerated)
-    trials : number of these trials; with a single trial, both bounds are its change
+    trials : number of these trials; with a single trial, `low` and `high` equal `change`
     """
 
     metric: str
@@ -214,7 +214,7 @@ def _trial_changes(before: EvaluationResult, after: EvaluationResult) -> tuple[T
 
 
 def _places(results: Iterable[EvaluationResult]) -> list[list[NDArray[np.int64]]]:
-    """Compute the clip and frame displayed at each tick (T, 2), per result and trial, with the same clip numbers."""
+    """Find the clip and frame (T, 2) displayed at each tick, per result and trial; equal uids get equal numbers."""
     numbers: dict[str, int] = {}
     return [[_clip_frames(result, record, numbers) for record in result.records] for result in results]
 
@@ -227,7 +227,7 @@ def _clip_frames(result: EvaluationResult, record: TrialRecord, numbers: dict[st
 
 
 def _numbers_differ(first: TrialRecord, second: TrialRecord) -> NDArray[np.bool_]:
-    """Find the ticks (T,) at which two records differ, except in row numbers, which depend on the database."""
+    """Mark the ticks (T,) at which two records differ; row numbers are ignored, since they depend on the database."""
     differs: NDArray[np.bool_] = np.any(first.positions != second.positions, axis=1)
     for name in ("headings", "status", "match_cost", "continuing_cost", "pose_cost"):
         one, other = getattr(first, name), getattr(second, name)

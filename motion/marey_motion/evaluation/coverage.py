@@ -27,7 +27,7 @@ EDGE_DECIMALS = 9
 
 
 class Windows(NamedTuple):
-    """Means over one second, one window per starting frame; arrays of shape (W,)."""
+    """Mean speed, turn rate and velocities in windows of one second, one per starting frame; arrays of shape (W,)."""
 
     speed_m_s: Floats
     turn_rate_rad_s: Floats
@@ -75,7 +75,7 @@ def measure_coverage(
     Parameters
     ----------
     database : MatchingDatabase    the clips
-    options : EvaluationOptions    grid and least seconds per cell
+    options : EvaluationOptions    grid and minimum seconds per cell
     with_in_place : bool    include clips that walk in place
 
     Returns
@@ -115,7 +115,7 @@ def coverage_of(
     windows : Windows    W windows
     owners : (W,) int32    index of the clip of each window
     too_short : tuple of int    indices of clips without a window
-    options : EvaluationOptions    grid and least seconds per cell
+    options : EvaluationOptions    grid and minimum seconds per cell
     window_s : float    seconds of data that each window counts for
 
     Returns
@@ -185,9 +185,12 @@ def cell_edges(values: Sequence[float], step: float) -> Floats:
 
 
 def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn_edges: Floats) -> float:
-    """Compute 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h over cells that mirror each other exactly; 1 if there is no data.
+    """Compute how equally left and right turns are covered: 1 for equal coverage, 0 if only one side is covered.
 
-    The cells are those of the map and, where the grid itself is one-sided, their mirror images.
+    The value is 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h, where h is the number of windows in a cell of speed v and turn rate
+    ω; it is 1 if there is no data.
+
+    The cells are those of the map and, if the grid contains only one side, also their mirror images.
 
     Parameters
     ----------

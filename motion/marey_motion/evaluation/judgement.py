@@ -26,7 +26,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """Ratios of a trial's three errors to their limits: above 1 beyond the limit, infinite if undefined."""
+    """Ratio of each of a trial's three errors to its limit: above 1 if the error exceeds it, infinite if undefined."""
 
     place: float
     speed: float

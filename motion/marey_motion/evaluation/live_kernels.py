@@ -1,7 +1,7 @@
 """Compiled functions of `live_windows`, kept apart so that importing the rest of the package does not load numba.
 
-`take` and `filters` are the tuples of `live_windows`; the arrays of `take` are changed in place. Frames are processed
-one by one, so that results do not depend on how the frames were divided into requests.
+`take` is a `live_windows.LiveTake`, whose arrays are changed in place; `filters` is a `live_windows.Filters`. Frames
+are processed one by one, so that results do not depend on how the frames were divided into requests.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ RECEIVED, SMOOTHED = 0, 1
 
 @compiled
 def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
-    """Estimate a column of the raw root at a frame by the polynomial fitted to the frames around it."""
+    """Smooth one column of `take.raw` at a frame, by the polynomial fitted to the frames around it."""
     width = smoother.shape[0]
     first = max(min(frame - width // 2, take.counters[RECEIVED] - width), 0)
     total = 0.0
@@ -27,7 +27,10 @@ def _estimate(take, smoother, frame, column):  # type: ignore[no-untyped-def]
 
 @compiled
 def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
-    """Replace the oldest step of the ring buffer. Sums are recomputed once per cycle of the buffer to bound errors."""
+    """Replace the oldest step in the ring buffer, and update the sums of the steps.
+
+    The sums are recomputed once per cycle of the buffer, so that rounding errors do not accumulate.
+    """
     for column, value in enumerate((length, ahead, left)):
         take.sums[column] += value - take.steps[place, column]
         take.steps[place, column] = value
@@ -41,7 +44,7 @@ def _add_step(take, place, left, ahead, length):  # type: ignore[no-untyped-def]
 
 @compiled
 def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
-    """Move the smoothed root to its next frame."""
+    """Append a smoothed root to the ring buffers, together with the step that leads to it."""
     frame, span = take.counters[SMOOTHED], take.steps.shape[0]
     if frame > 0:
         heading += 2.0 * np.pi * np.round((take.root[2] - heading) / (2.0 * np.pi))
@@ -70,7 +73,7 @@ def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def
 
 @compiled
 def newest_window(take, duration_s, window):  # type: ignore[no-untyped-def]
-    """Fill in speed, turn rate, forward and strafe velocity of the last window; return False if there is none yet."""
+    """Write speed, turn rate, forward and strafe velocity of the last window to `window`; return whether one exists."""
     frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
     if frame < span:
         return False

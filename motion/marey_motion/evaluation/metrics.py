@@ -145,7 +145,7 @@ def _pieces(trial: Trial, times_s: Floats) -> NDArray[np.int64]:
 
 
 def _travel_turn_rates(steps: Floats, speeds: Floats, pieces: NDArray[np.int64], rate: float) -> Floats:
-    """Compute the turn rate of the direction of travel from the step before to each step.
+    """Compute the turn rate of the direction of travel between each step and the one before it.
 
     The rate is NaN if one of the two steps is too short, or if only one of them belongs to the approach.
     """
@@ -257,7 +257,7 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 
 
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Pool the costs of steps; a step has the cost of its first tick, whose choice is displayed at the next tick."""
+    """Pool the costs of steps; the cost of a step is that of its first tick, when the row shown next was chosen."""
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
         "pose_cost": record.pose_cost[:-1][window],
@@ -351,7 +351,7 @@ def _pooled(several: Sequence[Metrics]) -> dict[str, float | None]:
 
 
 def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
-    """Compute the mean difference of `offset_mean` between turning left and right at the same speed.
+    """Compute the mean absolute difference of `offset_mean` between trials that differ only in turning left or right.
 
     Parameters
     ----------
@@ -359,7 +359,7 @@ def offset_asymmetry(results: Sequence[TrialResult]) -> float | None:
 
     Returns
     -------
-    float or None    metres; None if no two trials differ only in the direction of turning
+    float or None    metres; None if there is no such pair of trials
     """
     offsets = {
         (result.trial.family, result.trial.speed_m_s, round(result.trial.turn_rate_rad_s, 9)): offset

@@ -284,7 +284,7 @@ def _require_near(positions: Floats) -> None:
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:
-    """Normalise facing directions (n, 2); a direction that is too short is replaced with the one before it.
+    """Normalise facing directions (n, 2); where the vector is too short, the direction of the frame before is used.
 
     `before` (2,) is the direction of the frame before the first. If it is None, leading frames without a direction are
     left out, so that only the last m directions (m, 2) are returned.

@@ -87,7 +87,7 @@ def find_jumps(clips: Sequence[DatabaseClip], record: TrialRecord) -> Jumps:
 
 
 def measure_usage(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> tuple[ClipUsage, ...]:
-    """Measure the ticks and entries of each clip, over all records.
+    """Count the ticks that display each clip, and the jumps to it, over all records.
 
     Parameters
     ----------
@@ -143,8 +143,8 @@ class SourceUsage:
     ----------
     uid, name : str    uid and name of the source clip
     clips : tuple of int    indices of the one or two clips made from it
-    ticks, share, entries    sums over these clips
-    popularity : (frames,) int64    ticks of each frame, summed
+    ticks, share, entries : sums over these clips
+    popularity : (frames,) int64    number of ticks that displayed each frame, summed over these clips
     """
 
     uid: str
@@ -215,9 +215,9 @@ def unused_clips(usage: Sequence[ClipUsage]) -> tuple[int, ...]:
 
 
 def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]) -> float | None:
-    """Compute the share of chosen jumps that stay in the same clip and lead at most `TREADING_S` away.
+    """Compute the share of chosen jumps that lead to a frame of the same clip at most `TREADING_S` away.
 
-    A character without suitable data returns to nearly the same frame at every search, so it slides on the ground.
+    A character without suitable data returns to nearly the same frame at every search, so its feet slide.
 
     Parameters
     ----------

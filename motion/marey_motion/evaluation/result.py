@@ -62,7 +62,7 @@ class Coverage:
     deficit_s : (V, O) float64    seconds that each cell lacks
     index : share of the target cells with enough data
     symmetry : 1 if turning left and right are covered equally, 0 if only one of them is covered
-    too_short : indices of the clips without a window, of one second or less
+    too_short : indices of the clips that have no window, because they last one second or less
     """
 
     clip: NDArray[np.int32]

@@ -73,7 +73,7 @@ class Reference:
 
     Parameters
     ----------
-    tick_count : number T of ticks of the trial itself; the arrays have L more rows, the look-ahead
+    tick_count : number T of ticks of the trial itself; the arrays have L more rows, for the look-ahead
     positions : (T + L, 2) float64    metres on the ground
     headings, speeds_m_s, turn_rates_rad_s : (T + L,) float64
     """
@@ -99,7 +99,7 @@ def suite_trials(options: EvaluationOptions) -> tuple[Trial, ...]:
 
     Raises
     ------
-    MotionError    if two trials have the same name, such as with speeds that differ by less than a millionth
+    MotionError    if two trials have the same name, for example because their speeds differ by less than a millionth
     """
     trials = tuple(
         Trial(

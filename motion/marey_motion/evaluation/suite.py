@@ -84,7 +84,7 @@ def run_suite(
     Raises
     ------
     EvaluationCancelled    if cancelled; trials that are running are finished first
-    MotionError    if two trials have the same name, such as with speeds that differ by less than a millionth
+    MotionError    if two trials have the same name, for example because their speeds differ by less than a millionth
     """
     wanted = suite_trials(options) if trials is None else tuple(trials)
     require_names(wanted)

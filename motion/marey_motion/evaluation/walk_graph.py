@@ -110,8 +110,8 @@ _GRAPHML_KEYS = (
 def graph_to_graphml(graph: WalkGraph, trials: Sequence[str] = ()) -> bytes:
     """Write a graph as GraphML: nodes n<row> with clip, frame and ticks, edges with their count.
 
-    The ordered walks are data of the graph, walk0 and so on: `n12:30 n140:6` is thirty frames from row 12 on, then six
-    from row 140.
+    Each walk is an attribute of the graph, walk0 and so on, which lists its runs in order: `n12:30 n140:6` is thirty
+    frames from row 12 on, then six from row 140.
 
     Parameters
     ----------

@@ -207,8 +207,8 @@ def _bend_leg(
 ) -> None:
     """Solve a leg by two-bone inverse kinematics; the knee bends towards the heading `facing` (n,), in radians.
 
-    That heading is between those of pelvis and foot. A swinging foot that is out of reach is pulled along by the leg;
-    the pull is softer where `freedom` (n,) is higher.
+    The heading `facing` lies between the headings of pelvis and foot. A swinging foot that is out of reach is pulled
+    along by the leg; the pull is softer where `freedom` (n,) is higher.
     """
     thigh, shank = _thigh_m(skeleton), _shank_m(skeleton)
     reach = ankle - hip

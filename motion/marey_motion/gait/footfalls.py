@@ -1,4 +1,4 @@
-"""Footholds of each foot, and its motion from one to the next.
+"""Footholds of each foot, and the foot's motion from one foothold to the next.
 
 The position of a foot is the position of its ball, the joint about which the toes turn. While the foot is loaded, the
 heel or the ball is a fixed point of the floor: the foot rolls about the heel when it lands with the toes up, is flat,
@@ -189,7 +189,7 @@ class Footfalls:
 
     @cached_property
     def footholds(self) -> Complexes:
-        """Position of the ball of each flat foot as z + i·x, in metres."""
+        """Position of the ball of the foot in each stance, while the foot is flat, as z + i·x in metres."""
         root, shape, style = self.middles, self.shape, self.cadence.style
         forward = np.cos(root.travel_angles)
         sideways = np.abs(np.sin(root.travel_angles))
@@ -306,7 +306,7 @@ class Footfalls:
     def _swing_ground(
         self, times_s: AnyFloats, stance: NDArray[np.intp], following: NDArray[np.intp], share: AnyFloats
     ) -> Complexes:
-        """Compute the path of the ball over the floor: a cubic in the root's frame, at rest at both ends."""
+        """Compute the path of the ball over the floor: a cubic in the root's frame that joins both stances smoothly."""
         path = self.cadence.path
         leaving, landing = path.at(self.leaves_s[stance]), path.at(self.strikes_s[following])
         pitches, rates = self._leaving_pitches[stance], self._leaving_pitch_rates[stance]

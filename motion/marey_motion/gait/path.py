@@ -26,7 +26,7 @@ class PathSegment:
     speed_m_s : speed at its start, metres per second, not negative
     turn_rate_rad_s : change of heading, radians per second; positive turns left
     end_speed_m_s : speed at its end; `speed_m_s` if None
-    travel_angle_rad : direction of travel against the heading: 0 forward, π/2 to the left, π backward
+    travel_angle_rad : direction of travel relative to the heading: 0 forward, π/2 to the left, π backward
     """
 
     duration_s: float
@@ -120,7 +120,7 @@ class RootPath:
 
     @cached_property
     def pieces(self) -> tuple[PathSegment, ...]:
-        """The segments between the two endless pieces that continue the path before and after them."""
+        """All segments, preceded and followed by an endless piece that continues the path beyond its start and end."""
         first, last = self.segments[0], self.segments[-1]
         before = PathSegment(1.0, first.speed_m_s, first.turn_rate_rad_s, None, first.travel_angle_rad)
         after = PathSegment(1.0, last.final_speed_m_s, last.turn_rate_rad_s, None, last.travel_angle_rad)

@@ -129,8 +129,8 @@ def studio_skeleton(stature_m: float = STUDIO_STATURE_M) -> Skeleton:
 def game_skeleton() -> Skeleton:
     """Build a taller figure in an A-pose with other names, proportions and local axes, twist joints and a prop.
 
-    The joints of the trunk and of the left side have x along the bone, the mirrored right side has it against the bone;
-    the root is rotated by a quarter turn about x, as converters from a Z-up world leave it.
+    The x axis of the joints of the trunk and of the left side points along the bone; on the mirrored right side, it
+    points against the bone. The root is rotated by a quarter turn about x, as in files converted from a Z-up world.
 
     Returns
     -------

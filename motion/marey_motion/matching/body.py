@@ -29,8 +29,8 @@ class MatchingBody:
     torso : the joint whose position on the ground is smoothed to make the simulation root: the upper spine, or else the
         hips
     feet, toes : (left, right) ankles, and (left, right) toes; without toe joints, the ankles again
-    lefts, rights : matching joints of both sides, hips and shoulders, from whose differences the facing direction is
-        computed
+    lefts, rights : hips and shoulders of each side, in the same order; the facing direction is computed from their
+        differences
     pose_joints : joints of the pose cost: the joints of `POSE_JOINTS` that the skeleton has, in that order
     partners : (J,) each joint's partner on the other side; joints of the centre have their own index
     standard_joints : joint index by standard name, for all joints of the mapping
@@ -88,7 +88,7 @@ class MatchingBody:
 
     @cached_property
     def pose_chain(self) -> tuple[NDArray[np.int64], Skeleton]:
-        """The pose joints with their ancestors (K,), in the skeleton's order, and the skeleton of these joints."""
+        """Indices (K,) of the pose joints and their ancestors, in the skeleton's order, and the skeleton of these."""
         needed = {0}
         for joint in self.pose_joints:
             while joint > 0:

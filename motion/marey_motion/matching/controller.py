@@ -27,7 +27,7 @@ class Trajectory(Protocol):
 
     @property
     def tick_count(self) -> int:
-        """Number T of ticks to simulate; the arrays have at least T rows."""
+        """Number T of ticks to simulate; the arrays have T + L rows, where L is any number of further ticks, or 0."""
 
     @property
     def positions(self) -> Floats:

@@ -1,7 +1,12 @@
 """The compiled loop of motion matching, kept apart so that importing the rest of the package does not load numba.
 
-Ground positions are (x, z) metres, headings radians growing to the left; `when` is a moment of the desired path, in
-ticks. `index` is a `search.SearchIndex`, `wish`, `rules`, `playback` and `record` are the tuples of `controller`.
+Ground positions are (x, z) in metres; headings are in radians and grow to the left. Parameters with the same name have
+the same meaning in all functions:
+
+* `index` is a `search.SearchIndex`.
+* `wish` is the desired path, a `controller.TrajectoryArrays`; `when` is a moment of this path, in ticks.
+* `rules` is a `controller.ControllerConstants`, and `playback` a `controller.DatabaseArrays`.
+* `record` is a tuple of the arrays of a `TrialRecord`, which are filled.
 """
 
 from __future__ import annotations
@@ -162,9 +167,9 @@ def _search(index, playback, rules, row, query, skip_start, skip_stop):  # type:
 
 @compiled
 def choose(index, playback, rules, row, query):  # type: ignore[no-untyped-def]
-    """Choose the next row; return it, its cost, and the cost of continuing from `row`, NaN if its clip has ended.
+    """Choose the next row; return this row, its cost, and the cost of continuing from `row` (NaN at the end of a clip).
 
-    The query has the pose of `row`, so continuing has only the cost of the trajectory.
+    The pose of the query is that of `row`, so the cost of continuing is only that of the trajectory.
     """
     skip_start = skip_stop = 0
     if rules.window > 0:
@@ -221,7 +226,7 @@ def _advance(playback, rules, row, offsets, root):  # type: ignore[no-untyped-de
 
 @compiled
 def _hold(rules, wish, when, root):  # type: ignore[no-untyped-def]
-    """Pull the root towards the desired one, and limit its distance."""
+    """Pull the root towards the desired position and heading, and limit its distance from the desired position."""
     x, z, heading = _wished(wish, when)
     turn = heading - root[2]
     root[0] += rules.pull * (x - root[0])

@@ -142,9 +142,9 @@ class MatchingDatabase:
 
     The pose of a row is relative to its root. If the root is placed at position p with heading theta, and R(theta) is
     the rotation about +Y, joint 0 is at R(theta)·poses[:3] + (p.x, 0, p.z) with the rotation R(theta)·poses[3:7]. All
-    other joints follow by their local rotations, offsets and translations. With the clip's own root, the result is the
-    clip's pose, for the body's carrier and every joint below it. Joints above the carrier, which in clips may be left
-    behind at an origin, are at rest under the body and have the heading of the root.
+    other joints follow by their local rotations, offsets and translations. If p and theta are those of the clip's own
+    root, the result is the clip's pose of `MatchingBody.carrier` and of every joint below it. Joints above the carrier,
+    which in clips may stay at an origin while the body moves away, are in their rest pose relative to the root instead.
 
     Parameters
     ----------

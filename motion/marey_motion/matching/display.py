@@ -18,7 +18,7 @@ from marey_schemas.options.matching import ControllerOptions
 
 
 def displayed_clip(database: MatchingDatabase, record: TrialRecord, options: ControllerOptions) -> Clip:
-    """Make a clip of a trial: joints are inertialised at every switch, and the root has its recorded positions.
+    """Make a clip that shows a trial: joints are inertialised at every switch; the root has the recorded positions.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def pose_costs(database: MatchingDatabase, rows: NDArray[np.int32], options: Con
 
 
 def switched_rows(database: MatchingDatabase, rows: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Find the row that replaced the displayed one after each tick.
+    """Find the row that a search chose instead of the displayed row at each tick; its successor is displayed next.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Compiled inertialisation of poses, kept apart so that importing the rest of the package does not load numba.
 
 A pose is a row of 3 + 4·J numbers: the position of joint 0 in metres and the rotations (w, x, y, z) of J joints, joint
-0 in the frame of the simulation root, the others in the frames of their parents. Rotations add by multiplying from the
-left; their offsets and velocities are rotation vectors.
+0 in the frame of the simulation root, the others in the frames of their parents. Offsets and velocities of rotations
+are rotation vectors; they are added to a rotation by multiplying from the left.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SMALL = 1e-4
 
 @compiled
 def _exponential(x, y, z):  # type: ignore[no-untyped-def]
-    """Compute the rotation about (x, y, z) by its length in radians."""
+    """Compute the rotation about the axis (x, y, z) by an angle equal to the vector's length, in radians."""
     square = 0.25 * (x * x + y * y + z * z)
     if square < SMALL:
         cosine = 1.0 - square * (1.0 / 2.0 - square * (1.0 / 24.0 - square / 720.0))
@@ -106,7 +106,7 @@ def _take_offsets(shown, shown_places, pose, place, joints, moved, offsets):  # 
 
 @compiled
 def _decay(decay, offsets, velocities):  # type: ignore[no-untyped-def]
-    """Advance all springs by one tick; return whether any offset remains."""
+    """Advance all offsets and their velocities by one tick; return whether any offset remains."""
     left = 0.0
     for k in range(offsets.shape[0]):
         for c in range(3):

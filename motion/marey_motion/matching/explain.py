@@ -34,8 +34,8 @@ POSE_DISTANCE = "pose_distance"
 class Candidate:
     """A row that could be chosen: frame `frame` of clip `clip` (an index into the database's clips).
 
-    `groups` is the cost of each group of features; they add up to `cost`. `barred` is the reason why a listed row could
-    not be chosen, "not selectable" or "too near"; None if it could.
+    `groups` is the cost of each group of features; these costs add up to `cost`. `barred` is the reason why a listed
+    row could not be chosen, "not selectable" or "too near"; None if it could.
     """
 
     row: int

@@ -151,9 +151,9 @@ class Normaliser:
 
 
 def fit_normaliser(features: Floats, layout: FeatureLayout, fitted_on: str) -> Normaliser:
-    """Fit means, and one scale per group: the mean of its standard deviations divided by its weight.
+    """Fit the mean of each dimension and the scale of each group: mean standard deviation of its dimensions / weight.
 
-    Groups that hardly vary get the least scale, and are named in `floored`.
+    Groups that hardly vary get the scale `LEAST_SCALE`, and are listed in `floored`.
 
     Parameters
     ----------

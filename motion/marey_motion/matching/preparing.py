@@ -37,7 +37,7 @@ class PreparedClip:
 
     Parameters
     ----------
-    seam : transition to the next round of a loop whose rows look ahead across it; None if the clip ends
+    seam : transition from the end of a loop to its start, if rows look ahead across it; None if the clip just ends
     mirrored : whether left and right are exchanged
     first_s : time of the first frame in the recording, seconds
     """
@@ -52,7 +52,7 @@ class PreparedClip:
 
     @property
     def uid(self) -> str:
-        """Name of the clip in the database."""
+        """Permanent identifier of the clip in the database."""
         return f"{self.source.uid}~mirrored" if self.mirrored else self.source.uid
 
 
@@ -66,7 +66,7 @@ def prepare_clip(
     source : SourceClip    the clip
     body : MatchingBody    the joints to match
     options : DatabaseOptions    rate and horizons
-    landmarks : Landmarks    joints of the body, for the checks
+    landmarks : Landmarks    joints of the body, by which rest poses and walks in place are detected
 
     Returns
     -------
@@ -114,7 +114,10 @@ def mirror_prepared(clip: PreparedClip, body: MatchingBody, *, keep_notes: bool)
 def _wanted_frames(
     source: SourceClip, body: MatchingBody, options: DatabaseOptions, landmarks: Landmarks, warn: _Warn
 ) -> tuple[Clip, int, bool]:
-    """Cut a clip to its range without rest poses at its ends; return it, its first frame, whether it walks in place."""
+    """Cut a clip to the requested range, without rest poses at the ends.
+
+    Returns the cut clip, the index of its first frame in the source, and whether it walks in place.
+    """
     clip, first = source.clip, 0
     if not _moves(clip, body.skeleton):
         raise MotionError(
@@ -133,7 +136,7 @@ def _wanted_frames(
 
 
 def _moves(clip: Clip, skeleton: Skeleton) -> bool:
-    """Check that a clip can move this skeleton. Tips may differ, and so may offsets that translations replace."""
+    """Check whether a clip fits a skeleton. End sites may differ, and so may offsets that translations replace."""
     own = clip.skeleton
     if own is skeleton:
         return True

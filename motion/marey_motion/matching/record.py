@@ -29,13 +29,14 @@ class TrialRecord:
     Parameters
     ----------
     rate_hz : ticks per second
-    rows : (T,) int32    displayed database row; a row chosen by a search at one tick is displayed at the next
+    rows : (T,) int32    displayed database row; if a search chooses a row at one tick, the successor of this row is
+        displayed at the next tick
     positions : (T, 2) float64    root on the ground, metres
     headings : (T,) float64    radians, continuous
     status : (T,) int8    `Status`
     match_cost : (T,) float64    normalised squared cost of the row that was chosen; NaN at ticks without a search
-    continuing_cost : (T,) float64    the same for continuing the displayed clip; NaN at ticks without a search and
-        after the end of the clip
+    continuing_cost : (T,) float64    cost of continuing the displayed clip, comparable to `match_cost`; NaN at ticks
+        without a search and at the end of the clip
     pose_cost : (T,) float64    metres: distance over the pose joints between the displayed pose, including the
         remaining offsets of earlier switches, and the row displayed next; at the last tick, the row that would follow
     """

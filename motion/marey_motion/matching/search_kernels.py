@@ -2,15 +2,17 @@
 
 `index` is a `marey_motion.matching.search.SearchIndex`; queries are normalised like its rows. Rows are database rows.
 
-Proof that screening in float32 gives the answer of float64 ----------------------------------------------------------
+Proof that screening in float32 gives the same rows and costs as a search in float64 alone:
+
 Let c be the cost of a row in exact arithmetic, c32 the cost computed by the screening, u = 2⁻²⁴, and ‖·‖ the norm with
 the weights. Rounding row and query to float32 moves each by at most u times its norm, hence their distance √c by at
-most u (‖row‖ + ‖query‖) < reach / 2. Each of the D terms of the sum then goes through at most six roundings, and every
-addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded vectors' cost:
+most u (‖row‖ + ‖query‖), which is less than half of `_Query.reach`. Each of the D terms of the sum then goes through at
+most six roundings, and every addition is of nonnegative numbers, so c32 is within (1 ± u)^(D + 8) of the rounded
+vectors' cost:
 
     c32 ≤ (1 + u)^(D + 8) (√c + reach)²
 
-If a row's cost is at most `best`, its c32 is at most the right side with c = best, which is what `_limit` returns, with
+If a row's cost is at most `best`, its c32 is at most the right side with c = best. `_limit` returns this value, with
 four times the margin of each term. So a row above the limit is farther away than the best one and can be skipped; the
 costs of all others are computed again in float64, in the order of the dimensions. A box's float32 bound obeys the same
 inequality, because in exact arithmetic it is at most the cost of every rounded row in the box. This is proven for all
@@ -126,7 +128,7 @@ def _screened_boxes(boxes, query, number, sums, limit):  # type: ignore[no-untyp
 
 @inlined
 def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best among (row, cost), the best so far, and a block's screened rows; also return its limit."""
+    """Compare the best row so far (row, cost) with a block's screened rows; return the best, its cost and its limit."""
     while lanes:
         lane = _lane_of_least(query.sums, lanes)
         if query.sums[lane] > limit:
@@ -143,7 +145,7 @@ def _choose_row(index, query, block, lanes, row, cost, limit):  # type: ignore[n
 
 @inlined
 def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best among (row, cost), the best so far, and the rows of a group; also return its limit."""
+    """Compare the best row so far (row, cost) with the rows of a group; return the best, its cost and its limit."""
     boxes = _screened_boxes(index.boxes, query, group, query.bounds, limit)
     first = index.group_blocks[group]
     boxes &= (1 << (index.group_blocks[group + 1] - first)) - 1
@@ -162,7 +164,7 @@ def _search_group(index, query, group, row, cost, limit):  # type: ignore[no-unt
 def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-def]
     """Search the group with the nearest box first, for a tight limit, then the remaining groups in their order.
 
-    Searching all groups by distance would visit a few per cent fewer, and take longer.
+    Searching all groups in the order of their distance would visit a few per cent fewer groups, but take longer.
     """
     groups = index.boxes.shape[0]
     bounds = np.empty((index.group_boxes.shape[0], LANES), np.float32)
@@ -183,7 +185,7 @@ def _search_boxes(index, query, row, cost, limit):  # type: ignore[no-untyped-de
 
 @compiled
 def _search_blocks(index, query, start, stop, row, cost, limit):  # type: ignore[no-untyped-def]
-    """Find the best among (row, cost), the best so far, and the rows of blocks [start, stop); also return its limit."""
+    """Compare the best row so far (row, cost) with blocks [start, stop); return the best, its cost and its limit."""
     for block in range(start, stop):
         lanes = _screened_rows(index, query, block, limit)
         if lanes:
@@ -236,7 +238,7 @@ def all_costs(index, query, weights, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def boxes_within(index, query, cost):  # type: ignore[no-untyped-def]
-    """Count the blocks with a box as near as `cost`: the least that any order of search must visit."""
+    """Count the blocks whose box is at most `cost` away from the query; any search must visit at least these blocks."""
     prepared = _prepared(index, query, np.ones(query.shape[0]), 0, 0)
     limit = _limit(prepared, cost)
     count = 0

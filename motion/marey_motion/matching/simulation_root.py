@@ -85,7 +85,7 @@ def raw_root(positions: Floats, body: MatchingBody) -> SimulationRoot:
 
 
 def bone_root(motion: Motion, body: MatchingBody) -> SimulationRoot:
-    """Compute the motion of the root joint on the ground, for data in which the root joint guides the character.
+    """Compute the motion of the root joint on the ground, for data whose root joint is meant to steer the character.
 
     Its heading is the heading of the rest pose plus the root's rotation about the vertical.
 

@@ -1,9 +1,9 @@
 """Near-duplicates: clips with nearly the same poses in the same order and nearly the same path of the root.
 
-A frame is compared by points in the frame of its root: the pose joints and the future root at each horizon, so that
-walks with equal poses but different turns differ. The distance of two clips is that of their best alignment in time
-(`alignment.dtw`): the sum over its path of the mean distance between points, divided by the frames of the longer clip,
-in metres. It is 0 for the same frames of clips with equal content.
+Two frames are compared by points relative to the root: the pose joints, and the future root at each horizon, so that
+walks with equal poses but different turns differ. The distance of two clips is computed from their best alignment in
+time (`alignment.dtw`): the mean distance between points is summed over the aligned frames and divided by the number of
+frames of the longer clip. It is in metres, and 0 for the same frames of clips with equal content.
 """
 
 from __future__ import annotations
@@ -119,9 +119,10 @@ class _Families:
         return source_of(self._clips[self._first[number]])
 
     def compared(self, number: int, limit_m: float) -> tuple[list[NearDuplicate], int, int]:
-        """Find near-duplicates of a source among later ones; also count the aligned clips, and all later clips.
+        """Find near-duplicates of a source among later sources; also count the aligned clips, and all later clips.
 
-        Mirroring both clips changes no distance, so one of them is never mirrored.
+        The source is compared with the later sources and with their mirrored copies. Its own mirrored copy is left out:
+        mirroring both clips of a pair does not change their distance.
         """
         one, others = self._first[number], np.arange(self._first[number + 1], len(self._clips))
         near: dict[int, list[NearDuplicate]] = {}
@@ -166,7 +167,8 @@ def spared_sources(
 ) -> tuple[tuple[str, NearDuplicate], ...]:
     """Choose sources to remove so that no pair of near-duplicates is left.
 
-    Of a pair, the source that is displayed less is removed; in a tie the shorter one, then the one with the higher uid.
+    Of each pair, the source that is displayed for fewer ticks is removed; if both are displayed equally, the shorter
+    one, and then the one with the higher uid.
 
     Parameters
     ----------

@@ -86,14 +86,14 @@ def rank_fillings(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[Filling, ...]:
-    """Rank the sources of other collections that contain data the set lacks, the best first.
+    """Rank the sources of other collections that contain data missing from the set, the best first.
 
     Parameters
     ----------
     database : MatchingDatabase    the set
     coverage : Coverage    its coverage
     collections : mapping of str to MatchingDatabase    databases by name, of any skeleton, at the set's frame rate
-    options : EvaluationOptions    grid and least seconds per cell
+    options : EvaluationOptions    grid and minimum seconds per cell
     threshold_m : float    distance up to which a frame can be blended, metres, as in `similarity`
     most_frames : int    frames compared per source
     progress : callable, optional    called as progress(sources done, total, name)
@@ -139,7 +139,7 @@ def plan_fillings(
     fillings : sequence of Filling    result of `rank_fillings`
     coverage : Coverage    coverage of the set
     collections : mapping of str to MatchingDatabase    by name
-    options : EvaluationOptions    grid and least seconds per cell
+    options : EvaluationOptions    grid and minimum seconds per cell
 
     Returns
     -------
@@ -177,7 +177,8 @@ def source_seconds(
 
     Returns
     -------
-    dict of str to (seconds, rows, cells)    by source: seconds (V, O) in each cell, its windows' rows and flat cells
+    dict of str to (seconds, rows, cells)    by source: its seconds (V, O) in each cell; for each of its windows, the
+        first row, and the flat index of the cell, -1 outside the map
     """
     coverage = measure_coverage(database, options)
     rows, cells = window_rows(database, coverage), window_cells(coverage)
@@ -191,7 +192,7 @@ def source_seconds(
 
 
 def _less(missing: Floats, seconds: Floats, options: EvaluationOptions) -> Floats:
-    """Compute the deficit of each cell after adding `seconds` of data; half a frame or less counts as rounding."""
+    """Compute the deficit of each cell after adding `seconds` of data; a deficit below half a frame is set to 0."""
     left = np.maximum(missing - seconds, 0.0)
     left[left < 0.5 / options.database.rate_hz] = 0.0
     return left

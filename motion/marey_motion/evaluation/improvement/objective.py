@@ -24,7 +24,7 @@ def objective_value(weights: ObjectiveOptions, results: Sequence[TrialResult], s
 
     Returns
     -------
-    float    metres: mean offset, speed error, turn rate error, pose cost and seconds, each times its weight
+    float    metres: sum of the mean offset, speed error, turn rate error, pose cost and seconds, each times its weight
     """
     means = headline_means(results)
     return (

@@ -74,7 +74,8 @@ def optimise(
         added (`selection.joined`)
     options : OptimisationOptions    objective and budget
     absent : collection of str    sources that may be added; all other sources are the set
-    log : sequence of OptimisationStep    earlier steps to continue from; `absent` is then the value before these steps
+    log : sequence of OptimisationStep    earlier steps to continue from; `absent` must then list the sources that were
+        absent before the first of these steps
     made : callable, optional    called with every new step
     progress : callable, optional    called as progress(candidates tried, total of this step, uid)
 

@@ -59,15 +59,15 @@ def leave_one_out(
     consider: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> tuple[Removal, ...]:
-    """Measure the effect of leaving out each needed source; the source with the least harm per second of data is first.
+    """Measure the effect of leaving out each source that a trial needs; sort by harm per second of data, least first.
 
     Parameters
     ----------
     simulation : Resimulation    the suite over the set
     objective : ObjectiveOptions    measure of harm
     removed : collection of str    sources that are removed already
-    consider : int, optional    number of sources to try, in the order of the number of trials that need them, then of
-        uid; all if None
+    consider : int, optional    number of sources to try, starting with those that the fewest trials need, then in the
+        order of uids; all if None
     progress : callable, optional    called as progress(sources done, total, uid)
 
     Returns

@@ -1,14 +1,17 @@
 """A suite of trials over parts of one database, in which only affected trials are simulated again.
 
 Clips are removed by making their rows unselectable. The trials are then the same as with a database without these
-clips: a row is displayed only if it was chosen or follows a chosen row of the same clip; a trial depends only on the
-displayed and chosen rows and on the least cost among selectable rows; and since the order of the rows does not change,
-ties are decided the same way.
+clips, for three reasons:
 
-For the same reason, removing clips of which a trial neither displays nor chooses a row leaves the trial bit-identical:
-at every search the cheapest row is still available and still the first of the cheapest, and the trial up to the search
-is the same by induction. So only the trials that need a clip are run again without it. The same is true between any
-part of the database and a smaller part, so results are shared between parts.
+* A row is displayed only if it was chosen or follows a chosen row of the same clip.
+* A trial depends only on the displayed and chosen rows and on the least cost among selectable rows.
+* The order of the rows does not change, so ties are decided the same way.
+
+A trial needs a clip if it displays or chooses one of the clip's rows. Removing clips that a trial does not need leaves
+the trial bit-identical. By induction, the trial is unchanged up to each search; at the search, the cheapest row is
+still available, and still the first among equally cheap rows. So after a removal, only the trials that need a removed
+clip are simulated again. This also holds if the removed clips are taken from a part of the database, so results are
+shared between parts.
 """
 
 from __future__ import annotations

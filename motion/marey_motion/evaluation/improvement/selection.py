@@ -19,7 +19,7 @@ from marey_motion.skeleton import SAME_OFFSET_M, same_hierarchy
 
 
 def source_of(clip: DatabaseClip) -> str:
-    """Return the uid of a clip's source, which is the recorded clip, for a mirrored copy as well.
+    """Return the uid of a clip's source: the clip itself or, for a mirrored copy, the clip that was mirrored.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def joined(first: MatchingDatabase, second: MatchingDatabase) -> MatchingDatabas
 
 
 def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> MatchingDatabase:
-    """Add local translations of these joints to a database, equal to their offsets if the joints have none."""
+    """Store local translations of exactly `joints`; those without translations in the database get their offsets."""
     if joints == database.translated_joints:
         return database
     translations = np.empty((database.row_count, len(joints), 3), np.float32)
@@ -147,8 +147,8 @@ def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> Matchin
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
     """Check whether clips of two databases can be mixed.
 
-    Tips may differ, and so may the offsets of joints that are translated in both databases. A database that is built
-    with the other database's body (`build_database`) has the same skeleton.
+    The end sites of the skeletons may differ, and so may the offsets of joints that are translated in both databases.
+    To make the skeletons equal, build one database with the body of the other (`build_database`).
 
     Parameters
     ----------

@@ -46,7 +46,8 @@ class Suggestions:
     redundant : all clips that were tried, ranked by the harm of their removal per second saved
     plan : a sequence of removals, starting from the set without its unused clips
     spared : near-duplicates to remove, each with its pair, whose other clip stays
-    fillings, additions : clips of other collections, each alone and as a sequence of additions
+    fillings, additions : clips of other collections that fill holes: each measured alone, and a sequence in which each
+        is measured after all earlier ones
     tried : number of needed clips that were left out one at a time, and number of all needed clips
     """
 
@@ -177,5 +178,5 @@ class _Stages:
         return report
 
     def watch(self, stage: str) -> dict[str, Any]:
-        """Make the callbacks of a stage, as keyword arguments."""
+        """Make the keyword arguments `progress` and `cancelled` for a stage."""
         return {"progress": self.within(stage), "cancelled": self._cancelled}

@@ -1,4 +1,4 @@
-"""Evaluations of the same suite with other weights of the feature groups, to find the groups that matter."""
+"""Evaluations of one suite with different weights of the feature groups, to find the groups that matter."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GROUPS = tuple(FeatureWeights.model_fields)
 
 @dataclass(frozen=True)
 class SweepRow:
-    """One setting: its weights, the suite's pooled metrics, their headlines, and the objective in metres."""
+    """Result of one setting: weights, pooled metrics and headline metrics of the suite, and the objective in metres."""
 
     weights: FeatureWeights
     metrics: Metrics
@@ -37,7 +37,7 @@ class SweepRow:
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of one feature group on the objective, from the settings that differ from the first in this group only.
+    """Influence of one feature group on the objective, over the settings that vary only this group's weight.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def sweep_weights(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[SweepRow, ...]:
-    """Run the suite with each setting, with the features and the normaliser's spreads of the database.
+    """Run the suite with each setting of the weights; the features and their standard deviations stay the same.
 
     Progress counts trials over all settings.
 

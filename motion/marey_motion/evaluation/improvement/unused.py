@@ -1,13 +1,18 @@
 """Clips that a suite of trials never needs, and unneeded ranges of clips that are used elsewhere.
 
-Both can be removed from the database and leave every trial bit-identical, as long as the normaliser stays the same;
-`resimulation` explains why for whole clips. A frame of a used clip is unneeded if it is far from every frame that a
-trial displayed or chose: at least `MARGIN_BEFORE_S` before it, or the look-ahead plus `MARGIN_AFTER_S` after it, and
-outside the window in which a search at that frame may not choose. Removing the rows of unneeded frames changes neither
-the needed rows, nor the rows that follow them, nor their features. The margins also contain all frames from which
-filters and differences computed the features of needed frames. If instead the recording itself is cut there, it is
-sampled and filtered again, which rounds differently, and frames near the cut have no frames to look ahead to. The
-result is then nearly, but not exactly, the same, so such a cut is not reported as safe.
+Removing both from the database leaves every trial bit-identical, as long as the normaliser stays the same;
+`resimulation` explains why for whole clips. The needed frames are those that a trial displayed or chose. A frame of a
+used clip is unneeded if it is far from every needed frame, in two respects:
+
+* It is at least `MARGIN_BEFORE_S` before the needed frame, or the look-ahead plus `MARGIN_AFTER_S` after it.
+* It is outside the `reselect_window_s` around the needed frame. Within this window, a search may not choose rows of the
+  displayed clip; a cut there would make them rows of another clip, which may be chosen.
+
+Removing the rows of unneeded frames changes neither the needed rows, nor the rows that follow them, nor their features.
+The margins also contain all frames from which filters and differences computed the features of needed frames. If
+instead the recording itself is cut there, it is sampled and filtered again, which rounds differently, and frames near
+the cut have no frames to look ahead to. The result is then nearly, but not exactly, the same, so such a cut is not
+reported as safe.
 """
 
 from __future__ import annotations
@@ -66,7 +71,7 @@ class UnusedRange:
 
 @dataclass(frozen=True, eq=False)
 class Unused:
-    """Data whose removal changes no trial: whole sources, ranges of other sources, and the rows (N,) of both."""
+    """Data whose removal changes no trial: whole sources, ranges of other sources, and a mask (N,) of their rows."""
 
     clips: tuple[UnusedClip, ...]
     ranges: tuple[UnusedRange, ...]
@@ -86,7 +91,9 @@ def find_unused(
     *,
     index: SearchIndex | None = None,
 ) -> Unused:
-    """Find the sources and frames that no trial needs, the longest first. Loops that wrap are only removed as a whole.
+    """Find the sources and ranges of frames that no trial needs, the longest first.
+
+    A loop is removed only as a whole if playback wraps from its end to its start.
 
     Parameters
     ----------
