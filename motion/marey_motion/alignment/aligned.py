@@ -16,9 +16,9 @@ from marey_motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class Placement:
-    """Original position and heading of a clip's first frame, before the clip was moved to the canonical frame.
+    """Original position and heading of a clip's first frame, before the clip was moved to canonical coordinates.
 
-    A point p of the canonical frame was at R(heading) p + (x, y, z) in the source; R rotates about the vertical axis.
+    A point p in canonical coordinates was at R(heading) p + (x, y, z) in the source; R rotates about the vertical axis.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class AlignedClip:
     ----------
     uid : str    unique among the clips
     name : str    name shown to people; clips are ordered by name, then uid
-    motion : Motion    N frames in the canonical frame: the body begins at x = z = 0 and faces +z. If the root is
+    motion : Motion    N frames in canonical coordinates: the body begins at x = z = 0 and faces +z. If the root is
         static, joints between the root and the joint that carries the body are not translated.
     time_function : (N,) float64    fractional frame of the source (at the set's rate) at each canonical frame;
         strictly increasing from 0 to the last frame of the source

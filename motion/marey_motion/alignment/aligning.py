@@ -1,4 +1,4 @@
-"""Alignment of examples of one action to one canonical frame and one canonical time."""
+"""Alignment of examples of one action in space and time: all get the same canonical coordinates and canonical time."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class SourceExample:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """An example in the canonical frame, resampled to the set's rate."""
+    """An example in canonical coordinates, resampled to the set's rate."""
 
     example: SourceExample
     motion: Motion

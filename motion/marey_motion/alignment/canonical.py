@@ -1,6 +1,4 @@
-"""Conversion of motions to the canonical frame of reference, in which they begin at the origin of the ground and face
-+z.
-"""
+"""Conversion of motions to canonical coordinates, in which they begin at the origin of the ground and face +z."""
 
 from __future__ import annotations
 
@@ -32,7 +30,7 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
     Returns
     -------
-    motion : Motion    F frames in the canonical frame
+    motion : Motion    F frames in canonical coordinates
     placement : Placement    input of `placed`
 
     Raises
@@ -50,11 +48,11 @@ def to_canonical(motion: Motion, body: MatchingBody, *, keep_height: bool = True
 
 
 def placed(motion: Motion, placement: Placement, skeleton: Skeleton) -> Motion:
-    """Move a motion from the canonical frame to its original place: the inverse of `to_canonical`.
+    """Move a motion from canonical coordinates to its original place: the inverse of `to_canonical`.
 
     Parameters
     ----------
-    motion : Motion    F frames in the canonical frame
+    motion : Motion    F frames in canonical coordinates
     placement : Placement    result of `to_canonical`
     skeleton : Skeleton    its skeleton
 

@@ -1,6 +1,6 @@
 """Compiled costs of pairs of frames, kept apart so that importing the rest of the package does not load numba.
 
-Inner loops run along the frames of the second motion, which therefore come last in its arrays.
+Inner loops run over the frames of the second motion, so frames are the last axis of that motion's arrays.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def turned_windows(a, b, window, costs):  # type: ignore[no-untyped-def]
 
 @compiled
 def _slide(history, row, window, sums):  # type: ignore[no-untyped-def]
-    """Fill `sums` (c, m) with sums along diagonals of the pair matrix, over the `window` rows that end at `row`."""
+    """Fill `sums` (c, m) with sums along diagonals of the pair matrix, over `window` rows up to and including `row`."""
     sums[:] = 0.0
     for step in range(window):
         past = history[(row - window + 1 + step) % window]

@@ -229,6 +229,6 @@ def _box_costs(a: Floats, b: NDArray[np.floating], frames_per_box: int) -> Float
 
 
 def _points(a: NDArray[np.floating], b: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Lay out the points of two motions with frames as the first axis of one and the last axis of the other."""
+    """Arrange the points of two motions for kernels: frames are the first axis of one array, the last of the other."""
     require_same_points(a, b)
     return np.ascontiguousarray(a, dtype=np.float64), np.ascontiguousarray(b.transpose(1, 2, 0), dtype=np.float64)

@@ -18,7 +18,7 @@ from marey_motion.errors import AnnotationError
 
 
 class Cut(NamedTuple):
-    """Labelled frame that occurs in every example of an action, such as a keyframe or the border of a segment.
+    """Labelled frame that every example of an action must have, such as a keyframe or the border of a segment.
 
     Parameters
     ----------

@@ -39,7 +39,8 @@ class PrincipalExamples:
     Parameters
     ----------
     functions : FunctionalComponents    the components to keep
-    energy : (r,) float64    cumulative share of the variance, of all r components that the examples have
+    energy : (r,) float64    cumulative share of the variance in the first 1, 2, ... r components; r is the number of
+        all components
     scores : (m, r) float64    scores of the examples on all components, centred
     deviations : (m, n, D) float64    deviations of the examples' coefficients from their mean
     """
@@ -68,8 +69,7 @@ def find_components(
     ----------
     basis : SplineBasis    splines with n coefficients
     coefficients : (m, n, D) float64    coefficients of the examples in `basis`
-    weights : (D,) float64    positive; channels are multiplied by them before the analysis, which is undone in the
-        result
+    weights : (D,) float64    positive factors of the channels in the analysis; the resulting functions are scaled back
     keep : Keep    number of components to keep
     inner_product : str    "coefficients" sums products of coefficients; "l2" integrates products of functions over
         canonical time, so that the result does not depend on the position of the knots (Ramsay and Silverman 2005,
@@ -81,10 +81,11 @@ def find_components(
 
     Notes
     -----
-    There are fewer examples than coefficients. The eigenvectors u of the (m, m) matrix of the examples' inner products
-    therefore give those of the covariance at a fraction of the cost. A direction is the sum of the deviations weighted
-    by u, whatever the inner product; the inner product matters only for the projections that compute scores. The share
-    of variance is of all components. The largest entry of each direction is positive.
+    There are fewer examples than coefficients. Therefore, the eigenvectors u of the (m, m) matrix of the examples'
+    inner products are computed instead of those of the covariance, at a fraction of the cost. A direction is the sum of
+    the deviations weighted by u, whatever the inner product; the inner product matters only for the projections that
+    compute scores. Shares of the variance refer to the variance in all components. The largest entry of each direction
+    is positive.
     """
     examples = len(coefficients)
     if coefficients.shape[1] != basis.count or weights.shape != coefficients.shape[2:]:
@@ -116,7 +117,7 @@ def find_components(
 
 
 def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: InnerProduct) -> Floats:
-    """Compute the coefficients whose elementwise products with others give inner products of the functions.
+    """Compute dual coefficients, whose dot products with a function's coefficients are inner products of functions.
 
     Parameters
     ----------
@@ -134,7 +135,7 @@ def dual_coefficients(basis: SplineBasis, coefficients: Floats, inner_product: I
 def _inner_products(
     basis: SplineBasis, deviations: Floats, mean: Floats, weights: Floats, inner_product: InnerProduct
 ) -> tuple[Floats, float]:
-    """Compute inner products (m, m) of weighted deviations (m, n, D), the size of all examples, and mean (n, D)."""
+    """Compute the inner products (m, m) of the weighted examples' deviations, and the norm of all weighted examples."""
     weighted, weighted_mean = deviations * weights, mean * weights
     if inner_product == "l2":
         root = np.linalg.cholesky(basis.products).T

@@ -109,7 +109,7 @@ class LatentMixture:
 
 
 def _as_share(normal: Floats) -> Floats:
-    """Map standard normal numbers to numbers evenly distributed over 0 to 1."""
+    """Map standard normal numbers to numbers uniformly distributed over 0 to 1."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(normal), dtype=np.float64)

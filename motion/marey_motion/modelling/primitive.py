@@ -107,8 +107,8 @@ class MotionPrimitive:
     name : name of the action
     skeleton : skeleton of the motions, J joints
     frame_rate_hz : rate of the canonical frames
-    spatial : 3 + 4·J channels over canonical frames 0 to N - 1: root translation in metres in the canonical frame, then
-        local quaternions, not of unit length until they are evaluated
+    spatial : 3 + 4·J channels over canonical frames 0 to N - 1: root translation in metres in canonical coordinates,
+        then local quaternions, which are normalised when they are evaluated
     temporal : one channel over the N - 1 steps between canonical frames: the natural logarithm of the number of frames
         of real time, at `frame_rate_hz`, that pass in each step
     temporal_weight : positive factor of the temporal scores in latent vectors
@@ -207,7 +207,8 @@ class MotionPrimitive:
 
         Returns
         -------
-        (m, T, 3 + 4·J) float64    root translation in metres in the canonical frame, then local rotations (w, x, y, z)
+        (m, T, 3 + 4·J) float64    root translation in metres in canonical coordinates, then local rotations (w, x, y,
+            z)
         """
         values = self.spatial.basis.at_frames if times is None else self.spatial.basis.matrix(times)
         poses = values @ self.spatial.coefficients(latents[:, : self.spatial.count])
@@ -218,7 +219,7 @@ class MotionPrimitive:
     def time_functions(self, latents: Floats) -> Floats:
         """Compute the frames of real time that have passed at each canonical frame.
 
-        A motion that would exceed `duration_range_s` is played faster or slower as a whole.
+        A motion whose duration is outside `duration_range_s` is played faster or slower as a whole.
 
         Parameters
         ----------
@@ -265,7 +266,7 @@ class MotionPrimitive:
 
         Returns
         -------
-        list of Motion    at `frame_rate_hz`, in the canonical frame
+        list of Motion    at `frame_rate_hz`, in canonical coordinates
 
         Raises
         ------

@@ -25,7 +25,7 @@ Tree = dict[str, Any]
 
 
 def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -> Tree:
-    """Make part `model` of a primitive.
+    """Convert a primitive to the document of its part `model`.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def primitive_to_tree(primitive: MotionPrimitive, skeleton: Mapping[str, Any]) -
 
 
 def trained_to_tree(trained: TrainedPrimitive, skeleton: Mapping[str, Any], provenance: Mapping[str, Any]) -> Tree:
-    """Make part `model` of a trained primitive, with its training and report.
+    """Convert a trained primitive, its training and its report to the document of its part `model`.
 
     Parameters
     ----------

@@ -68,8 +68,8 @@ def reconstruction_errors(
     Notes
     -----
     Leaving example i out of a principal component analysis subtracts c sᵢsᵢᵀ from the diagonal covariance of the scores
-    s, with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1). Each left-out example therefore is an eigenproblem of
-    the size of the score space, without going back to the coefficients.
+    s, with c = m / (m - 1), and moves the mean to -sᵢ / (m - 1). Each left-out example therefore needs only an
+    eigendecomposition of the size of the score space; the coefficients are not analysed again.
     """
     basis = principal.functions.basis
     frames = comparison_frames(basis)
@@ -126,14 +126,14 @@ def _left_out(scores: Floats, example: int, count: int) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Motions of a score space, at T frames: mean (T, D), directions (r, T, D)."""
+    """Poses at T frames as a linear function of r scores: mean (T, D), directions (r, T, D)."""
 
     skeleton: Skeleton
     mean: Floats
     directions: Floats
 
     def distances(self, scores: Floats, poses: Floats) -> Floats:
-        """Compute the mean distances (c,) of the joints of motions with scores (c, r) to poses (T, D), metres."""
+        """Compute the mean distance (c,) in metres of joints between the motions of scores (c, r) and poses (T, D)."""
         from marey_motion import kinematics
         from marey_motion.modelling import reconstruction_kernels
 

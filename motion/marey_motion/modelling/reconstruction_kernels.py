@@ -1,4 +1,4 @@
-"""Compiled comparison of poses by their joint positions, with its derivative by the poses."""
+"""Compiled comparison of the joint positions of poses, with the derivative of the error with respect to a pose."""
 
 from __future__ import annotations
 
@@ -60,10 +60,11 @@ def mean_distances(poses, parents, offsets, targets, out):  # type: ignore[no-un
 
 @compiled
 def squared_error_gradient(poses, parents, offsets, targets, gradient):  # type: ignore[no-untyped-def]
-    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) by the poses.
+    """Compute the sum of squared distances of joints from targets (F, J, 3), and its gradient (F, D) in the poses.
 
-    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they represent. The
-    gradients of the joints below each joint add up to a force and a torque on it, from the leaves to the root.
+    Quaternions need not be of unit length: the error, and so the gradient, is that of the rotations they represent.
+    From the leaves to the root, the gradients of all joints below a joint are added up to a force and a torque on this
+    joint.
     """
     joints = len(parents)
     local, world = np.empty((joints, 4)), np.empty((joints, 4))

@@ -22,8 +22,8 @@ class FootQuality:
     below_floor_share : share of frames in which at least one foot is under height 0
     below_floor_mean_cm : mean depth of the lowest foot in those frames; 0 if there are none
     lowest_cm : lowest height of a foot in a motion, mean over the motions
-    slide_m_s : mean speed on the ground of feet in the frames where the same feet of most training examples are on the
-        ground
+    slide_m_s : mean horizontal speed of each foot, over the frames in which this foot is on the ground in most training
+        examples
     """
 
     below_floor_share: float
@@ -33,7 +33,7 @@ class FootQuality:
 
 
 def foot_speeds(toes: Floats, time_functions: Floats, frame_rate_hz: float) -> Floats:
-    """Compute the speeds of feet on the ground in steps of canonical time.
+    """Compute the horizontal speeds of feet in each step of canonical time.
 
     Parameters
     ----------

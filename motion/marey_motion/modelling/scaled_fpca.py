@@ -143,7 +143,7 @@ class _Problem:
         return np.asarray(kinematics.forward_kinematics(self.skeleton, poses), dtype=np.float64)
 
     def value_and_gradient(self, logarithms: Floats) -> tuple[float, Floats]:
-        """Compute the mean squared distance in m², and its gradient (3 + J,) by the logarithms of the weights."""
+        """Compute the mean squared distance in m², and its gradient (3 + J,) in the logarithms of the weights."""
         from marey_motion.modelling import reconstruction_kernels
 
         squares = np.exp(2.0 * logarithms)

@@ -68,7 +68,7 @@ def jacobian_weights(skeleton: Skeleton, poses: Floats) -> Floats:
 
 
 def _descent(skeleton: Skeleton) -> Floats:
-    """Make the matrix (J, J) that is 1 where one joint is a descendant of the other, else 0."""
+    """Make the matrix (J, J) that is 1 where the column's joint is a descendant of the row's joint, else 0."""
     below = np.zeros((skeleton.joint_count, skeleton.joint_count))
     for joint, parent in enumerate(skeleton.parents.tolist()):
         if parent >= 0:

@@ -96,7 +96,7 @@ class SplineBasis:
 
         Returns
         -------
-        (m, n) float64    values, per frame to the power of the order
+        (m, n) float64    values of the basis functions; derivatives per frame to the power of the order
         """
         from scipy.interpolate import BSpline
 

@@ -48,7 +48,7 @@ class TrainedPrimitive:
 
 @dataclass(frozen=True, eq=False)
 class FittedExamples:
-    """Examples in modelled form: poses with consistent signs, and the components of space and time."""
+    """Examples prepared for the model: poses with consistent signs, and the spatial and temporal components."""
 
     poses: Floats
     spatial: PrincipalExamples
@@ -148,7 +148,7 @@ def check_examples(aligned: AlignedSet) -> None:
 
 
 def fit_examples(aligned: AlignedSet, options: ModelOptions) -> FittedExamples:
-    """Compute the functional components of space and time.
+    """Compute the functional components of the poses (spatial) and of the time functions (temporal).
 
     Parameters
     ----------

@@ -185,7 +185,7 @@ def _examples(
 
 
 def _at(errors: ReconstructionErrors, components: int) -> int:
-    """Find the index of the errors with this many components; the last index if none was measured with so many."""
+    """Find the index of the errors with `components` components; the last index if fewer were measured."""
     return min(components, len(errors.components) - 1)
 
 
@@ -197,7 +197,7 @@ def _durations(durations: Floats, span: tuple[float, float]) -> Durations:
 def _feet(
     primitive: MotionPrimitive, aligned: AlignedSet, poses: Floats, sampled: Floats | None
 ) -> tuple[FootQuality | None, FootQuality | None]:
-    """Measure the feet in the examples and in samples; None twice if the skeleton has no known feet."""
+    """Measure the feet in the examples and in the samples; None for both if the skeleton has no known feet."""
     joints = find_landmarks(primitive.skeleton).ground_joints
     if not joints:
         return None, None

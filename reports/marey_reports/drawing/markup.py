@@ -19,7 +19,7 @@ Content = str | Html | Iterable["Content"] | None
 
 
 def text(value: str) -> Html:
-    """Escape a text for HTML; replace forbidden characters and controls of the writing direction by U+FFFD."""
+    """Escape a text for HTML; replace forbidden characters and controls of the writing direction with U+FFFD."""
     return escape(_UNSEEN.sub("\ufffd", value))
 
 

@@ -73,7 +73,7 @@ def _section(section: Section) -> Html:
 
 
 def shown(figures: Mapping[str, DrawnFigure], *names: str) -> Html:
-    """Show the named figures, without those that do not exist."""
+    """Make the HTML of the named figures; names without a figure are skipped."""
     return joined(_shown(figures[name], f"f{list(figures).index(name)}") for name in names if name in figures)
 
 

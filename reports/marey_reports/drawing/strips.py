@@ -55,7 +55,7 @@ class StripRow:
 
 
 class StripMoments(NamedTuple):
-    """Columns of a strip: x and z (T, 2) of the point at the centre of each in metres, and their titles and labels."""
+    """Columns of a strip: for each column, x and z (T, 2) of the point at its centre in metres, title and label."""
 
     middles: Floats
     names: Sequence[str]
@@ -192,7 +192,7 @@ def _draw_way(axes: Axes, way: Floats, frame: Rectangle) -> None:
 
 
 class _Shapes(NamedTuple):
-    """A body's bones by side, both joined to long lines (`runs`) and one by one (n, 2); bone and size of its head."""
+    """Shapes of a body: by side, long lines of joined bones (`runs`) and the single bones (n, 2); also its head."""
 
     runs: dict[int, list[Indices]]
     bones: dict[int, Indices]

@@ -1,4 +1,4 @@
-"""Places of the boxes of a directed graph without circles, in layers from left to right.
+"""Positions of the boxes of an acyclic directed graph, in layers from left to right.
 
 The method of Sugiyama, Tagawa and Toda (1981): every box stands to the right of all boxes that have arrows to it; an
 arrow that passes over layers gets a place in each of them; the order within a layer follows the mean positions of the
@@ -31,7 +31,7 @@ class Layout(NamedTuple):
 def lay_out(count: int, arrows: Sequence[tuple[int, int]]) -> Layout:
     """Return the layers of `count` boxes with arrows between them.
 
-    Raises `ValueError` for a circle of arrows, and for arrows that pass more than `MOST_PASSED` layers together.
+    Raises `ValueError` if the arrows form a cycle, or if they pass through more than `MOST_PASSED` layers in total.
     """
     depth = _depths(count, arrows)
     if sum(depth[target] - depth[source] for source, target in arrows) > MOST_PASSED:
@@ -53,7 +53,7 @@ def lay_out(count: int, arrows: Sequence[tuple[int, int]]) -> Layout:
 
 
 def _depths(count: int, arrows: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the layer of each box: sources stand directly before the first box that they have an arrow to."""
+    """Return the layer of each box; a box without incoming arrows is one layer before the first of its targets."""
     before, after = defaultdict(list), defaultdict(list)
     for source, target in arrows:
         before[target].append(source)
@@ -68,7 +68,7 @@ def _depths(count: int, arrows: Sequence[tuple[int, int]]) -> list[int]:
             if not waiting[target]:
                 order.append(target)
     if len(order) < count:
-        raise ValueError("the arrows form a circle")
+        raise ValueError("the arrows form a cycle")
     for box in reversed(order):
         if not before[box] and after[box]:
             depth[box] = min(depth[target] for target in after[box]) - 1

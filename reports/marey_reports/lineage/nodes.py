@@ -15,7 +15,7 @@ MOST_NAMES = 3
 
 
 class Sort(StrEnum):
-    """Meaning of a box."""
+    """Kind of a box: the revision from which the graph starts, other revisions, a job or a commit."""
 
     START = "start"
     ITEMS = "items"
@@ -40,7 +40,7 @@ class Arrow(NamedTuple):
 
 
 def boxes_of(graph: LineageGraph) -> tuple[list[Box], list[Arrow]]:
-    """Return the boxes of a graph, the start first, and the arrows between them."""
+    """Return the boxes of a graph and the arrows between them; the first box is the revision where the graph starts."""
     groups, links = grouped(graph)
     boxes = [_group_box(graph, group, start=index == 0) for index, group in enumerate(groups)]
     arrows: list[Arrow] = []
@@ -58,7 +58,7 @@ def boxes_of(graph: LineageGraph) -> tuple[list[Box], list[Arrow]]:
 
 
 def _into(link: GroupLink, groups: list[LineageGroup], job_boxes: dict[str, int]) -> Arrow:
-    """Return the arrow of a link: into the job that made the result, or into the result if no job made it."""
+    """Return the arrow of a link: it ends at the job that made the result, or at the result if no job made it."""
     return Arrow(link.source, job_boxes.get(groups[link.result].job or "", link.result), _line(link.role))
 
 

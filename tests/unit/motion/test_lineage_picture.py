@@ -138,8 +138,8 @@ def test_arrows_run_from_left_to_right_through_adjacent_layers(arrows: list[tupl
         assert all(node >= 12 for node in route[1:-1])
 
 
-def test_a_circle_of_arrows_is_refused() -> None:
-    with pytest.raises(ValueError, match="circle"):
+def test_a_cycle_of_arrows_is_refused() -> None:
+    with pytest.raises(ValueError, match="cycle"):
         lay_out(3, [(0, 1), (1, 2), (2, 1)])
 
 

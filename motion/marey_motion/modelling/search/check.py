@@ -32,13 +32,13 @@ REFINING = RefineOptions(likelihood_weight=0.01)
 
 @dataclass(frozen=True, eq=False)
 class SearchCheck:
-    """Errors of searches for positions that left-out examples reached, with a model of the other examples.
+    """Errors of searches for positions that left-out examples reached; the model is trained on the other examples.
 
     Parameters
     ----------
     examples, joints : (n,) uid of the example and standard name of the joint whose position is the target
     frames : (n,) canonical frame at which the positions of that joint differ most between the examples
-    searched_cm, refined_cm : (n,) error of the best sample of the tree, and after refining it
+    searched_cm, refined_cm : (n,) error of the best sample of the tree, before and after refining it
     """
 
     examples: tuple[str, ...]

@@ -1,6 +1,7 @@
 """Meaning of constraints for a model: tolerances, canonical frames and joints.
 
-A `Placement` gives the model's canonical frame in the world of the constraints, at its origin by default.
+A `Placement` is the position and heading, in the world of the constraints, at which the model's motions begin; by
+default, they begin at the origin of the world.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def found_motion(steps: Sequence[Step], sequel: Sequel) -> FoundMotion:
 
 
 def _placed(motion: Motion, placement: Placement) -> Motion:
-    """Place a motion of the canonical frame in the world, turned and shifted as a whole."""
+    """Move a motion from canonical coordinates to the world, turned and shifted as a whole."""
     turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), placement.heading_rad)
     origin = np.array((placement.x, placement.y, placement.z))
     roots = quaternions.rotate_vectors(turn, motion.root_translations) + origin
@@ -118,7 +118,7 @@ def _placed(motion: Motion, placement: Placement) -> Motion:
 
 
 def _in_a_row(motions: Sequence[Motion]) -> Motion:
-    """Concatenate motions; of a rotation and its negative, the one nearer to the frame before is taken."""
+    """Concatenate motions; the sign of each quaternion is chosen to be nearer to the quaternion of the frame before."""
     rotations = [motions[0].rotations]
     for motion in motions[1:]:
         agreeing = np.einsum("jc,jc->j", rotations[-1][-1], motion.rotations[0]) >= 0.0

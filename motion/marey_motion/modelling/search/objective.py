@@ -1,4 +1,4 @@
-"""Errors of motions: Equation 1 for many latent vectors, residuals and derivatives for one."""
+"""Errors of motions with respect to constraints: costs of many latent vectors, or residuals and slopes of one."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Objective:
     Parameters
     ----------
     constraints : the m constraints
-    placement : position and heading of the canonical frame in the world of the targets
+    placement : position and heading, in the world of the targets, at which the motions begin
     """
 
     primitive: MotionPrimitive
@@ -108,7 +108,7 @@ class Objective:
         return out
 
     def costs(self, latents: Floats) -> Floats:
-        """Compute Equation 1: the sum over the constraints of weight · error / tolerance.
+        """Sum weight · error / tolerance over the constraints (Herrmann et al. 2019, Equation 1).
 
         Parameters
         ----------
@@ -129,7 +129,8 @@ class Objective:
         ----------
         stacked : (W,) float64    latent vectors one after the other, this step's from `first` on
         first : int    index in `stacked` of the first number of this step
-        placement : (3,) float64    heading, x and z of the canonical frame; replaces the placement of this objective
+        placement : (3,) float64    heading, x and z in the world at which the motion begins; replaces the placement of
+            this objective
         moved : (3, W) float64    derivatives of the placement
 
         Returns
@@ -174,7 +175,7 @@ def build_objective(
     primitive : MotionPrimitive    the model
     constraints : sequence of constraints    m constraints
     standard_joints : mapping of str to int    joint index by standard name, as far as they are known
-    placement : Placement    the canonical frame in the world of the targets
+    placement : Placement    start of the motions in the world of the targets
     also : sequence of Tracked    further points to track; they come first
 
     Returns

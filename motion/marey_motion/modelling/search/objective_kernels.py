@@ -1,7 +1,8 @@
 """Compiled evaluation of constraints, kept apart so that importing the rest of the package does not load numba.
 
-`chains`, `clocks` and `rows` are the tuples of `objective`. Latent vectors are handled one by one, so that results do
-not depend on the number of vectors evaluated at once, or on threads. A placement is (heading, x, z).
+`chains`, `clocks` and `rows` are a `tracking.Chains`, a `tracking.Clocks` and an `objective.Rows`. Latent vectors are
+handled one by one, so that results do not depend on the number of vectors evaluated at once, or on threads. A placement
+is (heading, x, z).
 
 Derivatives of rotations are angular velocities in the world: turning by a small w takes q to (1, w / 2) q.
 """
@@ -66,10 +67,10 @@ def _items(chains, placement, positions, rotations, points, turns):  # type: ign
 
 @compiled
 def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-def]
-    """Fill the seconds since the beginning at each clock, and `log_steps` with the steps that they add up.
+    """Fill `times` with the seconds from the start of the motion to each clock, and `log_steps` with the step lengths.
 
-    Returns the factor of the times that keeps the whole motion within its range, and the motion's seconds without that
-    factor.
+    Returns the factor by which all times are multiplied so that the duration is within its range, and the duration in
+    seconds before this multiplication. On return, `log_steps` contains the lengths in frames, not their logarithms.
     """
     log_steps[:] = clocks.mean
     for component in range(clocks.directions.shape[0]):
@@ -92,7 +93,7 @@ def _times(clocks, latent, first, log_steps, times):  # type: ignore[no-untyped-
 
 @compiled
 def _angle_factors(sine, cosine):  # type: ignore[no-untyped-def]
-    """Compute an angle divided by its sine, and the derivative of this ratio by the cosine."""
+    """Compute an angle divided by its sine, and the derivative of this ratio with respect to the cosine."""
     angle = math.atan2(sine, cosine)
     if angle < _SMALL:
         return 1.0 + angle * angle / 6.0, -1.0 / 3.0

@@ -1,9 +1,10 @@
 """Refinement of latent vectors by Levenberg and Marquardt (Herrmann et al. 2019, Equation 2, as a posterior).
 
-The cost is ½ Σ w (e / σ)² - λ Σ ln p(s): errors in their tolerances, and the likelihood of the motions. For the steps,
-the mixture is replaced by its most likely component at the current vector, whose whitened distance is a residual like
-any other (max-mixture, Olson and Agarwal 2013); the constant of that component does not change the step and is left
-out. A step is accepted if it decreases the cost under the whole mixture.
+The cost is ½ Σ w (e / σ)² - λ Σ ln p(s), with errors e, their tolerances σ and weights w, and the likelihood p of each
+latent vector s. To compute a step, the mixture is replaced by its component that is most likely at the current vector
+(max-mixture, Olson and Agarwal 2013). The whitened distance from this component's mean is then a residual like any
+other; the constant term of its logarithm does not change the step and is left out. A step is accepted if it decreases
+the cost under the whole mixture.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class LeastSquares(Protocol):
 
     @property
     def priors(self) -> Sequence[LatentMixture]:
-        """Mixtures of the latent vectors, one after the other."""
+        """Distribution of each latent vector, in the order in which the vectors are stacked."""
 
     def linearise(self, stacked: Floats) -> tuple[Floats, Floats]:
         """Compute residuals and their derivatives.
@@ -64,7 +65,7 @@ class LeastSquares(Protocol):
         Returns
         -------
         residuals : (r,) float64    errors in multiples of their tolerances
-        derivatives : (r, W) float64    by the latent vectors
+        derivatives : (r, W) float64    of the residuals with respect to the latent vectors
         """
 
 
@@ -122,7 +123,7 @@ def refine(problem: LeastSquares, start: Floats, options: RefineOptions = DEFAUL
 
 
 def _step(curvature: Floats, gradient: Floats) -> Floats | None:
-    """Compute the step to the minimum of a quadratic; None if rounding makes it singular and it needs more damping."""
+    """Compute the step to the minimum of a quadratic; None if it is numerically singular and needs more damping."""
     try:
         step = np.asarray(np.linalg.solve(curvature, -gradient))
     except np.linalg.LinAlgError:

@@ -64,8 +64,9 @@ def search_closely(
 ) -> FoundSamples:
     """Find the best sample, then better latent vectors close to it, by several runs of `search_tree`.
 
-    Each further pass descends the same tree once more, with all samples drawn together about the best motion so far, so
-    that they are a quarter as far apart as in the pass before. A result is about as likely as a sample.
+    Each further pass searches the same tree, but with all samples moved towards the best latent vector so far: the
+    distances between them are a quarter of those in the pass before. The resulting motion is about as likely as a
+    sample.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def search_closely(
 def _descend(
     objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
 ) -> FoundSamples:
-    """Descend a tree in which `drawn` replaces each latent vector by another one."""
+    """Search a tree whose latent vectors are first transformed by the function `drawn`."""
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
     while frontier.size:

@@ -1,8 +1,9 @@
-"""Compiled derivatives of the tracked points and times of constraints by the latent vectors of one or several steps.
+"""Compiled derivatives of the constraints' points and times with respect to the latent vectors of one or more steps.
 
 A step's own latent vector moves its joints through spline, quaternion normalisation and forward kinematics; the latent
-vectors of the steps before it move the placement of its canonical frame. `moved` (3, W) is the derivative of that
-placement (heading, x, z) by all W numbers, of which the step's own begin at `first`.
+vectors of earlier steps move its placement, at which it begins in the world. `moved` (3, W) is the derivative of the
+placement (heading, x, z) with respect to all W numbers of the stacked latent vectors, in which the numbers of the step
+itself begin at `first`.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _SMALL_ANGLE = 1e-3
 
 @compiled
 def _joint_slopes(chains, local, rotations, shifts, spins):  # type: ignore[no-untyped-def]
-    """Fill velocities and angular velocities (V, 3, k) of joints by each score, in the canonical frame."""
+    """Fill derivatives (V, 3, k) of joint positions and rotations with respect to scores, in canonical coordinates."""
     for node in range(chains.parents.shape[0]):
         first, parent = chains.columns[node], chains.parents[node]
         w, x, y, z, length = local[node]
@@ -92,7 +93,7 @@ def track(chains, placement, moved, latent, first, points, turns, point_slopes, 
 
 @compiled
 def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-def]
-    """Add derivatives (3, k) in the canonical frame to the derivatives in the world."""
+    """Convert derivatives (3, k) from canonical to world coordinates, and add them to the derivatives in the world."""
     for score in range(slopes.shape[1]):
         x, z = slopes[0, score], slopes[2, score]
         out[0, first + score] += sign * (cos * x + sin * z)
@@ -102,7 +103,7 @@ def _add_turned(cos, sin, sign, slopes, first, out):  # type: ignore[no-untyped-
 
 @compiled
 def keep_time(clocks, latent, first, times, slopes):  # type: ignore[no-untyped-def]
-    """Fill seconds (n,) at the clocks and their derivatives (n, W); the temporal numbers begin at `first`."""
+    """Fill the seconds (n,) at the clocks and their derivatives (n, W); temporal scores are at `first` and after it."""
     steps = np.empty(clocks.mean.shape[0])
     factor, lasting = _times(clocks, latent, first, steps, times)
     least, most = math.exp(clocks.log_slope_bounds[0]), math.exp(clocks.log_slope_bounds[1])
@@ -182,7 +183,7 @@ def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[
 
 @compiled
 def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives (3, 3) of a constraint's error by its tracked point and its tracked rotation."""
+    """Fill the derivatives (3, 3) of a constraint's error with respect to its tracked point and tracked rotation."""
     kind, item = rows.kinds[row], rows.items[row]
     by_point[:], by_turn[:] = 0.0, 0.0
     if kind == POSITION:

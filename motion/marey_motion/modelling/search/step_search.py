@@ -66,7 +66,7 @@ def search_steps(
     ----------
     steps : sequence of Step    the steps
     trees : sequence of SampleTree    samples of each step's primitive
-    start : Placement    the first step's canonical frame in the world
+    start : Placement    position and heading in the world at which the first step begins
     candidates, passes : int    see `search_closely`
     refining : RefineOptions or None    None to keep the samples that were found
     transitions : TransitionOptions    continuity between steps

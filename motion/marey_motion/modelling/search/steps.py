@@ -1,8 +1,8 @@
 """Sequences of several motions, with constraints on each of them.
 
-Each step's canonical frame is placed so that its first root is where the step before it ended, with the same heading:
-root and heading are continuous whatever the latent vectors are. Continuity of hands, feet and the height of the root is
-a constraint.
+Each step is placed in the world so that its root begins where the root of the previous step ended, with the same
+heading. Therefore, the root's ground position and heading are continuous whatever the latent vectors are. Continuity of
+hands, feet and the height of the root is a constraint.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ DEFAULT_TRANSITIONS = TransitionOptions()
 class CarriedOn(NamedTuple):
     """Start of a step that continues the previous step.
 
-    It consists of its canonical frame, and of the positions of the transition joints by standard name.
+    The fields are the placement at which the step begins in the world, and the positions of the transition joints at
+    that moment, by standard name.
     """
 
     placement: Placement
@@ -62,7 +63,7 @@ class Measured(NamedTuple):
 
     Parameters
     ----------
-    placements : placements of the steps' canonical frames in the world
+    placements : position and heading in the world at which each step begins
     errors : errors (m,) of each step's constraints, in metres, radians or seconds
     jumps_m : for each transition, the distances (1 + joints,) by which the pelvis and the transition joints jump
     """
@@ -77,9 +78,10 @@ class _Link(NamedTuple):
 
     Parameters
     ----------
-    objective : the step's constraints; if there are several steps, its first tracked points are pelvis, facing and
-        transition joints at the step's start, then the same at its end
-    beginning : pelvis and facing at the step's start, by which it is placed at the end of the step before it
+    objective : the step's constraints; if there are several steps, the first tracked points are pelvis, facing and
+        transition joints at the start of the step, followed by those at its end
+    beginning : pelvis and facing at the start of the step, from which its placement at the end of the previous step is
+        computed
     first : index in the stacked latent vectors at which the step's own begins
     """
 
@@ -93,9 +95,10 @@ class _Walked(NamedTuple):
 
     Parameters
     ----------
-    placement : (3,) heading, x and z of the step's canonical frame
+    placement : (3,) heading, x and z in the world at which the step begins
     found : the step's constraints, linearised
-    jumps : (j, 3) metres from the end of the step before it, for pelvis and transition joints; j is 0 for the first
+    jumps : (j, 3) distances in metres, from the end of the previous step, of pelvis and transition joints; j is 0 for
+        the first step
     jump_slopes : (j, 3, W) derivatives of the jumps
     """
 
@@ -112,7 +115,7 @@ class SeveralSteps:
     Parameters
     ----------
     joints : the transition joints that all steps have, by standard name
-    start : placement of the first step's canonical frame
+    start : placement of the first step in the world
     """
 
     links: tuple[_Link, ...]
@@ -129,7 +132,7 @@ class SeveralSteps:
         Parameters
         ----------
         steps : sequence of Step    the steps
-        start : Placement    the first step's canonical frame in the world
+        start : Placement    position and heading in the world at which the first step begins
         transitions : TransitionOptions    continuity between steps
 
         Returns
@@ -183,7 +186,7 @@ class SeveralSteps:
         Returns
         -------
         residuals : (r,) float64    errors in multiples of their tolerances
-        derivatives : (r, W) float64    by the latent vectors
+        derivatives : (r, W) float64    of the residuals with respect to the latent vectors
         """
         walked = list(self._walk(stacked, len(self.links)))
         residuals = [part for one in walked for part in (one.found.residuals, self._scale * one.jumps.ravel())]
@@ -270,7 +273,7 @@ def _link(step: Step, ends: Sequence[Tracked], first: int) -> _Link:
 
 
 def _carry_on(points: Floats, slopes: Floats, link: _Link, stacked: Floats) -> tuple[Floats, Floats]:
-    """Compute the placement (3,) at which a step continues root and facing (2, 3), and its derivatives (3, W)."""
+    """Compute the placement (3,) of a step that continues pelvis and facing `points`, and its derivatives (3, W)."""
     width = len(stacked)
     begun, begun_slopes = np.empty((2, 3)), np.empty((2, 3, width))
     still = np.zeros((3, width))

@@ -68,7 +68,8 @@ class Clocks(NamedTuple):
     ----------
     mean, directions : (N - 1,), (k, N - 1) mean logarithms of steps, and their change per unit of each temporal number
         of a latent vector
-    weights : (n, N - 1) seconds that one frame of each step counts for each moment
+    weights : (n, N - 1) factors that convert the length of each step, in frames, to the seconds of it that have passed
+        at each moment
     frame_s : seconds of one frame
     range_s : (2,) shortest and longest duration of a motion; a longer or shorter one is played faster or slower as a
         whole

@@ -32,8 +32,8 @@ DEFAULT_TREE = TreeOptions()
 class SampleTree:
     """Samples of a primitive, grouped in a tree.
 
-    Nodes come level by level from the root; the children of a node follow one another, and each child has a part of the
-    node's samples. A node without children is a leaf.
+    Nodes are numbered level by level from the root. The children of a node have consecutive numbers, and each child has
+    a part of the node's samples. A node without children is a leaf.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def build_tree(
     primitive : MotionPrimitive    the model
     seed : int    the same seed gives the same tree
     options : TreeOptions    options
-    end_effectors : sequence of int    joint indices, for features of that kind
+    end_effectors : sequence of int    joint indices; used if samples are clustered by the positions of end effectors
 
     Returns
     -------

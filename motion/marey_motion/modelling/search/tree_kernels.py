@@ -111,8 +111,8 @@ def grow(features, randoms, branching, leaf_size, depth, order, starts, sizes, c
     """Split samples (n, D) recursively, level by level; return the number of nodes.
 
     `order` (n,) is permuted so that each node's members are contiguous; `starts`, `sizes` and `children` (nodes,) are
-    filled per node: first member, number of members, number of child nodes. Children of a node follow one another, and
-    nodes of a level come in the order of their parents.
+    filled per node: first member, number of members, number of child nodes. The children of a node have consecutive
+    numbers, and the nodes of a level are in the order of their parents.
     """
     count = features.shape[0]
     room = (np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64))

@@ -118,7 +118,7 @@ def _evaluation_work(objective: Objective) -> float:
 
 
 def _slope_work(objective: Objective, width: int) -> float:
-    """Estimate the work of one motion and its derivatives by `width` numbers."""
+    """Estimate the work of evaluating one motion and its derivatives with respect to `width` numbers."""
     timed = objective.primitive.frame_count * width if len(objective.clocks.weights) else 0
     followed = (len(objective.chains.parents) + len(objective.constraints)) * width
     return float(_PER_LINEARISED_STEP + objective.chains.directions.size + _PER_SLOPE * followed + timed)

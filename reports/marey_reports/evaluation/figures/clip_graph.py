@@ -107,8 +107,8 @@ def _links(subjects: Sequence[Subject], switches: Sequence[Ints]) -> dict[tuple[
 def _lines(subject: Subject, switches: Ints, circles: dict[str, Circle]) -> list[_Line]:
     """Combine the jumps between clips into lines, the most frequent first.
 
-    All jumps from the same range of frames to the same other range form one line. A range is a dot of a circle; if this
-    gave more than `MOST_LINES` lines, a range is several neighbouring dots.
+    All jumps from the same range of frames to the same other range form one line. Each range is one dot of a circle, or
+    several neighbouring dots if there would otherwise be more than `MOST_LINES` lines.
     """
     clips = subject.result.clips
     owners = clips_of_rows(clips, switches[:, :2])

@@ -36,7 +36,7 @@ CATEGORIES = len(COLOURS) * len(MARKERS)
 
 
 class _Points(NamedTuple):
-    """Indices of what is drawn of a subject: windows of its coverage, and the clips that have their own colours."""
+    """Indices of the windows of a subject's coverage that are drawn, and of the clips that have their own colours."""
 
     windows: NDArray[np.int64]
     named: list[int]

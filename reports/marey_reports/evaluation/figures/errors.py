@@ -25,7 +25,7 @@ FINE = 400
 
 
 class _Errors(NamedTuple):
-    """Errors of one quantity over a trial, and both fits."""
+    """Errors of one quantity over a trial, and the two distributions fitted to them."""
 
     values: AnyFloats
     one: Normals

@@ -17,7 +17,7 @@ LEAST_TOP_M = 0.01
 
 
 def draw_transition_costs(subjects: Sequence[Subject], trial: str | None, _options: FigureOptions) -> Sketch:
-    """Draw speeds above and costs below, with a line per subject; marks under the costs are jumps to other places."""
+    """Draw speeds above and costs below, with a line per subject; marks under the costs show where a search jumped."""
     chosen = choose_trial(subjects, trial, ("switching", "circle"))
     views = [view_trial(subject, chosen) for subject in subjects]
     first = views[0].series

@@ -129,7 +129,7 @@ def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64]
 def position_table(
     subject: ModelSubject, frames: NDArray[np.int64], rows: Sequence[tuple[str, Floats]]
 ) -> dict[str, object]:
-    """Make columns of a table from positions (T, P, 3) of joints, in metres in the canonical frame."""
+    """Make columns of a table from positions (T, P, 3) of joints, in metres in canonical coordinates."""
     joints = subject.primitive.skeleton.joint_names
     cells = len(frames) * len(joints)
     places = np.concatenate([points[:, : len(joints)].reshape(-1, 3) for _, points in rows])
