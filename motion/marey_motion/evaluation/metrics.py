@@ -246,7 +246,7 @@ def _response_s(series: TrialSeries, first: int, stop: int) -> float | None:
 
 
 def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Compute the metrics of chosen transitions; jumps forced by the end of a clip do not count."""
+    """Count the transitions that searches chose, and apart from them the ends of clips and restarts of loops."""
     status = record.status[1:][window]
     transitions = float(np.count_nonzero(status == Status.REPLACING))
     return {
@@ -319,9 +319,9 @@ SUMMED = ("transitions", "clip_ends", "response_missed")
 def pooled_metrics(results: Sequence[TrialResult]) -> dict[str, float | None]:
     """Pool the metrics of several trials, and of their regimes under the regime's name.
 
-    A maximum is the largest of all trials, a root mean square the root mean square of the trials' values, and a count
-    the sum. All other metrics are means over the trials that define them. `dse_…_pooled` is the root mean square of the
-    trials' spreads.
+    Maxima are pooled to the largest value of all trials, root mean squares to the root mean square of the trials'
+    values, and counts to their sum. Every other metric is pooled to the mean over the trials in which it is defined.
+    `dse_…_pooled` is the root mean square of the trials' spreads.
 
     Parameters
     ----------

@@ -226,7 +226,7 @@ def treading_share(clips: Sequence[DatabaseClip], records: Sequence[TrialRecord]
 
     Returns
     -------
-    float or None    0 to 1; None if there are no jumps
+    float or None    0 to 1; None if no jump was chosen
     """
     made = back = 0
     for record in records:

@@ -93,7 +93,7 @@ class Provenance:
 
 @dataclass(frozen=True, eq=False)
 class EvaluationResult:
-    """A suite of trials over one database.
+    """Result of a suite of trials over one database.
 
     Parameters
     ----------

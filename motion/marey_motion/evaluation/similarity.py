@@ -121,7 +121,7 @@ def measure_similarity(
 
 
 def every_kth(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Select rows evenly.
+    """Select evenly spaced entries of a list of rows.
 
     Parameters
     ----------

@@ -230,7 +230,7 @@ def _row_notes(clip: PreparedClip, rows: ClipRows) -> tuple[DatabaseNote, ...]:
     if rows.selectable.any() or (clip.mirrored and not clip.notes):
         return ()
     length = counted(len(rows.selectable), "frame")
-    message = f"{clip.source.name}: with {length} too short to look ahead; none can be chosen"
+    message = f"{clip.source.name}: the clip has {length}, too few to look ahead, so none of its rows can be chosen"
     return (DatabaseNote("too-short", message, clip.uid),)
 
 
@@ -244,7 +244,7 @@ def _layout_notes(layout: FeatureLayout) -> tuple[DatabaseNote, ...]:
 
 def _normaliser_notes(normaliser: Normaliser) -> tuple[DatabaseNote, ...]:
     return tuple(
-        DatabaseNote("scale-floored", f"{group} hardly varies in these clips; its scale was raised to the least one")
+        DatabaseNote("scale-floored", f"{group} hardly varies in these clips; its scale was raised to the minimum")
         for group in normaliser.floored
     )
 

@@ -24,7 +24,7 @@ from marey_motion.motion import Motion
 from marey_schemas.options.matching import DatabaseOptions
 
 CLAMPED_S = 1 / 3
-"""Seconds at the end of a clip that searches may not choose, because their look-ahead is cut at the last frame."""
+"""Seconds before the end of a clip in which searches may not choose rows, because the look-ahead is cut off there."""
 
 
 class ClipRows(NamedTuple):

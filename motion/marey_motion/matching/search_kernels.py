@@ -36,7 +36,7 @@ _SMALLEST = 1e-36
 
 
 class _Query(NamedTuple):
-    """A query during its search: in float64, in float32 padded to the index's dimensions, with space for 16 sums."""
+    """A query during its search: in float64, and in float32 padded to the index's dimensions; arrays for 16 sums."""
 
     exact: Any
     exact_weights: Any
@@ -101,14 +101,14 @@ def _prepared(index, query, weights, skip_start, skip_stop):  # type: ignore[no-
 
 @inlined
 def _limit(query, best):  # type: ignore[no-untyped-def]
-    """Compute the float32 cost that no row as near as `best` can exceed."""
+    """Compute an upper bound of the float32 costs of all rows whose exact cost is at most `best`."""
     distance = np.sqrt(best) + query.reach
     return np.float32(distance * distance * query.margin + query.least)
 
 
 @inlined
 def _lane_of_least(sums, lanes):  # type: ignore[no-untyped-def]
-    """Find the lane, among those given as bits, that holds the least sum."""
+    """Find the lane with the least sum among the lanes whose bits are set in `lanes`."""
     best = -1
     for lane in range(LANES):
         if lanes >> lane & 1 and (best < 0 or sums[lane] < sums[best]):

@@ -14,7 +14,7 @@ from marey_motion.modelling.splines import SplineBasis
 from marey_schemas.options.modelling import DEFAULT_INNER_PRODUCT, InnerProduct
 
 SMALLEST_RELATIVE_DEVIATION = 2e-7
-"""Share of the largest singular value below which others are rounding errors: the Gram matrix has their squares."""
+"""Share of the largest singular value below which a singular value is a rounding error: the Gram matrix has squares."""
 
 SMALLEST_RELATIVE_SPREAD = 1e-11
 """Examples that differ from their mean by less than this share of their size are copies of one example."""

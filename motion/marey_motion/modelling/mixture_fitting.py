@@ -39,7 +39,7 @@ class MixtureCandidate:
     smallest_weight : float    the least weight of a component
     converged : bool    whether the fit converged
     refusal : str    reason for excluding the mixture whatever its criterion: "small-component" if a component has too
-        few examples, "held-out" if unseen examples are less likely than with one component
+        few examples, "held-out" if held-out examples are not more likely than with one component
     """
 
     components: int
@@ -91,9 +91,9 @@ def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed:
     """Fit a mixture to latent vectors.
 
     With no more than d + 1 examples a full covariance is singular; one component then has a covariance shrunk towards a
-    sphere (Ledoit and Wolf 2004). Otherwise numbers of components are compared by their criterion. A number is excluded
-    if a component has fewer examples than dimensions (or than 5), or if it makes held-out examples less likely than one
-    component does.
+    sphere (Ledoit and Wolf 2004). Otherwise, mixtures with different numbers of components are compared by
+    `options.criterion`. A number is excluded if one of the components has fewer than d + 1 examples, or fewer than 5,
+    or if held-out examples are not more likely than under a single component.
 
     Parameters
     ----------

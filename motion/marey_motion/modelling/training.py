@@ -233,13 +233,13 @@ def _assemble(
 
 
 def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
-    """Compute the range of durations of samples: the range of the examples, extended by a fifth."""
+    """Compute the range of durations of samples: the range of the examples, with a fifth less and a fifth more."""
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
 
 
 def _log_slope_range(aligned: AlignedSet, temporal: PrincipalExamples) -> tuple[float, float]:
-    """Compute the range of the logarithms of the examples' time steps, extended by a twentieth of a step.
+    """Compute the range of the logarithms of the examples' time steps, extended by `LOG_SLOPE_MARGIN` at both ends.
 
     Examples rebuilt from the kept components count as well, so that the limits change no rebuilt example.
     """

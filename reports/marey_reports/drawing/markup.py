@@ -24,10 +24,10 @@ def text(value: str) -> Html:
 
 
 def element(tag: str, /, *content: Content, **attributes: str | None) -> Html:
-    """Return an element.
+    """Make an HTML element.
 
-    In names of attributes, an underscore at the end is dropped, and others become hyphens. Attributes that are None are
-    omitted.
+    In the names of attributes, an underscore at the end is dropped, and other underscores are replaced with hyphens.
+    Attributes that are None are omitted.
     """
     parts = [tag]
     for key, value in attributes.items():

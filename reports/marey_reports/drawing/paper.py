@@ -188,7 +188,7 @@ def shortened(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def reach(values: NDArray[np.floating[Any]], wanted: float) -> float:
-    """Choose the end of an axis: from `wanted` to twice `wanted`, so that only few extreme values lie beyond it."""
+    """Choose the end of an axis between `wanted` and twice `wanted`; the most extreme values may lie beyond it."""
     if not len(values):
         return wanted
     most = float(np.quantile(values, 0.98))

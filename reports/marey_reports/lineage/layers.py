@@ -1,8 +1,8 @@
 """Positions of the boxes of an acyclic directed graph, in layers from left to right.
 
 The method of Sugiyama, Tagawa and Toda (1981): every box stands to the right of all boxes that have arrows to it; an
-arrow that passes over layers gets a place in each of them; the order within a layer follows the mean positions of the
-neighbours.
+arrow that passes over layers gets a node in each of them; the nodes of a layer are sorted by the mean positions of
+their neighbours.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import NamedTuple
 SWEEPS = 12
 """Number of times that the order of all layers is improved."""
 MOST_PASSED = 100_000
-"""Greatest number of layers that all arrows pass together."""
+"""Greatest number of layers that arrows pass through, summed over all arrows."""
 
 
 class Layout(NamedTuple):
     """Nodes by layer, in their order from top to bottom, and for each arrow the nodes that it passes.
 
-    Nodes below the number of boxes are boxes; the others are places that arrows pass through.
+    Nodes are numbers: those below the number of boxes are the boxes, and the others are points that arrows pass
+    through.
     """
 
     layers: list[list[int]]

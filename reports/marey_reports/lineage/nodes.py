@@ -32,7 +32,7 @@ class Box(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """An arrow between two boxes, named by their positions, with its label."""
+    """An arrow between two boxes, which are identified by their indices, with its label."""
 
     source: int
     target: int

@@ -26,7 +26,7 @@ ProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class NearDuplicate:
-    """Two sources of nearly the same motion; if `mirrored`, one is nearly the mirror image of the other.
+    """Two source clips with nearly the same motion; if `mirrored`, one is nearly the mirror image of the other.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def find_near_duplicates(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> NearDuplicates:
-    """Find all pairs of sources whose distance is at most the threshold.
+    """Find all pairs of source clips whose distance is at most the threshold.
 
     The result is exact: lower bounds of the distance rule out most pairs without alignment. Progress counts sources.
 
@@ -165,7 +165,7 @@ def frame_points(database: MatchingDatabase) -> NDArray[np.float64]:
 def spared_sources(
     database: MatchingDatabase, duplicates: NearDuplicates, ticks: dict[str, int]
 ) -> tuple[tuple[str, NearDuplicate], ...]:
-    """Choose sources to remove so that no pair of near-duplicates is left.
+    """Choose source clips to remove so that no pair of near-duplicates is left.
 
     Of each pair, the source that is displayed for fewer ticks is removed; if both are displayed equally, the shorter
     one, and then the one with the higher uid.

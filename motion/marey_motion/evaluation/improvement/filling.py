@@ -36,7 +36,7 @@ class FilledCell:
 
 @dataclass(frozen=True)
 class Filling:
-    """A source that would fill holes, with its mirrored copy if its collection contains one.
+    """A source clip that would fill holes, together with its mirrored copy if its collection contains one.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def rank_fillings(
     progress: ProgressCallback | None = None,
     cancelled: CancelCallback | None = None,
 ) -> tuple[Filling, ...]:
-    """Rank the sources of other collections that contain data missing from the set, the best first.
+    """Rank the source clips of other collections that contain data missing from the set, the best first.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def plan_fillings(
     collections: Mapping[str, MatchingDatabase],
     options: EvaluationOptions,
 ) -> tuple[Addition, ...]:
-    """Order candidates: each step adds the best candidate for the still missing data, until no candidate provides any.
+    """Order candidates: each step adds the one that is best for the data still missing, until none provides any.
 
     Candidates of another skeleton come after all others.
 
@@ -168,7 +168,7 @@ def plan_fillings(
 def source_seconds(
     database: MatchingDatabase, options: EvaluationOptions
 ) -> dict[str, tuple[Floats, NDArray[np.int64], NDArray[np.int64]]]:
-    """Compute the data of each source in each cell of the trial grid.
+    """Compute the data of each source clip in each cell of the trial grid.
 
     Parameters
     ----------

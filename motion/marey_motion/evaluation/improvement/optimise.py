@@ -66,7 +66,7 @@ def optimise(
     made: Callable[[OptimisationStep], None] | None = None,
     progress: ProgressCallback | None = None,
 ) -> Optimisation:
-    """Remove and add sources until no step lowers the objective or the budget is spent.
+    """Remove and add source clips until no step lowers the objective or the budget is spent.
 
     Parameters
     ----------

@@ -141,7 +141,7 @@ class Resimulation:
         return NONE.union(*(outcome.needed for outcome in self.outcomes(removed)))
 
     def leaves_rows(self, removed: Collection[str]) -> bool:
-        """Check whether a selectable row is left without some sources.
+        """Check whether a selectable row remains after some sources are removed.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class Resimulation:
 
         Returns
         -------
-        bool    True if a row is left
+        bool    True if a row remains
         """
         return bool(np.any(self.database.selectable & ~rows_of_sources(self.database.clips, removed)))
 

@@ -41,7 +41,7 @@ MARGIN_AFTER_S = MARGIN_BEFORE_S
 
 @dataclass(frozen=True)
 class UnusedClip:
-    """A source that no trial needs: neither the clip itself nor its mirrored copy."""
+    """A source clip that no trial needs: neither the clip itself nor its mirrored copy."""
 
     source: str
     name: str
