@@ -60,7 +60,7 @@ def _knots(path: NDArray[np.integer]) -> tuple[Floats, Floats]:
 
 
 def _with_least_slope(times: Floats) -> Floats:
-    """Find the nearest times, by least squares of their steps, with the same ends and no step below the least slope."""
+    """Find times with the same ends and no step below the least slope, whose steps are nearest in least squares."""
     steps, least = np.diff(times), LEAST_SLOPE + _SLACK
     if steps.min() >= LEAST_SLOPE:
         return times

@@ -187,8 +187,8 @@ def cell_edges(values: Sequence[float], step: float) -> Floats:
 def symmetry(speeds: Floats, turn_rates_deg_s: Floats, speed_edges: Floats, turn_edges: Floats) -> float:
     """Compute how equally left and right turns are covered: 1 for equal coverage, 0 if only one side is covered.
 
-    The value is 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h, where h is the number of windows in a cell of speed v and turn rate
-    ω; it is 1 if there is no data.
+    The value is 1 - ½ Σ|h(v, ω) - h(v, -ω)| / Σ h, summed over the cells, where h is the number of windows in the cell
+    of speed v and turn rate ω; without data, it is 1.
 
     The cells are those of the map and, if the grid contains only one side, also their mirror images.
 

@@ -7,7 +7,8 @@ A trial counts as followed if the character meets three limits, on average over 
 * its turn rate differs from the desired turn rate by at most 10 degrees a second.
 
 The share of followed trials gives the grade: from 90 % very good, from 70 % good, from 40 % usable in part, below that
-poor. Clips generated for every cell of the default grid follow 95 % of its trials, so the best grade can be reached.
+poor. With clips generated for every cell of the default grid, 95 % of the trials are followed, so the best grade can be
+reached.
 """
 
 from __future__ import annotations

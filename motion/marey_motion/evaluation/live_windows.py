@@ -80,7 +80,7 @@ class LiveWindows:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the take so far."""
+        """Number of frames received in the current take."""
         return int(self._take.counters[0])
 
     @property
@@ -99,7 +99,7 @@ class LiveWindows:
         return Windows(*window)
 
     def receive(self, frames: Floats) -> Windows:
-        """Add frames.
+        """Add the next frames of the take.
 
         Parameters
         ----------

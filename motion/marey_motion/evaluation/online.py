@@ -132,7 +132,7 @@ class OnlineCoverage:
         return self._add(positions[:, body.torso, ::2], forward_vectors(positions, body.lefts, body.rights))
 
     def add_roots(self, positions: Floats, headings: Floats) -> Windows:
-        """Add unsmoothed positions of the torso and headings of the body.
+        """Add the next frames, given as unsmoothed positions of the torso and headings of the body.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Digests of the content and conditions of an evaluation, by which two evaluations can be compared."""
+"""Digests of the content and conditions of an evaluation, which show whether two evaluations are comparable."""
 
 from __future__ import annotations
 

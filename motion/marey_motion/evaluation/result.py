@@ -50,7 +50,7 @@ class ClipUsage:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Speeds and turn rates of the clips, by windows of one second.
+    """Speeds and turn rates of the clips in windows of one second, and the seconds of data in each cell of the grid.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class Trial:
     """One trajectory to follow: straight for `approach_s`, then a circle, or a chain of arcs whose speed switches.
 
     Speeds are in m/s; `turn_rate_rad_s` is positive to the left. `switch_speed_m_s` and `switch_every_s` are used by
-    the switching family only; its first interval begins with the circle.
+    the switching family only; the first interval begins with the circle.
     """
 
     family: Family
@@ -75,7 +75,7 @@ class Reference:
     ----------
     tick_count : number T of ticks of the trial itself; the arrays have L more rows, for the look-ahead
     positions : (T + L, 2) float64    metres on the ground
-    headings, speeds_m_s, turn_rates_rad_s : (T + L,) float64
+    headings, speeds_m_s, turn_rates_rad_s : (T + L,) float64    headings in radians, continuous
     """
 
     rate_hz: float

@@ -206,7 +206,7 @@ class Footfalls:
 
     @cached_property
     def lifts_m(self) -> AnyFloats:
-        """Greatest clearance, in metres, of the step that follows each stance but the last."""
+        """Greatest clearance between foot and floor, in metres, in the step after each stance except the last."""
         way = np.abs(np.diff(self.footholds)) + 0.3 * np.abs(np.diff(self.middles.headings))
         highest = styles.clearance_m(0.5 * (self.middles.speeds[1:] + self.middles.speeds[:-1]))
         return np.asarray(self.cadence.style.lift * highest * -np.expm1(-way / SHORT_STEP_M))

@@ -178,7 +178,9 @@ def _ordered(clips: Sequence[SourceClip]) -> list[SourceClip]:
     for clip, following in pairwise(ordered):
         if clip.uid == following.uid:
             raise MotionError(
-                f"{clip.name} and {following.name} have the same uid {clip.uid}", code="uid-repeated", where=clip.name
+                f"{clip.name} and {following.name} have the same uid {clip.uid}; each clip needs a different one",
+                code="uid-repeated",
+                where=clip.name,
             )
     return ordered
 

@@ -87,13 +87,13 @@ def _progress(wish, when, x, z):  # type: ignore[no-untyped-def]
 
 @compiled
 def _moment(rules, wish, when, tick, x, z):  # type: ignore[no-untyped-def]
-    """Compute the moment of the desired path, in ticks, that counts as the present."""
+    """Compute the moment of the desired path, in ticks, that corresponds to `tick` or to the position (x, z)."""
     return _progress(wish, when, x, z) if rules.follow == BY_PATH else float(tick)
 
 
 @compiled
 def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (T,) with the moment of the desired path that counted as the present at each tick of a trial."""
+    """Fill `out` (T,) with the moment of the desired path, in ticks, that corresponds to each tick of a trial."""
     when = 0.0
     for tick in range(positions.shape[0]):
         if tick > 0:

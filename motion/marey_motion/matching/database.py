@@ -77,7 +77,7 @@ def root_motion(
 
 @dataclass(frozen=True, eq=False)
 class SourceClip:
-    """A clip that goes into a database.
+    """A clip from which rows of a database are computed.
 
     Parameters
     ----------

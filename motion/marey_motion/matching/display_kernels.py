@@ -125,8 +125,8 @@ def inertialised(  # type: ignore[no-untyped-def]
 
     `poses` (N, 3 + 4·J) and the local translations `places` (N, L, 3) are those of the database. `joints` (K,) and
     `moved` (M,) are indices of the wanted joints and translations. `rows` (T,) are displayed at each tick. `cuts` (T,)
-    are the rows that replace the displayed rows after their ticks, or -1. `decay` (2, 2) advances offsets and
-    velocities by one tick.
+    are the rows that replace the displayed rows after each tick, or -1 where a clip continues. `decay` (2, 2) advances
+    offsets and velocities by one tick.
     """
     offsets = np.zeros((1 + moved.shape[0] + joints.shape[0], 3))
     velocities = np.zeros_like(offsets)

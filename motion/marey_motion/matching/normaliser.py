@@ -107,7 +107,7 @@ class Normaliser:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Normaliser:
-        """Convert a tree of `as_tree` to a normaliser.
+        """Convert the result of `as_tree` to a normaliser.
 
         Parameters
         ----------

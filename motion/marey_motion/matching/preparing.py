@@ -1,4 +1,4 @@
-"""The frames of a source clip that a database uses, at the database's rate."""
+"""Preparation of source clips: the frames that a database uses, resampled to the database's rate."""
 
 from __future__ import annotations
 

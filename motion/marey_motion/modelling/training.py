@@ -36,7 +36,8 @@ class TrainedPrimitive:
 
     Parameters
     ----------
-    weights : (3 + 4·J,) factors of the channels in the analysis; undone in the primitive
+    weights : (3 + 4·J,) factors by which channels were multiplied in the analysis; the primitive itself is in the
+        original units
     """
 
     primitive: MotionPrimitive
@@ -233,7 +234,7 @@ def _assemble(
 
 
 def _sampled_range(aligned: AlignedSet) -> tuple[float, float]:
-    """Compute the range of durations of samples: the range of the examples, with a fifth less and a fifth more."""
+    """Compute the allowed range of durations of samples: a fifth beyond the range of the examples at both ends."""
     durations = aligned.time_functions[:, -1] / aligned.frame_rate_hz
     return float(durations.min()) * (1.0 - DURATION_MARGIN), float(durations.max()) * (1.0 + DURATION_MARGIN)
 

@@ -35,8 +35,8 @@ class ExampleReport:
     ----------
     log_likelihood : natural logarithm of its density
     held_out_log_likelihood : its log-likelihood under a mixture fitted without it; None if it was not requested
-    left_out_error_cm : mean distance of its joints from their reconstruction by components of the other examples; as
-        many components as the model has
+    left_out_error_cm : mean distance of its joints from their reconstruction by the components of the other examples,
+        with as many components as the model has
     outlier : whether its likelihood is much lower than those of the others
     """
 

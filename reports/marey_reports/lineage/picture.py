@@ -96,7 +96,7 @@ def _escaped(text: str) -> str:
 
 
 def _places(boxes: list[Box], layout: Layout) -> dict[int, _Rectangle]:
-    """Place the layers from left to right; the nodes of a layer from top to bottom, around the middle."""
+    """Place the layers from left to right, and the nodes of each layer from top to bottom, centred vertically."""
 
     def size(node: int) -> tuple[float, float]:
         if node >= len(boxes):
@@ -143,7 +143,7 @@ def _draw_box(axes: Axes, box: Box, place: _Rectangle) -> None:
 
 
 def _draw_arrow(axes: Axes, arrow: Arrow, route: list[_Rectangle]) -> None:
-    """Draw an arrow as a smooth line through the places of its route; its label stands near its start."""
+    """Draw an arrow as a smooth line through the nodes of its route, with the label near the start of the line."""
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 

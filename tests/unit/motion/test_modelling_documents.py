@@ -107,7 +107,7 @@ def test_splines_whose_degree_is_not_told_are_cubic() -> None:
 
 def test_a_model_of_other_joints_is_refused() -> None:
     tree = primitive_to_tree(train_primitive(bending_chains()).primitive, SKELETON)
-    with pytest.raises(MotionError, match="not the skeleton's: bone_4"):
+    with pytest.raises(MotionError, match="the model and the skeleton differ: bone_4"):
         primitive_from_tree(tree, chain(5))
     with pytest.raises(MotionError, match="marey/motion@1"):
         primitive_from_tree({**tree, "schema": "marey/motion@1"}, chain())

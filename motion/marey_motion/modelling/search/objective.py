@@ -64,7 +64,7 @@ class Linearised(NamedTuple):
     ----------
     points : (n, 3) the tracked points in the world, metres
     point_slopes : (n, 3, W) their derivatives
-    residuals : (3 m,) three numbers for each of m constraints: its error divided by its tolerance, multiplied by the
+    residuals : (3 m,) three numbers for each of m constraints: its error divided by its tolerance, times the square
         root of its weight
     slopes : (3 m, W) derivatives of the residuals
     """

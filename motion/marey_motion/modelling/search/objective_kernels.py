@@ -193,7 +193,7 @@ def errors(chains, clocks, rows, placement, latents, out):  # type: ignore[no-un
 
 @compiled
 def costs(prices, errors, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (n,) with sums of errors (n, rows) times `prices` (rows,), which are weights over tolerances."""
+    """Fill `out` (n,) with sums of errors (n, rows) times `prices` (rows,), which are weights divided by tolerances."""
     for n in range(out.shape[0]):
         total = 0.0
         for row in range(prices.shape[0]):

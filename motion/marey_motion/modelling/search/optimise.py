@@ -38,7 +38,8 @@ class Refined:
     latents : (W,) refined latent vectors, one after the other
     cost : the minimised cost at `latents`
     start_cost : the cost at the start
-    iterations, evaluations : number of steps that were tried; number of motions that were evaluated, also for slopes
+    iterations, evaluations : number of steps that were tried; number of motions that were evaluated, including those
+        for derivatives
     """
 
     latents: Floats
@@ -137,7 +138,7 @@ class _Quadratic(NamedTuple):
 
 
 class _Prior:
-    """-λ ln p of stacked latent vectors."""
+    """Negative log-likelihood -λ ln p of stacked latent vectors."""
 
     def __init__(self, mixtures: Sequence[LatentMixture], weight: float) -> None:
         self._mixtures = mixtures

@@ -26,7 +26,7 @@ class FoundSamples:
     ----------
     samples : (t,) indices of the samples in the tree; -1 for latent vectors that a further pass found between samples
     latents : (t, L) latent vectors
-    costs : (t,) costs by Equation 1
+    costs : (t,) costs as in `Objective.costs`
     evaluations : number of motions that were evaluated
     """
 

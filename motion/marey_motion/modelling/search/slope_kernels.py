@@ -160,7 +160,10 @@ def _orientation_slope(residual, by_turn):  # type: ignore[no-untyped-def]
 
 @compiled
 def _aim_slopes(pointing, wanted, distance, by_point, by_turn):  # type: ignore[no-untyped-def]
-    """Fill the derivatives of angle / sin(angle) · (pointing × wanted); `distance` is 0 if no point is involved."""
+    """Fill the derivatives of the rotation vector angle / sin(angle) · (pointing × wanted).
+
+    `distance` is the distance of the point to look at, or 0 for a constraint without such a point.
+    """
     across = np.empty(3)
     sine = _crossed(pointing, wanted, across)
     cosine = pointing[0] * wanted[0] + pointing[1] * wanted[1] + pointing[2] * wanted[2]

@@ -36,7 +36,8 @@ class Sequel:
     ----------
     latents : one latent vector (L,) per step
     measured : their placements and errors
-    joints : standard names of the transition joints; `jumps_m` lists the jump of the pelvis, then those of these joints
+    joints : standard names of the transition joints; `Measured.jumps_m` lists the jump of the pelvis, then those of
+        these joints
     searched : result of the search in each tree
     sampled : placements and errors before refining
     refined : result of refining, None if it was not requested

@@ -59,7 +59,7 @@ class CarriedOn(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Errors of latent vectors.
+    """Errors of the motions of some latent vectors.
 
     Parameters
     ----------

@@ -97,7 +97,11 @@ def find_record(subject: Subject, name: str) -> TrialRecord:
     if name not in names:
         raise MotionError(f"the evaluation has no trial {name!r}", code="unknown-trial")
     if len(subject.result.records) != len(names):
-        raise MotionError("this figure needs the records of the trials", code="records-missing", where=name)
+        raise MotionError(
+            "this figure needs the records of all trials, but the evaluation does not contain them",
+            code="records-missing",
+            where=name,
+        )
     return subject.result.records[names.index(name)]
 
 

@@ -28,7 +28,7 @@ def draw_search_check(subject: ModelSubject) -> Sketch | None:
 
 
 def draw_search_errors(searched_cm: Floats, refined_cm: Floats, *, about: str = "") -> Sketch:
-    """Draw the errors at n targets: after the search of the sample tree, and after the refinement of what it found.
+    """Draw the errors at n targets: after the search of the sample tree, and after refinement of the found motions.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ class ModelSubject:
     ----------
     primitive : the model
     examples : aligned examples that it was trained on
-    report : its quality
+    report : quality of the model
     check : accuracy of searches, if it was measured
     seed : seed of the drawn samples
     """
