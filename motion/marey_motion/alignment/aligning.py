@@ -125,8 +125,8 @@ def align_clips(
     options : AlignOptions, optional    options; `options.reference` may be the uid of an example
     threads : int    threads to use
     progress : callable, optional    called as progress(done, total, note)
-    on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned;
-        the example is left out. If None, the first such error is raised.
+    on_refusal : callable, optional    called as on_refusal(example, error) for each example that cannot be aligned; the
+        example is left out. The error is raised instead if `on_refusal` is None or the example is the reference.
 
     Returns
     -------

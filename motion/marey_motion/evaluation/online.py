@@ -149,7 +149,7 @@ class OnlineCoverage:
         """
         if positions.shape != (len(headings), 2) or not np.all(np.isfinite(headings)):
             raise MotionError(
-                f"each position needs one heading, but there are {len(headings)} headings and positions of "
+                f"each position needs one finite heading, but there are {len(headings)} headings and positions of "
                 f"shape {positions.shape}",
                 where="roots",
             )
@@ -280,7 +280,9 @@ class OnlineCoverage:
 
 def _require_near(positions: Floats) -> None:
     if not float(np.max(np.abs(positions), initial=0.0)) <= FARTHEST_M:
-        raise MotionError(f"the position in a frame is more than {FARTHEST_M:g} m from the origin", where="positions")
+        raise MotionError(
+            f"a position is not a number, or it is more than {FARTHEST_M:g} m from the origin", where="positions"
+        )
 
 
 def _directions(facing: Floats, before: Floats | None) -> Floats:

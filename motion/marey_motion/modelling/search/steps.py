@@ -97,8 +97,8 @@ class _Walked(NamedTuple):
     ----------
     placement : (3,) heading, x and z in the world at which the step begins
     found : the step's constraints, linearised
-    jumps : (j, 3) distances in metres, from the end of the previous step, of pelvis and transition joints; j is 0 for
-        the first step
+    jumps : (j, 3) displacements of pelvis and transition joints, in metres, from the end of the previous step to the
+        start of this one; j is 0 for the first step
     jump_slopes : (j, 3, W) derivatives of the jumps
     """
 
