@@ -27,8 +27,8 @@ class Clip:
     frame_rate_hz : float    frames per second
     poses : (F, 3 + 4·J) float32    absolute root translation in metres, which replaces the root's offset, then one
         unit local rotation (w, x, y, z) per joint in the skeleton's order
-    translations : (F, k, 3) float32, optional    metres in the parent's frame; replace the offsets of
-        `translated_joints`. None if only the root is translated.
+    translations : (F, k, 3) float32, optional    positions of `translated_joints` in their parents' frames, in metres;
+        they replace the offsets of these joints. None if only the root is translated.
     translated_joints : tuple of int    increasing indices of the k joints with translations, never the root
 
     Raises
@@ -173,7 +173,7 @@ def _frozen(values: NDArray[np.generic], field: str, ndim: int) -> NDArray[np.fl
 
 
 def _surely_unit(rotations: NDArray[np.float32]) -> bool:
-    """Return whether rotations (F, J, 4) certainly have unit length, in half the time of the full check."""
+    """Check quickly whether all rotations (F, J, 4) have unit length; after False, the full check decides."""
     with np.errstate(over="ignore"):  # the check names the rotation
         squares = rotations * rotations
     lengths = squares[..., 0] + squares[..., 1]

@@ -19,7 +19,7 @@ from marey_schemas.documents.references import OutputRef, RevisionRef
 
 
 def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
-    """Convert a skeleton to its part `hierarchy`.
+    """Convert a skeleton to a `hierarchy` document, in which a skeleton's joints are stored.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ def skeleton_to_document(skeleton: Skeleton) -> skeletons.SkeletonHierarchy:
 
 
 def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
-    """Convert a `hierarchy` part to a skeleton.
+    """Convert a `hierarchy` document to a skeleton.
 
     Parameters
     ----------
-    document : SkeletonHierarchy    the part
+    document : SkeletonHierarchy    the document
 
     Returns
     -------
@@ -78,7 +78,7 @@ def skeleton_from_document(document: skeletons.SkeletonHierarchy) -> Skeleton:
 
 
 def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.MotionDocument:
-    """Convert a clip to its part `motion`.
+    """Convert a clip to a `motion` document, in which a clip's frames are stored.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def clip_to_document(clip: Clip, skeleton: RevisionRef | OutputRef) -> clips.Mot
 
 
 def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert a clip to its part `motion` as plain values and arrays, without validation.
+    """Convert a clip to the content of a `motion` document, as plain values and arrays, without validation.
 
     Parameters
     ----------
@@ -127,12 +127,12 @@ def clip_to_tree(clip: Clip, skeleton: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def clip_from_document(document: clips.MotionDocument, skeleton: Skeleton) -> Clip:
-    """Convert a `motion` part to a clip, with its rotations in the skeleton's order.
+    """Convert a `motion` document to a clip, with the rotations in the order of the skeleton's joints.
 
     Parameters
     ----------
-    document : MotionDocument    the part
-    skeleton : Skeleton    its skeleton
+    document : MotionDocument    the document
+    skeleton : Skeleton    the skeleton to which the document refers
 
     Returns
     -------
@@ -170,7 +170,7 @@ def layer_to_document(
     name: str,
     made_by: Literal["person", "algorithm"] = "person",
 ) -> annotation_documents.Annotation:
-    """Convert an annotation layer to its part `annotation`.
+    """Convert an annotation layer to an `annotation` document.
 
     Parameters
     ----------
@@ -193,11 +193,11 @@ def layer_to_document(
 
 
 def layer_from_document(document: annotation_documents.Annotation, frame_count: int) -> Layer:
-    """Convert an `annotation` part to a layer.
+    """Convert an `annotation` document to a layer.
 
     Parameters
     ----------
-    document : Annotation    the part
+    document : Annotation    the document
     frame_count : int    frames of the annotated clip
 
     Returns
@@ -216,11 +216,11 @@ def layer_from_document(document: annotation_documents.Annotation, frame_count: 
 
 
 def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) -> skeletons.SkeletonMapping:
-    """Convert a joint mapping with its axes to the part `mapping` of a skeleton.
+    """Convert a joint mapping and the axes of its joints to a `mapping` document.
 
     Parameters
     ----------
-    mapping : JointMapping    standard joints
+    mapping : JointMapping    joint names by standard name
     axes : mapping of str to JointAxes    axes by joint name
 
     Returns
@@ -240,18 +240,18 @@ def mapping_to_document(mapping: JointMapping, axes: Mapping[str, JointAxes]) ->
 def mapping_from_document(
     document: skeletons.SkeletonMapping, skeleton: Skeleton
 ) -> tuple[JointMapping, dict[str, JointAxes]]:
-    """Convert a `mapping` part, which people may have edited, to a mapping and its axes.
+    """Convert a `mapping` document, which a person may have edited, to a joint mapping and the axes of its joints.
 
     Axes are normalised, and the swing axis is made perpendicular to the twist axis.
 
     Parameters
     ----------
-    document : SkeletonMapping    the part
-    skeleton : Skeleton    its skeleton
+    document : SkeletonMapping    the document
+    skeleton : Skeleton    the skeleton whose joints are mapped
 
     Returns
     -------
-    mapping : JointMapping    standard joints
+    mapping : JointMapping    joint names by standard name
     axes : dict of str to JointAxes    axes by joint name
 
     Raises

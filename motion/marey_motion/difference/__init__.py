@@ -1,1 +1,1 @@
-"""Differences between two revisions of an item, in terms of motion."""
+"""Comparison of two revisions of an item: of their motions, skeletons, annotations and models."""

@@ -44,12 +44,12 @@ def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
 
     Parameters
     ----------
-    exceeds : (n,) bool    whether the change of each matched frame exceeds it
+    exceeds : (n,) bool    whether the change in each matched frame exceeds the threshold
     course : Course    the matched frames
 
     Returns
     -------
-    tuple of ranges    half open and in order; ranges less than `JOINED_S` apart are joined
+    tuple of ranges    half open and in order; ranges less than `JOINED_S` seconds apart are joined
     """
     frames = course.frames[exceeds]
     if not len(frames):
@@ -66,15 +66,15 @@ def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
 def joint_changes(
     names: Sequence[str], changes: NDArray[np.floating], course: Course, *, threshold: float, noise: float
 ) -> tuple[JointChange, ...]:
-    """Describe the changes of joints that exceed the noise.
+    """Describe the changes of each joint whose largest change exceeds the noise.
 
     Parameters
     ----------
-    names : sequence of str    J joints
-    changes : (n, J) float    degrees or centimetres, for each matched frame
+    names : sequence of str    names of J joints
+    changes : (n, J) float    change of each joint in each matched frame, in degrees or centimetres
     course : Course    the matched frames
-    threshold : float    change above which the times are listed
-    noise : float    largest change that is ignored
+    threshold : float    frames in which a joint changes by more than this are listed
+    noise : float    joints whose changes are all at most this large are left out
 
     Returns
     -------
@@ -93,19 +93,19 @@ def joint_changes(
 def path_change(
     joint: str, before: Floats, after: Floats, course: Course, threshold_cm: float, move: Move | None
 ) -> PathChange | None:
-    """Describe the change of a path.
+    """Describe the change of a joint's path.
 
     Parameters
     ----------
     joint : str    joint whose path is compared
-    before, after : (n, 3) float64    its positions in matched frames, metres
+    before, after : (n, 3) float64    positions of the joint in matched frames, metres
     course : Course    the matched frames
-    threshold_cm : float    distance above which the times are listed
-    move : Move or None    movement of the whole path
+    threshold_cm : float    frames whose positions are farther apart than this are listed
+    move : Move or None    movement of the whole path from `before` to `after`
 
     Returns
     -------
-    PathChange or None    None if all positions are equal
+    PathChange or None    None if all positions are equal, apart from rounding
     """
     distances = CM_PER_M * np.linalg.norm(after - before, axis=1)
     if not len(distances) or distances.max() <= NOISE_CM:
@@ -119,7 +119,7 @@ def path_change(
 
 
 def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, object]:
-    """Compute the fields of `Exceeding` for the changes of a joint or of a path."""
+    """Compute mean and maximum of the changes, the frame of the maximum, and the ranges above the threshold."""
     at = int(np.argmax(changes))
     return {
         "mean": float(changes.mean()),
@@ -130,11 +130,11 @@ def _exceeding(changes: Floats, course: Course, threshold: float) -> dict[str, o
 
 
 class Move(NamedTuple):
-    """Movement on the ground and along the vertical.
+    """Rigid movement in the world: a turn about the vertical axis through the origin, then a shift.
 
     Parameters
     ----------
-    turn_rad : float    turn about the vertical axis through the origin, left positive
+    turn_rad : float    angle of the turn, positive to the left
     shift_m : (3,) float64    shift after the turn
     """
 
@@ -142,7 +142,7 @@ class Move(NamedTuple):
     shift_m: Floats
 
     def applied(self, positions: Floats) -> Floats:
-        """Move positions.
+        """Apply the movement to positions.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class Move(NamedTuple):
 
 
 def whole_move(before: Floats, after: Floats) -> Move | None:
-    """Find the movement of a whole path, by least squares.
+    """Find the rigid movement that takes a path nearest to another one, by least squares.
 
     Parameters
     ----------
@@ -166,7 +166,8 @@ def whole_move(before: Floats, after: Floats) -> Move | None:
 
     Returns
     -------
-    Move or None    None if a movement of the whole path leaves more than `UNEXPLAINED` of the change
+    Move or None    None if the paths are equal, or if more than the share `UNEXPLAINED` of their mean distance remains
+        after the movement
     """
     change = np.linalg.norm(after - before, axis=1)
     if not len(change) or CM_PER_M * change.max() <= NOISE_CM:

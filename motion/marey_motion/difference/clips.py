@@ -43,19 +43,20 @@ def compare_clips(
 ) -> tuple[MotionDifference, DifferencePlot | None]:
     """Describe the differences between two clips.
 
-    Frames are matched by content, so that a removed or inserted frame does not change the frames after it. Rotations,
-    paths and translations are compared over the matched frames, of the joints that both skeletons have.
+    Frames are matched by content, so that the frames after a removed or inserted frame do not count as changed. In the
+    matched frames, the rotations, paths and translations of the joints that both skeletons have are compared.
 
     Parameters
     ----------
     before, after : Clip    clips of the same or of different skeletons
-    options : DifferenceOptions, optional    sizes of changes above which their times are listed
-    plot : bool    whether to compute values to draw
+    options : DifferenceOptions, optional    thresholds; the frames of larger changes are listed
+    plot : bool    whether to compute the data of a plot, too
 
     Returns
     -------
     difference : MotionDifference    in degrees and centimetres
-    plot : DifferencePlot or None    changes of rotations over time, and paths of the root
+    plot : DifferencePlot or None    changes of rotations over time, and paths of the body on the ground; None unless
+        requested
 
     Examples
     --------
@@ -93,7 +94,7 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, among the paired joints, of the first moving joint, whose path counts as that of the body."""
+    """Return the index, among the paired joints, of the first joint that moves; its path represents the body's."""
     if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
         return 0
     for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):
@@ -104,7 +105,7 @@ def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
 
 
 def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
-    """Return the poses of some joints, in the given order, with the positions of one joint in the world."""
+    """Return the rotations of `joints`, in this order, and the positions of the joint `carrier` in the world."""
     whole = joints == tuple(range(clip.skeleton.joint_count))
     positions = clip.root_translations if carrier == 0 else np.ascontiguousarray(global_positions(clip)[:, carrier])
     return Poses(positions, clip.rotations if whole else clip.rotations[:, list(joints)])
@@ -126,7 +127,7 @@ def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timi
 def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Floats]:
     """Return the positions (n, 3) of the body in matched frames of the old and of the new clip.
 
-    Those of the old clip are returned as they were before `move` was applied to it.
+    If `move` was applied to the old clip, the positions before this movement are returned.
     """
     pairs = timing.matching.pairs
     before = timing.before.roots[pairs[:, 0]].astype(np.float64)
@@ -175,7 +176,7 @@ def _translations(clip: Clip, joint: int) -> NDArray[np.floating]:
 def _plot(
     names: list[str], rotations: NDArray[np.float32], pairs: Ints, before: Poses, after: Poses, frame_rate_hz: float
 ) -> DifferencePlot:
-    """Reduce changes and paths to the size of a plot."""
+    """Make the data of a plot, with at most `MOST_ROWS` rows of changes and `MOST_POINTS` points of each path."""
     largest = rotations.max(axis=0, initial=0.0)
     shown = np.sort(np.argsort(-largest, kind="stable")[:MOST_PLOTTED_JOINTS])
     rows = min(MOST_ROWS, after.frame_count)

@@ -1,4 +1,4 @@
-"""Differences between documents: fields with other values, and the training of models."""
+"""Differences between documents: fields whose values differ, and differences in the training of models."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def changed_values(before: Any, after: Any, pointer: str = "") -> Iterator[Chang
     Parameters
     ----------
     before, after : JSON values and arrays    the documents
-    pointer : str    JSON pointer of the values in their documents
+    pointer : str    JSON pointer to `before` and `after` in the documents that contain them
 
     Yields
     ------
@@ -121,15 +121,15 @@ def _shown(value: Any) -> Any:
 
 
 def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> ModelDifference:
-    """Describe the differences between the trainings of two models.
+    """Describe how the training of two models differs.
 
     Parameters
     ----------
-    before, after : mapping    parts `model`, also of older versions
+    before, after : mapping    `model` documents, of the current or an older version of their schema
 
     Returns
     -------
-    ModelDifference    examples, and the mean likelihood if it is stored
+    ModelDifference    added and removed examples, and both mean log likelihoods, None where a model does not store it
     """
     old, new = _examples(before), _examples(after)
     return ModelDifference(
@@ -141,7 +141,7 @@ def compare_models(before: Mapping[str, Any], after: Mapping[str, Any]) -> Model
 
 
 def _examples(model: Mapping[str, Any]) -> dict[Any, str]:
-    """Return the names of the training examples by their revisions, or by their names in models without revisions."""
+    """Map the revision of each training example to its name; without stored revisions, map each name to itself."""
     provenance = model.get("provenance") or {}
     aligned = provenance.get("aligned") or ()
     if all(isinstance(one, Mapping) and {"item", "revision"} <= one.keys() for one in aligned) and aligned:

@@ -110,7 +110,7 @@ def likely_pace(before: Poses, after: Poses) -> float:
 
     Returns
     -------
-    float    frames after for each frame before, to about 3 %
+    float    number of frames of the new clip per frame of the old clip, with an error of about 3 %
     """
     stride = max(1, max(before.frame_count, after.frame_count) // DECIMATED)
     source, target = (
@@ -144,7 +144,7 @@ def _stretched(window: Floats, count: int) -> Floats:
 
 
 def _features(poses: Poses) -> Floats:
-    """Return random projections (F, `CHANNELS`) of the rotations, with the root's height and its steps."""
+    """Return columns (F, `CHANNELS` + 4): random projections of the rotations, the root's height, and its steps."""
     rotations = poses.rotations * np.where(poses.rotations[..., :1] < 0.0, -1.0, 1.0)
     flat = rotations.reshape(poses.frame_count, -1).astype(np.float64)
     projection = np.random.default_rng(0).normal(size=(flat.shape[1], CHANNELS)) / np.sqrt(CHANNELS)
@@ -161,7 +161,7 @@ def _body_hashes(poses: Poses) -> NDArray[np.uint64]:
 
 
 def _one_sided(rotations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return rotations as rows (F, 4·J); each quaternion gets the sign with which its w is not negative."""
+    """Return rotations as rows (F, 4·J); quaternions with a negative w are negated."""
     signs = np.where(rotations[..., :1] < 0.0, np.float32(-1.0), np.float32(1.0))
     return np.asarray(rotations * signs, dtype=np.float32).reshape(len(rotations), -1)
 

@@ -31,7 +31,7 @@ def compare_annotations(before: Annotation, after: Annotation) -> AnnotationDiff
 
     Parameters
     ----------
-    before, after : Annotation    the parts `annotation`
+    before, after : Annotation    the two documents
 
     Returns
     -------
@@ -71,7 +71,7 @@ def _of_keyframes(annotation: Annotation) -> list[Segment]:
 
 
 def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[int | None, int | None]]:
-    """Match the entries of two ordered lists, and return the indices of each pair; None stands for no partner.
+    """Match the entries of two ordered lists; return the indices of each pair, with None where an entry has no match.
 
     The entries that both lists have in common at their beginning and at their end are not returned.
     """
@@ -81,7 +81,8 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
     old, new = before[head : len(before) - tail], after[head : len(after) - tail]
     if len(old) * len(new) > MOST_PAIRS:
         raise AnnotationError(
-            f"{len(old):,} and {len(new):,} entries differ, which are too many to compare", code="too-many-entries"
+            f"the annotations differ in {len(old):,} and {len(new):,} entries, which are too many to compare",
+            code="too-many-entries",
         )
     labels = {one.label: number for number, one in enumerate((*old, *new))}
     columns = [
@@ -95,7 +96,7 @@ def _match(before: Sequence[Segment], after: Sequence[Segment]) -> list[tuple[in
 
 
 def _pair_costs(before: Ints, after: Ints) -> Floats:
-    """Return the costs (n, m) of pairs of entries, whose columns are label, start and end."""
+    """Return the costs (n, m) of pairing n with m entries, given as rows of label number, start and end."""
     same = before[:, None, 0] == after[None, :, 0]
     costs = np.minimum(
         _range_costs(before, after), SHIFTED + _range_costs(before + _common_shift(before, after), after)
@@ -124,7 +125,7 @@ def _common_shift(before: Ints, after: Ints) -> Ints:
 
 
 def _cheapest_pairs(costs: Floats) -> list[tuple[int | None, int | None]]:
-    """Match rows and columns in order at the least cost; a row or column alone costs `ALONE`."""
+    """Match rows and columns in order at the least cost; each row or column without a match costs `ALONE`."""
     rows, columns = costs.shape
     steps = ALONE * np.arange(columns + 1)
     totals = np.empty((rows + 1, columns + 1))

@@ -1,8 +1,8 @@
-"""Matching of the frames of two clips: the monotone sequence of runs of corresponding frames that has the least cost.
+"""Matching of the frames of two clips, in runs of frames, at the least cost.
 
-Within a run, the numbers of corresponding frames differ by a constant, the lag. Between runs, frames are removed or
-inserted. The runs are the cheapest path through the candidates for lags, so frames that follow an insertion remain
-matched, and still or cyclic motion has no more runs than needed.
+A run consists of consecutive frames of both clips, whose frame numbers differ by a constant, the lag. Between runs,
+frames are removed or inserted. Candidates for the lags are found first; the runs are then the cheapest path through
+them. Frames that follow an insertion therefore remain matched, and still or cyclic motion has no more runs than needed.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class Matching(NamedTuple):
 
 
 def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matching:
-    """Match the frames of two clips of the same pace.
+    """Match the frames of two clips in which the motion has the same speed in frames.
 
     Parameters
     ----------
     before, after : Poses    n and m frames of the same joints
-    search : bool    whether to search for similar frames if equal frames do not explain the clip
+    search : bool    whether to search for similar frames if some frames of `before` have no nearly equal match
 
     Returns
     -------
@@ -75,7 +75,10 @@ def _poorly_matched(matching: Matching, count: int) -> Ints:
 
 
 class _Diagonal(NamedTuple):
-    """All pairs of frames with one lag; `start` and `stop` limit frames of the old clip; `costs` are cumulative."""
+    """All pairs of frames with the same lag; the frames of the old clip are [start, stop).
+
+    `costs` are the cumulative costs of the pairs, from 0 to the sum of all.
+    """
 
     lag: int
     start: int
@@ -121,7 +124,10 @@ def _end_cost(one: _Diagonal, count_before: int, count_after: int) -> float:
 
 
 def _entered(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int) -> Floats:
-    """Return, before each frame of a diagonal and at its end, the least cost of entering it from another diagonal."""
+    """Return the least costs of paths that change from another diagonal to diagonal `place`.
+
+    There is one cost for each frame of the diagonal, for a change just before that frame, and one for its end.
+    """
     one = diagonals[place]
     least = np.full(len(one.costs), np.inf)
     for other, values in zip(diagonals, reached, strict=True):
@@ -157,7 +163,10 @@ def _traced(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: in
 
 
 def _origin(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: int, frame: int) -> tuple[int, int]:
-    """Return the diagonal from which the path enters another one at a frame, and the frame where it leaves."""
+    """Find where the cheapest path comes from that enters diagonal `place` at `frame`.
+
+    Returns the index of the previous diagonal, and the frame of the old clip at which the path leaves that diagonal.
+    """
     one = diagonals[place]
     best, origin = np.inf, (place, frame)
     for number, (other, values) in enumerate(zip(diagonals, reached, strict=True)):
@@ -171,7 +180,7 @@ def _origin(diagonals: Sequence[_Diagonal], reached: Sequence[Floats], place: in
 
 
 def _without_replacements(matching: Matching) -> Matching:
-    """Leave out pairs that differ entirely over several consecutive frames."""
+    """Remove runs of at least `SHORTEST_REPLACEMENT` consecutive pairs whose two frames differ entirely."""
     differing = matching.costs >= 2.0 * UNMATCHED - 1e-9
     edges = np.flatnonzero(np.diff(np.concatenate(([0], differing.astype(np.int8), [0]))))
     starts, stops = edges[::2], edges[1::2]

@@ -24,11 +24,11 @@ _FAR_CHORD = 2.0 * np.sin(np.radians(FAR_DEG) / 4.0)
 
 
 class Poses(NamedTuple):
-    """F frames of J joints that both clips have.
+    """F frames of one clip, reduced to the J joints that both compared clips have.
 
     Parameters
     ----------
-    roots : (F, 3) float32    positions of the root in metres
+    roots : (F, 3) float32    positions in the world of the joint that carries the body, usually the root, in metres
     rotations : (F, J, 4) float32    local rotations of unit length (w, x, y, z)
     """
 
@@ -86,11 +86,11 @@ def rotation_changes_deg(before: Poses, after: Poses, pairs: AnyInts) -> NDArray
 
 
 def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
-    """Compute the costs of paired frames, by which frames are matched.
+    """Compute the cost of matching the two frames of each pair.
 
-    Each joint costs min(angle / `FAR_DEG`, 1), and the root costs min(distance / `FAR_M`, 1) in addition. A joint that
-    was edited a lot therefore adds no more than its share. If the mean m of these costs is not 0, the cost of the pair
-    is `UNEQUAL` + (1 - `UNEQUAL`)·m.
+    Each joint costs min(angle / `FAR_DEG`, 1), and the root costs min(distance / `FAR_M`, 1) in addition. This limits
+    the contribution of a joint that was edited a lot. If the mean m of these costs is not 0, the cost of the pair is
+    `UNEQUAL` + (1 - `UNEQUAL`)·m.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def frame_costs(before: Poses, after: Poses, pairs: AnyInts) -> Floats:
 
 
 def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, Floats]:
-    """Estimate the offset in time, in frames, between paired frames.
+    """Estimate for each pair of frames how far apart in time their poses are, from distances and velocities.
 
     Parameters
     ----------
@@ -121,9 +121,8 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
 
     Returns
     -------
-    offsets : (n,) float64    number of frames by which the pose of a frame of `after` occurs later in `before` than the
-        frame paired with it
-    weights : (n,) float64    reliability: squared speeds, 0 where nothing moves
+    offsets : (n,) float64    for a pair (i, j): pose j of `after` occurs in `before` near frame i + offset
+    weights : (n,) float64    reliability of each offset: the squared speed in `before`, 0 where nothing moves
     """
     offsets, weights = np.zeros(len(pairs)), np.zeros(len(pairs))
     for start in range(0, len(pairs), BLOCK):
@@ -138,7 +137,7 @@ def time_offsets(before: Poses, after: Poses, pairs: AnyInts) -> tuple[Floats, F
 
 
 def _steps(first: Poses, second: Poses, rows: AnyInts, others: AnyInts) -> NDArray[np.float32]:
-    """Return the differences (n, J, 4) of rotations, each with the sign that makes it small."""
+    """Return the differences (n, J, 4) of quaternions; the sign of the second one is chosen to make them small."""
     a, b = first.rotations[rows], second.rotations[others]
     signs = np.where(np.einsum("fjc,fjc->fj", a, b) < 0.0, np.float32(-1.0), np.float32(1.0))
     return np.asarray(b * signs[..., None] - a, dtype=np.float32)

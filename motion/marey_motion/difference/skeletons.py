@@ -145,11 +145,11 @@ def compare_mappings(before: SkeletonMapping, after: SkeletonMapping) -> Mapping
 
     Parameters
     ----------
-    before, after : SkeletonMapping    the parts `mapping`
+    before, after : SkeletonMapping    the two documents
 
     Returns
     -------
-    MappingDifference    standard joints that are mapped to another joint, and joints with other axes
+    MappingDifference    standard joints that are mapped to different joints, and joints whose axes differ
     """
     standards = dict.fromkeys((*before.joints, *after.joints))
     joints = ((name, before.joints.get(name), after.joints.get(name)) for name in standards)

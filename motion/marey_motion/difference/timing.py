@@ -34,27 +34,27 @@ GREATEST_PACE = 16.0
 
 
 class Pace(NamedTuple):
-    """Sampling of a clip.
+    """Rate and start at which a stored clip is sampled.
 
     Parameters
     ----------
-    frames : float    frames of the sampled clip for each frame of the stored clip
-    phase : float    place of the first sampled frame, in frames of the stored clip
+    frames : float    number of samples per frame of the stored clip
+    phase : float    place of the first sample, in frames of the stored clip
     """
 
     frames: float
     phase: float = 0.0
 
     def places(self, frames: AnyInts | Floats) -> Floats:
-        """Return the places of sampled frames in the stored clip.
+        """Return the places of samples in the stored clip.
 
         Parameters
         ----------
-        frames : (n,)    numbers of sampled frames
+        frames : (n,)    numbers of samples, from 0
 
         Returns
         -------
-        (n,) float64    frames of the stored clip
+        (n,) float64    fractional frame numbers of the stored clip
         """
         return np.asarray(self.phase + frames / self.frames, dtype=np.float64)
 
@@ -84,7 +84,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
     Returns
     -------
-    Timing    correspondence at the ratio of the frame rates, unless another pace explains much more
+    Timing    correspondence at the ratio of the frame rates, unless the frames match much better at another pace
     """
     first, *others = _paces(before.frame_count, after.frame_count, rate_ratio)
     best = _at_pace(before, after, Pace(first), search=True)
@@ -98,7 +98,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
 
 def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float]:
-    """Return the paces to try: the ratio of the frame rates, 1, and the ratio of the lengths."""
+    """Return the paces to try: the ratio of the frame rates, 1, and the ratio of the numbers of frames."""
     paces = [rate_ratio, 1.0]
     if count_before > 1 and count_after > 1:
         paces.append((count_after - 1) / (count_before - 1))
@@ -107,7 +107,7 @@ def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float
 
 
 def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: bool = False) -> Timing:
-    """Return the timing at a pace, refined, if it is much better than the best one; otherwise the best one."""
+    """Match the frames at another pace, and refine it; return `best` unless the new timing is much better."""
     if pace == 1.0:
         tried = _at_pace(before, after, Pace(1.0), search=True)
         return tried if _share(tried, after) < MUCH_BETTER * _share(best, after) else best
@@ -127,10 +127,10 @@ def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing
 
 
 def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Timing:
-    """Correct pace and phase by the times of the matched frames, and match the frames again, while it gets better.
+    """Fit pace and phase to the times of the matched frames, and match again, until the matching stops improving.
 
-    Slopes over short and over long distances take turns: short ones are right where few frames are matched well, long
-    ones are more exact.
+    The slope of the fit is measured over a short and over a long distance alternately: over a short distance it is
+    right even if few frames are matched well, over a long distance it is more exact.
     """
     failed = False
     for attempt in range(MOST_REFINEMENTS):
@@ -154,7 +154,7 @@ def _refined(before: Poses, after: Poses, timing: Timing, *, search: bool) -> Ti
 
 
 def _rounded(start: float, step: float, count: int) -> Pace:
-    """Return the pace of a line; slope and start are replaced by simple numbers that differ only by rounding."""
+    """Convert start and slope of a line to a pace; values that are nearly simple numbers are rounded to these."""
     pace = 1.0 / step
     simple = float(Fraction(pace).limit_denominator(1000))
     if abs(simple - pace) * count <= ROUNDED_FRAMES * pace:
@@ -200,7 +200,7 @@ def _run_count(timing: Timing) -> int:
 
 
 def _share(timing: Timing, after: Poses) -> float:
-    """Return the cost of a matching, from 0 to 1, without the frames by which one clip is longer."""
+    """Return the cost of a matching, from 0 to 1, without the cost of the frames by which one clip is longer."""
     counts = timing.before.frame_count, after.frame_count
     return (timing.matching.total - UNMATCHED * abs(counts[0] - counts[1])) / (2.0 * UNMATCHED * min(counts))
 
@@ -252,7 +252,7 @@ def _edges(timing: Timing, count_before: int) -> list[tuple[tuple[int, int], tup
 
 
 def _stored(frames: Ints, timing: Timing, count: int) -> Ints:
-    """Convert borders of the sampled clip to borders of the stored clip."""
+    """Convert starts or ends of runs, in frames of the sampled clip, to frames of the stored clip."""
     if timing.pace == Pace(1.0):
         return frames
     borders = np.clip(np.round(timing.pace.places(frames)), 0, count)

@@ -34,7 +34,7 @@ class ComputeBudget:
     left: float = inf
 
     def spend(self, work: float) -> None:
-        """Subtract work before it is done.
+        """Subtract work from the budget; call this before the work is done.
 
         Parameters
         ----------

@@ -96,7 +96,7 @@ def constrain_motion(
     solver : str    "auto", "ccd", "two_bone" or "least_squares"; "auto" uses the two-bone solver for limbs and least
         squares for everything else
     options : SolverOptions, optional    tolerances and iterations
-    budget : budget, optional    remaining work; reduced by the work of this call
+    budget : ComputeBudget, optional    remaining work; reduced by the work of this call
 
     Returns
     -------
@@ -238,7 +238,7 @@ class _Cluster:
     def _work(
         self, frames: int, constraints: Sequence[Constraint], limb: TwoBoneLimb | None, joints: tuple[int, ...]
     ) -> float:
-        """Estimate the work of solving these frames when no target can be reached."""
+        """Estimate the work of solving a number of frames in the worst case, in which no target can be reached."""
         limited, asked = bool(self.freedom.limits), limb_targets([one.target for one in constraints], limb)
         alone = limb is not None and set(joints) <= set(limb.joints) and not self.freedom.root_moves
         method: Literal["ccd", "two_bone", "least_squares"] = "ccd" if self.solver == "ccd" else "least_squares"
@@ -269,11 +269,11 @@ def solving_work(
     limited: bool = False,
     options: SolverOptions | None = None,
 ) -> float:
-    """Estimate the work of inverse kinematics with unreachable targets, in nanoseconds of one thread.
+    """Estimate the work of inverse kinematics in the worst case, in which no target can be reached.
 
     Parameters
     ----------
-    frames, joints, targets : int    numbers of each
+    frames, joints, targets : int    number of frames, of joints above the targets, and of targets
     method : str    "ccd", "two_bone" or "least_squares"
     limited : bool    whether joints have limits, which need additional steps
     options : SolverOptions, optional    iterations

@@ -53,7 +53,7 @@ def constrain(take: Take, command: Constrain) -> Take:
 
     Returns
     -------
-    Take    F frames with a finding
+    Take    F frames, with a finding that contains the errors
 
     Raises
     ------
@@ -92,7 +92,7 @@ def plant_feet(take: Take, command: PlantFeet) -> Take:
 
     Returns
     -------
-    Take    F frames with a finding
+    Take    F frames, with a finding that contains the sliding distances
 
     Raises
     ------
@@ -120,7 +120,7 @@ class _Rig:
         self._axes: dict[str, JointAxes] | None = None
 
     def joint(self, name: str) -> int:
-        """Find the index of a joint by its own or its standard name."""
+        """Find the index of a joint by its name in the skeleton or by its standard name."""
         skeleton = self.take.skeleton
         standard = None if name in skeleton else self.take.body.mapping.joints.get(name)
         return skeleton.index_of(standard or name)
@@ -152,7 +152,7 @@ class _Rig:
 
 
 def _named(number: int, make: Any, *arguments: Any) -> Any:
-    """Call `make`, and add the number of the constraint to the place that its errors name."""
+    """Call `make`; if it raises a `MotionError`, add the number of the constraint to the error's `where`."""
     try:
         return make(*arguments)
     except MotionError as error:
@@ -244,7 +244,7 @@ def _foot(rig: _Rig, side: str) -> Foot:
 
 
 def _given_contacts(take: Take, feet: Sequence[Foot], command: PlantFeet) -> tuple[FootContacts, ...]:
-    """Return the toe contacts of the command, and heel contacts in those of the same frames in which heels are slow."""
+    """Return the contacts of the command: toes are planted in all of its frames, heels only while they are slow."""
     positions = take.motion.positions(take.skeleton)
     contacts = []
     for side, foot in zip(("left", "right"), feet, strict=True):

@@ -1,11 +1,11 @@
 """Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
 
-A displacement is a rotation vector d for each local rotation q, which becomes q·exp(d), and a shift of the root (Lee
-and Shin 1999). There is one control point per frame. The displacement is the sum of two curves. The first, of least
-bending, passes through the changes of the given frames after smoothing: without smoothing, it would continue the slope
-of the last two frames, which is mostly noise, far into the surroundings. The second, under high tension, passes through
-the remaining differences and hardly extends beyond the given frames. Near a smooth end of a window the control points
-are zero, so that value, slope and curvature are exactly zero there.
+A displacement consists of a rotation vector d for each local rotation q, which is replaced by q·exp(d), and of a shift
+of the root (Lee and Shin 1999). There is one control point per frame. The displacement is the sum of two curves. The
+first is the curve of least bending through the smoothed changes of the given frames: without smoothing, it would
+continue the slope of the last two frames, which is mostly noise, far into the surroundings. The second, under high
+tension, passes through the remaining differences and hardly extends beyond the given frames. Near a smooth end of a
+window the control points are zero, so that value, slope and curvature are exactly zero there.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def displace(motion: Motion, frames: AnyInts, changed: Motion, windows: Sequence
     ----------
     motion : Motion    F frames
     frames : (n,) int    increasing indices of the given frames, each inside a window
-    changed : Motion    those n frames after the change
+    changed : Motion    the n given frames with their change applied
     windows : sequence of Window    windows that do not overlap
 
     Returns

@@ -25,7 +25,7 @@ class FinishedMotion:
     ----------
     motion : the whole motion
     residual_before, residual_after : (C,) largest error of each constraint in its frames: metres, or radians
-    far : (C,) whether each constraint is a position that was missed by more than `FAR_M` before
+    far : (C,) True for position constraints with `residual_before` above `FAR_M`
     """
 
     motion: Motion
@@ -50,9 +50,8 @@ def finish(
     skeleton : Skeleton    J joints
     motion : Motion    F frames, such as a sample brought close by search and refinement
     constraints : sequence of Constraint    C constraints with their frames and the joints that may turn
-        (`constraining.Constraint`; `inverse_kinematics.limb_ending_at` and `inverse_kinematics_targets.chain_of` find
-        these)
-    window_frames : int    frames before and after the constrained ones that may change
+        (`inverse_kinematics.solving.limb_ending_at` and `inverse_kinematics.targets.chain_of` find such joints)
+    window_frames : int    number of frames before and after the constrained frames that may change
     freedom : Freedom, optional    limits and stiffness
     options : SolverOptions, optional    tolerances and iterations
 

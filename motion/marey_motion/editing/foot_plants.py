@@ -259,9 +259,10 @@ def _lowering(positions: Floats, feet: Sequence[Foot], plans: Sequence[_Plan], z
 
 
 def _enveloped(values: Floats, blend: int) -> Floats:
-    """Compute a smooth curve (F,) not below the values, and zero farther than 2·`blend` frames from them.
+    """Compute a smooth curve (F,) that is nowhere below the values (F,), which are at least 0.
 
-    The curve keeps the values up to `blend` frames beyond contacts. It changes slowly, so that the body does not bob.
+    The curve is zero in frames farther than 2·`blend` frames from any positive value. It changes slowly, so that the
+    body does not bob.
     """
     weights = np.hanning(2 * blend + 3)[1:-1]
     highest = maximum_filter1d(values, 2 * blend + 1, mode="nearest")

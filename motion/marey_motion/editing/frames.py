@@ -73,7 +73,7 @@ def split(take: Take, command: Split) -> tuple[Take, ...]:
 
 
 def concatenate(take: Take, command: Concatenate) -> Take:
-    """Append a clip of the same skeleton, at this motion's frame rate.
+    """Append another clip of the same skeleton, resampled to the frame rate of the take.
 
     If the root is a static reference and the hips below it are translated, their travel is merged into the root's.
 
@@ -205,7 +205,7 @@ def retime(take: Take, command: Retime) -> Take:
     Parameters
     ----------
     take : Take    F frames
-    command : Retime    the factor of the speed
+    command : Retime    the factor by which the motion is faster
 
     Returns
     -------

@@ -67,7 +67,7 @@ def find_ground(take: Take, _command: FindGround) -> Take:
 
     Returns
     -------
-    Take    the same motion with a finding
+    Take    the same motion, with a finding that contains the height
 
     Raises
     ------
@@ -86,7 +86,7 @@ def find_contacts(take: Take, command: FindContacts) -> Take:
 
     Returns
     -------
-    Take    the same motion with a finding
+    Take    the same motion, with a finding that contains the contacts
 
     Raises
     ------

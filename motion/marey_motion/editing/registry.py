@@ -67,7 +67,7 @@ class EditedClip:
     ----------
     clip : the motion
     pieces : for each split that was applied, the number of the piece that contains this clip, counted from 1
-    findings : findings of the commands
+    findings : values that the commands reported
     """
 
     clip: Clip

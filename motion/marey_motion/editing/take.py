@@ -48,7 +48,7 @@ class EditedBody:
 
     @cached_property
     def partners(self) -> NDArray[np.int32]:
-        """Index (J,) of each joint's partner on the other side of the body; joints in the middle are their own."""
+        """Index (J,) of each joint's partner on the other side of the body; central joints are their own partners."""
         return symmetric_joints(self.skeleton, self.mapping)
 
     @cached_property
@@ -72,7 +72,7 @@ class EditedBody:
 
 @dataclass(frozen=True)
 class EditFinding:
-    """Values that a command reports about its input motion.
+    """Values that a command reports, such as the height of the ground or the remaining errors of constraints.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ class Take:
 
 
 def motion_of(clip: Clip) -> Motion:
-    """Convert a clip to double precision; frames that no command changes can be converted back bit by bit.
+    """Convert a clip to double precision; a frame that no command changes is bit-identical after converting it back.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Translations of joints other than the root, made comparable between motions."""
+"""Functions that make two motions store translations for the same joints."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marey_motion.skeleton import Skeleton
 
 
 def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> Motion:
-    """Add translations for more joints, equal to their offsets.
+    """Add translations for further joints, equal to the offsets of these joints, so that the motion does not change.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def translated(motion: Motion, skeleton: Skeleton, joints: tuple[int, ...]) -> M
 
 
 def with_equal_joints(a: Motion, b: Motion, skeleton: Skeleton) -> tuple[Motion, Motion]:
-    """Give two motions of one skeleton translations of the same joints.
+    """Make two motions of one skeleton store translations for the same joints: all that either of them translates.
 
     Parameters
     ----------

@@ -296,17 +296,17 @@ COMMANDS: Mapping[str, Callable[..., Layer]] = {
 
 
 def piece_of(layer: Layer, segment: Segment, start: int, end: int) -> Layer:
-    """Make the layer for the part [start, end) of a clip, with one segment and the keyframes inside it.
+    """Make the layer of a clip that is cut to the frames [start, end), with one segment and its keyframes.
 
     Parameters
     ----------
-    layer : Layer    the layer
-    segment : Segment    one of its segments
-    start, end : int    frames of the part, which contains the segment
+    layer : Layer    the layer of the whole clip
+    segment : Segment    the segment to keep, inside [start, end); keyframes outside the segment are dropped
+    start, end : int    frames of the clip that are kept
 
     Returns
     -------
-    Layer    the layer, with frames counted from `start`
+    Layer    the new layer, with frames counted from `start`
     """
     if not 0 <= start <= segment.start < segment.end <= end <= layer.frame_count:
         raise wrong(

@@ -66,8 +66,8 @@ def propose_reaches(clip: Clip, body: MatchingBody, options: WristContactProposa
 
     The rest position is the position of the wrist at the start of the clip: horizontally relative to the hips and the
     body's heading, vertically the height above the ground. A segment begins and ends where the distance of the wrist
-    from rest has a minimum. The keyframe `contact` marks the first frame in which the hand is at its far position,
-    `release` the last.
+    from rest has a minimum. The keyframe `contact` marks the first frame in which the hand is at its far position; the
+    keyframe `release`, if the options ask for it, marks the last one.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def _form_value(form, q):  # type: ignore[no-untyped-def]
 
 @compiled
 def _largest_eigenvector(form, vectors):  # type: ignore[no-untyped-def]
-    """Compute the unit eigenvector of the largest eigenvalue of the symmetric `form` (4, 4) by Jacobi, in place."""
+    """Compute the unit eigenvector of the largest eigenvalue of `form` (4, 4) by Jacobi's method, in place."""
     vectors[:] = 0.0
     for i in range(4):
         vectors[i, i] = 1.0

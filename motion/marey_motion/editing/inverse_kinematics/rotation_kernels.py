@@ -57,7 +57,7 @@ def length(a):  # type: ignore[no-untyped-def]
 
 @compiled
 def direction(a):  # type: ignore[no-untyped-def]
-    """Compute the unit vector along `a`; zero if it has no length."""
+    """Compute the unit vector along `a`; the zero vector if `a` is zero."""
     size = length(a)
     return scaled(a, 1.0 / size) if size > TINY else (0.0, 0.0, 0.0)
 
@@ -89,7 +89,7 @@ def rotated(q, v):  # type: ignore[no-untyped-def]
 
 @compiled
 def exponential(v):  # type: ignore[no-untyped-def]
-    """Compute the rotation about `v` by its length in radians."""
+    """Compute the rotation about the axis `v` by an angle that is the length of `v`, in radians."""
     half = 0.5 * length(v)
     share = 0.5 * math.sin(half) / half if half > 1e-8 else 0.5
     return math.cos(half), v[0] * share, v[1] * share, v[2] * share

@@ -346,7 +346,10 @@ def _kernel_limb(
 
 
 def _keep_better(problem: IkProblem, before: Floats, found: SolverResult) -> None:
-    """Restore the frames in which the closed form increased the error, such as by turning a tool away from a target."""
+    """Restore the given pose in each frame in which the closed form increased the error.
+
+    The error can increase if the wrist turns a tool away from its target.
+    """
     squares = problem.targets.scales**2
     worse = (found.after**2) @ squares > (found.before**2) @ squares + 1e-18
     problem.rotations[worse] = before[worse]
@@ -391,16 +394,17 @@ def measure_residuals(skeleton: Skeleton, motion: Motion, targets: Sequence[Targ
 def limb_targets(
     targets: Sequence[Target], limb: TwoBoneLimb | None
 ) -> tuple[PositionTarget, OrientationTarget | None] | None:
-    """Select the position and the orientation of a limb's end.
+    """Select the targets that the closed form for two bones can meet: position and orientation of a limb's end.
 
     Parameters
     ----------
-    targets : sequence of targets    the targets
+    targets : sequence of targets    all targets
     limb : TwoBoneLimb or None    the limb
 
     Returns
     -------
-    (PositionTarget, OrientationTarget or None) or None    None if there are other targets
+    (PositionTarget, OrientationTarget or None) or None    None if there is no limb, if the position is not given in all
+        axes, or if there are more targets than these two
     """
     positions = [target for target in targets if isinstance(target, PositionTarget)]
     orientations = [target for target in targets if isinstance(target, OrientationTarget)]

@@ -37,7 +37,7 @@ CARRIED, HELD, GIVEN = 0, 1, 2
 
 @compiled
 def bend_at(distance, first, second):  # type: ignore[no-untyped-def]
-    """Compute the inner angle (radians, π if straight) between bones whose ends are `distance` apart."""
+    """Compute the inner angle (radians, π if straight) of two joined bones whose outer ends are `distance` apart."""
     near = max(distance * distance - (first - second) ** 2, 0.0)
     far = max((first + second) ** 2 - distance * distance, 0.0)
     return 2.0 * math.atan2(math.sqrt(near), math.sqrt(far))
@@ -88,7 +88,7 @@ def _turn_from_hinge(along, across, cosine, wished):  # type: ignore[no-untyped-
     Parameters
     ----------
     along, across : sine of the current bend, about the hinge and about the axis across it
-    cosine : of the current inner angle
+    cosine : cosine of the current inner angle
     """
     sine = math.hypot(along, across)
     if cosine > 0.0:  # folded, not straight
@@ -156,7 +156,12 @@ def reach_frames(limb, body, targets, target_rotations, roots, rotations, work):
 
 @compiled
 def undamped_reach(starts, firsts, seconds, zone):  # type: ignore[no-untyped-def]
-    """Compute the longest distances (F,) that limbs reach undamped; `starts` are their present lengths, in metres."""
+    """Compute the greatest distances (F,), in metres, that a limb can reach without damping.
+
+    `starts` (F,) are the current distances between the ends of the limb; `firsts` and `seconds` (F,) are the lengths of
+    its bones, all in metres; `zone` is the damping zone in radians. A limb that is already straighter than the zone
+    allows keeps its current distance.
+    """
     reach = np.empty(starts.shape[0])
     for f in range(starts.shape[0]):
         first, second = firsts[f], seconds[f]
