@@ -128,7 +128,7 @@ class MappingError(MotionError):
     ...     map_joints(skeleton).indices(skeleton, ["left_wing"])
     ... except MappingError as error:
     ...     print(error)
-    left_wing: the joint mapping contains no joint for left_wing; add one for each
+    left_wing: the joint mapping contains no joint for left_wing; add the missing joints to the mapping
     """
 
     default_code = "mapping-invalid"

@@ -83,7 +83,7 @@ def write_motion_file(
     source : ItemToExport    the item's documents; `hierarchy` is needed unless `skeleton` is given
     file_format : str    one of `marey_schemas.formats.MOTION_FORMATS`
     unit : str or float    unit of length by name or in metres, for formats without a fixed unit
-    time : str    for an aligned clip, whether to write its canonical frames or restore the source clip
+    time : str    for an aligned clip: "canonical" writes the aligned frames, "source" the restored original clip
     skeleton : Skeleton, optional    the skeleton, if it was already made from `hierarchy`
 
     Returns
@@ -106,7 +106,7 @@ def write_motion_file(
 
 
 def _source(clip: Clip, info: Mapping[str, Any]) -> SourceInfo | None:
-    """Read the rotation orders of the file from which a clip was imported, if the clip still has its skeleton."""
+    """Read the rotation orders of the file from which a clip was imported; None if the clip has other joints now."""
     details = info.get("source", {}).get("details", {})
     channels = tuple(tuple(names) for names in details.get("channels", ()))
     if len(channels) != clip.skeleton.joint_count:

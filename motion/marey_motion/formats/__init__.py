@@ -50,9 +50,10 @@ def read_motion(
     ----------
     data : bytes    the content of the file
     name : str    its name, which helps to detect the format and appears in messages
-    companion : bytes, optional    the ASF of an AMC, or the skeleton document of a clip of the predecessor
-    companion_name : str    its name, for messages
-    options : ImportOptions, optional    facts that the user knows better than the file
+    companion : bytes, optional    content of the file with the skeleton, for formats that need one: the ASF of an AMC,
+        or the skeleton document of a clip in the format of `formats.predecessor`
+    companion_name : str    name of that file, for messages
+    options : ImportOptions, optional    facts about the file, such as its unit, that have precedence over its content
 
     Returns
     -------
@@ -95,8 +96,8 @@ def read_source(
     data : bytes    the content of the file
     name : str    its name
     companion : bytes or None    content of the companion file, such as the ASF of an AMC
-    companion_name : str    its name
-    options : ImportOptions    facts that the user knows better than the file
+    companion_name : str    name of the companion file
+    options : ImportOptions    facts about the file, such as its unit, that have precedence over its content
 
     Returns
     -------
@@ -154,7 +155,7 @@ def write_motion(clip: Clip, file_format: str, **options: Any) -> bytes:
 
 
 def reader_of(row: FileFormat) -> Callable[..., SourceMotion | SourceDocument]:
-    """Find the reader of a format that has one.
+    """Find the function that reads files of a format; the format must be one that can be imported.
 
     Parameters
     ----------

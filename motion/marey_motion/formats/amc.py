@@ -76,7 +76,7 @@ def read_amc(
 def _read_amc_header(lines: TextLines, degrees: bool) -> tuple[bool, float | None]:
     """Read the header, up to the first frame; return whether angles are in degrees, and the frame rate if given.
 
-    If the AMC gives no unit of angles, `degrees` applies, which is the unit of its skeleton.
+    If the AMC gives no unit of angles, `degrees` is returned, which says whether the ASF uses degrees.
     """
     rate_hz = None
     while True:

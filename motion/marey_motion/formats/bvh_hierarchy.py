@@ -49,7 +49,7 @@ class BvhHeader:
 
 @dataclass(frozen=True)
 class _KeptHierarchy:
-    """A parsed HIERARCHY, and the position and line number after it. Its lists must not be changed."""
+    """A parsed HIERARCHY, which files share, so its lists must not be changed; and the position and line after it."""
 
     header: BvhHeader
     position: int

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def field_of(document: Any, name: str, kind: type[T] | tuple[type[T], ...], file: str) -> T:
-    """Read a field that must exist and have a type.
+    """Read a field that must exist and have one of the given types.
 
     Parameters
     ----------

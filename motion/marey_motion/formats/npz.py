@@ -8,9 +8,9 @@ A zip archive of .npy members, never pickled; the same clip always gives the sam
     offsets           (J, 3) float64, metres
     rest_rotations    (J, 4) float64, w x y z
     end_site_joints, end_site_offsets    (E,) int32, (E, 3) float64
-    frame_rate_hz     () float64                              these only where there is motion
-    poses             (F, 3 + 4 J) float32                    as in `Clip`
-    translated_joints, translations    (k,) int32, (F, k, 3) float32    only where joints below the root move
+    frame_rate_hz     () float64                              only in a clip
+    poses             (F, 3 + 4 J) float32                    only in a clip; as in `Clip`
+    translated_joints, translations    (k,) int32, (F, k, 3) float32    only if joints below the root are translated
 """
 
 from __future__ import annotations

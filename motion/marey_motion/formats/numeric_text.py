@@ -187,17 +187,17 @@ def scan_numbers(text: NDArray[np.uint8], width: int, first_line: int) -> Number
     Parameters
     ----------
     text : (bytes,) uint8    the text
-    width : int    expected number of values in a line; the first line with another number is returned and raises no
-        error
+    width : int    expected number of values in a line; a line with more or fewer values raises no error, but the first
+        such line is returned
     first_line : int    number of the first line of `text`, from 1
 
     Returns
     -------
-    NumberTable    the numbers, and the first line with another count
+    NumberTable    the numbers, and the first line with more or fewer values than `width`
 
     Raises
     ------
-    BadToken    at the first token that is not a finite decimal number
+    BadNumber    at the first token that is not a finite decimal number
     """
     text = ending_in_a_line(text)
     # Sized by what the text can hold, never by what a header declares; untouched pages cost nothing.

@@ -1,5 +1,6 @@
-"""Anatomy of a skeleton: standard joints, landmarks, axes and document, computed once for all files with equal
-skeletons.
+"""Anatomy of a skeleton: its standard joints, landmarks, axes and documents.
+
+An anatomy is computed once for all files with equal skeletons.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Anatomy:
 
     @cached_property
     def mapping(self) -> JointMapping:
-        """The standard joints."""
+        """Mapping from standard joints to joints of the skeleton."""
         return map_joints(self.skeleton)
 
     @cached_property
@@ -46,12 +47,12 @@ class Anatomy:
 
     @cached_property
     def hierarchy(self) -> dict[str, Any]:
-        """Part `hierarchy` of the skeleton."""
+        """Document `hierarchy` of the skeleton."""
         return skeleton_to_document(self.skeleton).model_dump(by_alias=True, exclude_none=True)
 
     @cached_property
     def _resting(self) -> dict[str, Any] | None:
-        """Part `mapping` with axes from the rest pose; None if some axes can only be found in a motion."""
+        """Document `mapping` with axes from the rest pose; None if some axes can only be found in a motion."""
         try:
             if rest_pose_doubts(self.skeleton, self.mapping):
                 return None
@@ -60,7 +61,7 @@ class Anatomy:
         return _mapping_part(self, None)
 
     def mapping_part(self, clip: Clip | None) -> dict[str, Any]:
-        """Make the part `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
+        """Make the document `mapping`: standard joints, and axes found in the rest pose or, failing that, in a clip.
 
         Parameters
         ----------
@@ -68,13 +69,13 @@ class Anatomy:
 
         Returns
         -------
-        dict    the document's tree, of plain values
+        dict    the document, as plain values
         """
         return self._resting or _mapping_part(self, clip)
 
 
 def _mapping_part(anatomy: Anatomy, clip: Clip | None) -> dict[str, Any]:
-    """Make the part `mapping`; if too few joints are recognised, it has a note instead of axes."""
+    """Make the document `mapping`; if too few joints are recognised, it contains a note instead of axes."""
     mapping = anatomy.mapping
     try:
         document = mapping_to_document(mapping, guess_axes(anatomy.skeleton, mapping, clip))
@@ -89,7 +90,7 @@ _KNOWN: LruCache[_SkeletonKey, Anatomy] = LruCache(max_entries=KEPT_SKELETONS)
 
 
 def anatomy_of(skeleton: Skeleton | SourceMotion) -> Anatomy:
-    """Return the anatomy of a skeleton; equal skeletons share a cached one.
+    """Return the anatomy of a skeleton; equal skeletons share one cached `Anatomy`.
 
     Parameters
     ----------

@@ -122,7 +122,7 @@ def without_rest_pose(clip: Clip) -> tuple[Clip, tuple[int, int]]:
 
     Returns
     -------
-    clip : Clip    the frames between
+    clip : Clip    the frames that remain
     dropped : (int, int)    numbers of frames removed at the start and at the end
     """
     start, end = _rest_pose_frames(clip, track(clip))
@@ -198,7 +198,7 @@ def _rest_pose_frames(clip: Clip, tracks: Tracks) -> tuple[int, int]:
 
 
 def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:
-    """Count the true values before the first false value; blocks after that value are not computed."""
+    """Count the true values before the first false one in a sequence of arrays, which is read only up to there."""
     total = 0
     for block in blocks:
         if not block.all():
@@ -208,7 +208,7 @@ def _leading(blocks: Iterable[NDArray[np.bool_]]) -> int:
 
 
 def _at_rest(clip: Clip, frames: slice) -> NDArray[np.bool_]:
-    """Find the frames (F,) in which 19 of 20 joints below the root are turned as in the skeleton's rest pose."""
+    """Find the frames (F,) in which at least 95 % of the joints below the root have nearly their rest rotation."""
     rotations = clip.rotations[frames, 1:]
     if rotations.shape[1] == 0:
         return np.zeros(len(rotations), np.bool_)
@@ -356,7 +356,7 @@ def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
 
 
 def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:
-    """Return whether all steps are certainly shorter than a jump, in half the time of `_step_cosines`."""
+    """Check quickly that no rotation from frame to frame is a jump; after False, the exact check decides."""
     products = rotations[1:] * rotations[:-1]
     cosines = products[..., 0] + products[..., 1]
     cosines += products[..., 2]

@@ -37,7 +37,7 @@ _LONGEST_COLLECTION = 1024
 
 
 def planned_entry(planned: PlannedFile) -> ImportEntry | None:
-    """Make the entry of a file that is not read on its own: a companion of other files, or a file with a refused name.
+    """Make the import's entry for a file that is not read on its own: a companion file, or one that the plan refuses.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _info(imported: ImportedMotion, file: FileToImport, checks: tuple[Tree, ...]
 
 
 def _on_skeleton(clip: Clip, skeleton: Skeleton, file: str) -> Clip:
-    """Move the clip to a given skeleton, which must equal the file's except in its name and order of joints."""
+    """Convert a clip to a given skeleton, which must equal the file's skeleton except in the order of joints."""
     own = clip.skeleton
     if set(own.joint_names) != set(skeleton.joint_names):
         odd = ", ".join(sorted(set(own.joint_names) ^ set(skeleton.joint_names))[:5])

@@ -1,4 +1,4 @@
-"""Conversion of the predecessor's graphs to graphs of the project's models, which are found by name."""
+"""Conversion of graphs read by `formats.predecessor` to graphs of models of the project, which are found by name."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FindModels = Callable[[str, str | None], tuple[int, Sequence[NamedModel]]]
 
 
 def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
-    """Make the item of a graph: each node gets the model of its name, preferably from the graph's collection.
+    """Make the item of a graph: each node refers to the model with the node's name, preferably in the same collection.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def graph_item(graph: ImportedGraph, find: FindModels) -> ImportedItem:
 
 
 def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
-    """Find the model of a name in the graph's collection, or else the only model of that name."""
+    """Find the model with a name in the graph's collection or, failing that, the only such model of the project."""
     count, models = find(name, collection)
     if count != 1:
         count, models = find(name, None)
@@ -79,5 +79,5 @@ def _find_model(find: FindModels, name: str, collection: str) -> dict[str, Any]:
         return models[0].ref
     places = ", ".join(one.path for one in models)
     there = f"{count} models are called {name!r} ({places})" if count else f"no model is called {name!r}"
-    advice = "import the models of a graph first, beside it"
+    advice = "import the models first, into the collection of the graph"
     raise FormatError(f"The graph has a node for the model {name!r}, but {there}; {advice}.", code="no-model")

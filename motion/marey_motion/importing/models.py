@@ -1,4 +1,4 @@
-"""Import of files of the predecessor that hold no motion: models with trees over their samples, and graphs."""
+"""Import of files of `formats.predecessor` without motion: models, trees over samples of models, and graphs."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def median(values: AnyFloats) -> Any:
 
 
 def low_quantile(values: AnyFloats) -> Any:
-    """Compute the value below which a twentieth of the values lie, as `numpy.quantile` does.
+    """Compute the 5 % quantile, as `numpy.quantile` does.
 
     Parameters
     ----------

@@ -1,4 +1,7 @@
-"""Plan of a batch of files, by their names alone: the companion of each file, its folder and its name, or a refusal."""
+"""Plan of the import of a batch of files, made from their names alone.
+
+The plan contains, for each file, its companion, the collection and the name of its item, or the reason of a refusal.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,10 @@ class PlannedFile:
     Parameters
     ----------
     name : name of the file, as given
-    role : a `motion` or `skeleton` to import, the `companion` of others, or `refused`
-    companion : name of the companion file that it needs
-    folder, item_name : folder below the target and name of the clip
-    reason : reason for its refusal
+    role : a `motion` or `skeleton` to import, a `companion` that is read with another file, or `refused`
+    companion : name of the companion file that this file needs; None if it needs none
+    folder, item_name : path below the collection that receives the import, and name of the clip
+    reason : reason of the refusal; empty for other roles
     """
 
     name: str
@@ -50,7 +53,9 @@ class Pairing:
 
 
 def plan_imports(names: Sequence[str]) -> list[PlannedFile]:
-    """Plan each file of a batch by its name. Folders in names become folders below the target.
+    """Plan the import of each file of a batch by its name.
+
+    Folders in the names are created below the collection that receives the import.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Positions of the joints that the checks of a motion use, and measures of its skeleton."""
+"""Positions of the joints that the checks of a clip use, and lengths of limbs of its skeleton."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ _FRAMES_PER_BLOCK = 4096
 class BodyPoints:
     """Points of a skeleton that the checks use, and lengths between them.
 
-    `points` are joints, followed by end sites, and `column` is the index of each point in them; `soles` and `all_soles`
-    are the columns of the joints and end sites from each ankle down. `limbs` are the joints of arms and legs, `span_m`
-    is the length of both arms and `leg_m` of the left leg; they are empty and zero if there are no hands or no feet.
+    `points` are the indices of joints, followed by those of end sites, which are numbered from J on; `column` maps each
+    of these indices to its position in `points`. `soles` are, for each foot, the positions in `points` of its joints
+    and end sites from the ankle down; `all_soles` are those of both feet. `limbs` are the joints of arms and legs,
+    `span_m` is the length of both arms, and `leg_m` that of the left leg. If there are no hands or no feet, `limbs` is
+    empty and both lengths are zero.
     """
 
     landmarks: Landmarks
@@ -70,7 +72,7 @@ class Tracks:
 
     @cached_property
     def floor_height(self) -> float:
-        """The height at which the lower foot rests."""
+        """The height of the floor in metres: the 5 % quantile of the heights of the lowest point of both feet."""
         return float(low_quantile(self.lowest))
 
 
@@ -105,7 +107,7 @@ def track(clip: Clip, landmarks: Landmarks | None = None) -> Tracks:
 
 @lru_cache(maxsize=KEPT_SKELETONS)
 def _body_points(skeleton: Skeleton, landmarks: Landmarks) -> BodyPoints:
-    """Select the points once for all clips of a skeleton."""
+    """Select the points and measure the lengths; the result is cached for all clips of a skeleton."""
     soles = tuple(sole_points(skeleton, foot) for foot in landmarks.feet or ())
     ends = [joint for pair in (landmarks.hands, landmarks.feet) if pair for joint in pair]
     points = sorted({0, landmarks.hips or 0, *ends, *(point for sole in soles for point in sole)})

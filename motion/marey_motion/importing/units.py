@@ -58,7 +58,7 @@ def unit_in_metres(unit: str | float) -> float:
     metres = UNITS_M.get(unit.lower()) if isinstance(unit, str) else float(unit)
     if metres is None or not (np.isfinite(metres) and metres > 0):
         raise MotionError(
-            f"the unit {unit!r} is neither one of {', '.join(UNITS_M)} nor its length in metres, a positive number",
+            f"the unit {unit!r} is unknown; give one of {', '.join(UNITS_M)}, or its length in metres, above 0",
             code="unit-unknown",
         )
     return metres

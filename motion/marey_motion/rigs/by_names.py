@@ -24,7 +24,7 @@ class NameMatch:
     ----------
     rig : str, optional    name of the rig; None if the names are everyday words of no particular tool
     joints : dict of str to int    index by standard name
-    signature_share : float    share of the rig's signature that was found, 0 to 1
+    signature_share : float    share of the rig's distinctive names (`KnownRig.signature`) that were found, 0 to 1
     """
 
     rig: str | None
@@ -100,7 +100,7 @@ def _parsed_names(rig: KnownRig) -> tuple[tuple[str, tuple[JointName, ...]], ...
 
 
 def _prefixes(pelvis: tuple[JointName, ...], joints: dict[JointName, int]) -> list[str]:
-    """List possible shared prefixes of the joint names: what precedes the rig's name of the pelvis in any name."""
+    """List prefixes that all joint names may share: the texts before the rig's name of the pelvis in any joint name."""
     prefixes = {
         joint.base[: len(joint.base) - len(name.base)]
         for name in pelvis
@@ -119,7 +119,7 @@ def _first(alternatives: tuple[JointName, ...], prefix: str, joints: dict[JointN
 
 
 def _signature_share(rig: KnownRig, prefix: str, names: Names, joints: dict[JointName, int]) -> float:
-    """Compute the share of the signature that is present; 0 for rigs without one."""
+    """Compute the share of a rig's distinctive names that the skeleton has; 0 for rigs without such names."""
     there = 0
     for mark in rig.signature:
         if mark.endswith("*"):

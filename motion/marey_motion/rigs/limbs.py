@@ -1,4 +1,4 @@
-"""Chains of bones that may be limbs: pairs of equal build on one joint of a skeleton."""
+"""Chains of bones that may be limbs: pairs of chains that branch from one joint and have nearly equal bone lengths."""
 
 from __future__ import annotations
 

@@ -73,7 +73,8 @@ class JointMapping:
         missing = [name for name in names if name not in self.joints]
         if missing:
             raise MappingError(
-                f"the joint mapping contains no joint for {', '.join(missing)}; add one for each", where=missing[0]
+                f"the joint mapping contains no joint for {', '.join(missing)}; add the missing joints to the mapping",
+                where=missing[0],
             )
         return tuple(skeleton.index_of(self.joints[name]) for name in names)
 
@@ -131,7 +132,7 @@ def map_joints(skeleton: Skeleton) -> JointMapping:
 def require_trust(mapping: JointMapping) -> JointMapping:
     """Refuse a mapping in which hardly any joint was recognised.
 
-    A dog has legs and a head, too: such a guess is not used before a person has checked it.
+    The few joints may also be those of an animal, so a person must check such a mapping before it is used.
 
     Parameters
     ----------

@@ -110,7 +110,8 @@ def _distance_from_rest(clip: Clip, body: MatchingBody, side: str) -> Floats:
     wrist = body.standard_joints.get(f"{side}_wrist")
     if wrist is None:
         raise MappingError(
-            "the joint mapping of the skeleton has no joint for this standard joint; add one", where=f"{side}_wrist"
+            "the joint mapping of the skeleton contains no joint for the wrist; add it to the mapping",
+            where=f"{side}_wrist",
         )
     positions = kinematics.global_positions(clip).astype(np.float64)
     forward = kinematics.forward_directions(positions, body.lefts, body.rights)

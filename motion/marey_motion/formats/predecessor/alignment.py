@@ -1,7 +1,8 @@
 """The predecessor's alignment of a clip: its sections in canonical frames, and its time function.
 
-The time function is a whole frame of the source for each canonical frame, so it is constant where several canonical
-frames correspond to one frame of the source. Some programs wrote it as a string of JSON within the document.
+The time function gives a whole frame number of the source clip for each canonical frame, so it is constant where
+several canonical frames correspond to one frame of the source. Some programs wrote it as a string of JSON within the
+document.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
 
 
 def write_predecessor_alignment(time_function: Floats, sections: Sequence[tuple[int, int]] = ()) -> bytes:
-    """Write a time function, to the nearest whole frame, and sections.
+    """Write sections, and a time function that is rounded to whole frames.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 Three forms: a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`; sections by label, `{"sections": {label:
 [{"start_idx", "end_idx"}]}}`; and the frames of each label, `{"semantic_annotation": {label: [frames]}}`. In some
-programs of the predecessor a section includes its frame `end_idx`, in others it ends before it; the documents do not
-say which, so it is an option of the reader.
+programs of the predecessor, the last frame of a section is `end_idx`, in others it is the frame before. The documents
+do not say which, so the reader has an option for it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def read_predecessor_annotation(
     data : bytes    content of the file
     file : str    its name, for messages
     frame_count : int    frames of the clip
-    end_index : str    "inclusive" if sections include their frame `end_idx`, as in the predecessor's editor;
-        "exclusive" if they end before it, as in the predecessor's time warping
+    end_index : str    "inclusive" if the last frame of a section is `end_idx`, as in the predecessor's editor;
+        "exclusive" if it is the frame before, as in the predecessor's time warping
     labels : sequence of str, optional    labels to read; all labels by default. If sections of different labels
         overlap, read one label at a time, since a layer has no overlapping segments. Sections without labels are called
         "section 1" and so on.
@@ -184,7 +184,7 @@ def _frames(given: Any, label: str, file: str) -> list[int]:
         raise FormatError(f"field {label!r} must be a list of frame numbers", file=file)
     numbers = number_array(given, file, label)
     if numbers.ndim != 1 or (numbers != np.floor(numbers)).any() or (np.abs(numbers) > 2**53).any():
-        raise FormatError(f"field {label!r} must be a list of frame numbers, which are whole numbers", file=file)
+        raise FormatError(f"field {label!r} must be a list of frame numbers; each must be a whole number", file=file)
     return [int(one) for one in numbers]
 
 

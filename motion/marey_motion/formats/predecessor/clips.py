@@ -81,7 +81,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
     Parameters
     ----------
     clip : Clip    F frames
-    form : str    "poses" for rows of numbers, "frames" for the objects of the engine
+    form : str    "poses" for one row of numbers per frame, "frames" for one object per frame, as the engine reads them
     encoding : str    "json", "bson" or "bson.bz2"
 
     Returns

@@ -25,12 +25,12 @@ Place = tuple[str, str]
 
 @dataclass(frozen=True)
 class GraphNode:
-    """A primitive of an action.
+    """Node of a graph: a model that is a primitive of an action.
 
     Parameters
     ----------
     model_id : id of the model in the predecessor's data base
-    type : one of `TYPES`
+    type : type of the node, one of `TYPES`
     transitions : nodes that may follow
     """
 
@@ -41,7 +41,7 @@ class GraphNode:
 
 @dataclass(frozen=True)
 class PredecessorGraph:
-    """Graph that was read or is to be written."""
+    """A graph of models: its nodes by action and model, and the action and model of its start node."""
 
     nodes: Mapping[Place, GraphNode]
     start: Place

@@ -54,7 +54,7 @@ class PredecessorModel:
     primitive : the model in Marey's units and conventions
     layout : layout of the document
     animated_joints : joints whose rotations are in the document; all other joints keep their rest rotation
-    time_form : form of its time function; None for a model without a time function, which runs at constant speed
+    time_form : form of the document's time function; None if it has none, so that the model runs at constant speed
     time_error_frames : largest difference between the time functions of `primitive` and of the document, in frames
     """
 
@@ -228,7 +228,7 @@ def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Read the time part of a model, which is None if it has no such part, and the form of the part.
+    """Return the time part of a model, with one component per row, and its form; None if the model has no time part.
 
     Layout 2 was written by two training programs. The first stores components as columns and uses the form
     `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.
@@ -283,7 +283,7 @@ def _read(parts: _Parts, layout: Layout, skeleton: Skeleton, file: str) -> Prede
 
 
 def _constant_speed(frames: int) -> PredecessorTime:
-    """Make the time function with one frame of the example for each canonical frame."""
+    """Make a time function of constant speed, which maps each canonical frame to the frame with the same number."""
     basis = SplineBasis.clamped(frames, DEGREE + 1)
     return PredecessorTime("increments", basis, np.zeros(basis.count), np.zeros((0, basis.count)))
 
@@ -410,7 +410,7 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
 
 
 def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
-    """Read the time function from the first channel; further channels contain semantics."""
+    """Read the time function from the first channel; further channels contain semantic annotations and are ignored."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:

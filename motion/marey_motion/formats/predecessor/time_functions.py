@@ -1,11 +1,11 @@
 """Conversion of time functions between the predecessor's models and Marey's, in both directions.
 
-Both models map each canonical frame x = 0 to N - 1 to a frame of an example, as functions of a score vector
-g. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
+A time function t(x) maps each canonical frame x, from 0 to N - 1, to a frame of an example; it depends on a vector g of
+scores. Marey's model contains ln(t(x + 1) - t(x)), which is linear in g. The predecessor has two forms:
 
 * `coefficients` (layouts 1 and 3, and layout 2 by its later training program): t(x) is a spline whose coefficients are
-  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g, so it is converted to the best
-  linear function over the scores that the model draws; the largest error is returned, too.
+  cumsum(exp(mean + g · eigen)) - 1. The logarithm of its slope is not linear in g. It is approximated by the linear
+  function that fits best for scores drawn from the model; the largest error is returned, too.
 * `increments` (layout 2 by its first training program): t(x + 1) - t(x) = exp(spline(x + 1)), where the spline is
   linear in g. This is also the form of Marey's model.
 """
@@ -71,7 +71,7 @@ class PredecessorTime:
 def as_log_slopes(
     time: PredecessorTime, scores: Floats, variances: Floats, file: str
 ) -> tuple[FunctionalComponents, float]:
-    """Convert a time function to logarithms of slopes.
+    """Convert a time function of the predecessor to Marey's form, the logarithms of its slopes.
 
     Parameters
     ----------
