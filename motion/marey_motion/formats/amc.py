@@ -49,7 +49,7 @@ def read_amc(
     FormatError    naming the line, and the bone if there is one
     """
     if companion is None:
-        message = "an AMC holds angles alone; import it together with its ASF"
+        message = "an AMC file contains angles but no skeleton; import it together with its ASF file"
         raise FormatError(message, code="asf-missing", file=file)
     skeleton = parse_asf(companion, companion_name)
     source = skeleton_source(skeleton)
@@ -65,7 +65,7 @@ def read_amc(
         source.warnings.append(
             CheckWarning(
                 "frame-rate-assumed",
-                f"an AMC file carries no frame rate; {DEFAULT_RATE_HZ:g} Hz is assumed, as for CMU takes",
+                f"the file states no frame rate; {DEFAULT_RATE_HZ:g} Hz is assumed, as in the CMU database",
                 values={"used_hz": DEFAULT_RATE_HZ},
             )
         )

@@ -150,15 +150,16 @@ def _warn_of_layout(header: BvhHeader, frames: int, wrapped: bool, warnings: lis
         warnings.append(
             CheckWarning(
                 "frame-count-mismatch",
-                f"the header declares {counted(header.declared_frames, 'frame')}, the file holds {frames:,}; "
-                "what it holds is read",
+                f"the header declares {counted(header.declared_frames, 'frame')}, but the file contains {frames:,}, "
+                "which were read",
                 values={"declared": header.declared_frames, "found": frames},
             )
         )
     if wrapped:
-        warnings.append(CheckWarning("frames-wrapped", "frames run over several lines; they were joined by count"))
+        message = "frames are divided into several lines; the lines were joined by counting values"
+        warnings.append(CheckWarning("frames-wrapped", message))
     if frames == 0:
-        warnings.append(CheckWarning("no-frames", "the file holds no frames; its skeleton is read"))
+        warnings.append(CheckWarning("no-frames", "the file contains no frames; only its skeleton was read"))
 
 
 def _fill_motion(source: SourceMotion, values: NDArray[np.float64], columns: ChannelColumns) -> None:
@@ -197,8 +198,8 @@ def _take_bones_from_positions(source: SourceMotion, translations: NDArray[np.fl
     source.warnings.append(
         CheckWarning(
             "offsets-from-positions",
-            "every OFFSET below the root is zero; the position channels of "
-            f"{counted(len(bones), 'joint')} give the bones",
+            "every OFFSET below the root is zero; the offsets were taken from the position channels of "
+            f"{counted(len(bones), 'joint')}",
             joints=tuple(source.joint_names[joint] for joint in source.translated_joints),
         )
     )

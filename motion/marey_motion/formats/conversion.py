@@ -102,7 +102,8 @@ def _check_range(source: SourceMotion, file: str) -> None:
     tips = np.array([offset for _, offset in source.end_sites])
     for values in (source.offsets, tips, source.root_positions, source.translations):
         if values is not None and np.abs(values).max(initial=0.0) > _LARGEST_LENGTH:
-            message = f"a length of {np.abs(values).max():.3g} units, more than the limit of {_LARGEST_LENGTH:.0e}"
+            largest = np.abs(values).max()
+            message = f"the file contains a length of {largest:.3g} units; the limit is {_LARGEST_LENGTH:.0e}"
             raise FormatError(message, code="value-range", file=file)
 
 
@@ -163,11 +164,11 @@ def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
         notices.append(CheckWarning("up-axis-converted", message, values={"up_axis": up_axis}))
     listed = _rotation_orders(source.channels)
     if len(listed) > 1:
-        message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own"
+        message = f"rotation orders differ between joints ({', '.join(listed)}); each joint is read in its own order"
         notices.append(CheckWarning("mixed-rotation-orders", message, values={"orders": list(listed)}))
     repeated = [name for name, shown in zip(source.joint_names, source.display_names, strict=True) if name != shown]
     if repeated:
-        message = f"{len(repeated)} joint names repeat in the file; each gets the name of its parent before its own"
+        message = f"{len(repeated)} joint names occur more than once; the parent's name was put before each of them"
         notices.append(CheckWarning("duplicate-joint-names", message, joints=tuple(repeated)))
     return notices
 

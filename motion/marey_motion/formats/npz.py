@@ -132,7 +132,8 @@ def _foreign(data: bytes, file: str) -> FormatError:
             "pose the model and export its joints as BVH, for instance with Blender's SMPL add-on"
         )
     else:
-        message = f"member 'format' must say {MARK}; the archive has {', '.join(members) or 'no members'}"
+        listed = f"the members {', '.join(members)}" if members else "no members"
+        message = f"member 'format' must contain the text {MARK}; the archive has {listed}"
     return FormatError(message, code="not-npz", file=file)
 
 

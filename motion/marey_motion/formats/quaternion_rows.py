@@ -58,7 +58,7 @@ def as_rotations(
     if flips.any():
         names = tuple(name for name, is_one in zip(joint_names, flips.any(axis=0), strict=True) if is_one)
         whose = f"rotations of {counted(len(names), 'joint')}"
-        message = f"{whose} jump to their negative {counted(int(flips.sum()), 'time')}; unrolled"
+        message = f"{whose} change sign {counted(int(flips.sum()), 'time')}; the signs were made continuous"
         warnings.append(CheckWarning("sign-flips-unrolled", message, joints=names, values={"count": int(flips.sum())}))
     # Rounded unit quaternions stay as they are, to the bit.
     unit = values / np.where(np.abs(norms - 1.0) > _ROUNDING, norms, 1.0)[..., None]

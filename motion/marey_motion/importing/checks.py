@@ -159,8 +159,8 @@ def _position_channels(clip: Clip) -> CheckWarning | None:
     moved = np.linalg.norm(clip.translations - clip.skeleton.offsets[list(clip.translated_joints)], axis=2)
     return CheckWarning(
         "position-channels",
-        f"positions of {counted(len(names), 'joint')} below the root change against the parents, "
-        f"{names[int(moved.max(axis=0).argmax())]} by up to {moved.max():.3f} m",
+        f"{counted(len(names), 'joint')} below the root move relative to their parents, most of all "
+        f"{names[int(moved.max(axis=0).argmax())]}: by up to {moved.max():.3f} m",
         joints=names,
         values={"largest_m": float(moved.max())},
     )
@@ -256,7 +256,7 @@ def _floor_penetration(tracks: Tracks) -> CheckWarning | None:
     deepest = int(depths.argmax())
     return CheckWarning(
         "floor-penetration",
-        f"feet go below their ground in {counted(below.size, 'frame')}, by {depths[deepest]:.2f} m in frame {deepest}",
+        f"feet are below the ground in {counted(below.size, 'frame')}, by {depths[deepest]:.2f} m in frame {deepest}",
         frames=(int(below[0]), int(below[-1]) + 1),
         values={"deepest_m": float(depths[deepest]), "frame": deepest, "frame_count": int(below.size)},
     )
@@ -332,8 +332,8 @@ def _rotation_jumps(clip: Clip) -> CheckWarning | None:
     worst = float(np.degrees(angles[frame, joint]))
     return CheckWarning(
         "rotation-jump",
-        f"{counted(joints.size, 'joint')} with jumps, {clip.skeleton.joint_names[joint]} by {worst:.0f}° "
-        f"from frame {frame} to {frame + 1}",
+        f"rotations of {counted(joints.size, 'joint')} jump, most of all {clip.skeleton.joint_names[joint]}: "
+        f"by {worst:.0f}° from frame {frame} to {frame + 1}",
         joints=tuple(clip.skeleton.joint_names[joint] for joint in joints),
         frames=(int(frames[0]), int(frames[-1]) + 2),
         values={"angle_deg": worst, "frame": int(frame) + 1, "count": int(np.count_nonzero(jumps))},
@@ -352,7 +352,8 @@ def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
     if not dead or (rotations == rotations[0]).all():
         return None
     names = tuple(clip.skeleton.joint_names[joint] for joint in dead)
-    return CheckWarning("dead-joints", f"whole limbs of {counted(len(names), 'joint')} never turn", joints=names)
+    message = f"no joint of one or more limbs ever turns ({counted(len(names), 'joint')})"
+    return CheckWarning("dead-joints", message, joints=names)
 
 
 def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:

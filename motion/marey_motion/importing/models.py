@@ -50,7 +50,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     """
     name = file.planned.name
     if source.subject == "tree":
-        message = "a tree over samples of a model is imported together with the file of that model"
+        message = "a tree over samples of a model must be imported together with the file of that model"
         example = "for example, walk_cluster_tree.json needs walk_mm.json"
         raise FormatError(f"{message}; {example}", code="model-missing", file=name)
     if source.subject == "graph":
@@ -61,7 +61,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
     found = model_of_document(source.document, name, skeleton=given)
     own = found.primitive.skeleton
     if given is not None and not same_hierarchy(own, given, tolerance_m=SAME_OFFSET_M):
-        message = "its skeleton is not the one that was chosen; choose none, and it is imported with its own"
+        message = "the model has a different skeleton from the chosen one; import it without choosing a skeleton"
         raise FormatError(message, code="skeleton-mismatch", file=name)
     ref = {"output": skeleton_output(name)} if file.skeleton is None else file.skeleton.ref
     item = main_item(file, Kind.MODEL, model_name(file.planned.item_name), _parts(file, found, ref))
@@ -92,7 +92,8 @@ def _imported_tree(data: bytes, file: FileToImport, primitive: MotionPrimitive) 
     name = str(file.planned.companion)
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:
-        message = f"its samples have {tree.dimensions} numbers, those of {file.planned.name} {primitive.dimensions}"
+        model = f"the latent vectors of {file.planned.name} have {primitive.dimensions}"
+        message = f"the samples of the tree have {tree.dimensions} numbers, but {model}"
         raise FormatError(message, code="tree-of-another-model", file=name)
     try:
         options = TreeOptions(

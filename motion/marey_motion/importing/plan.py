@@ -93,11 +93,11 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
     path = PurePosixPath(name.replace("\\", "/"))
     segments = [part for part in path.parts if part not in ("/", ".", "..")]
     if not segments or any(len(part) > _LONGEST_SEGMENT for part in segments) or len(name) > _LONGEST_PATH:
-        reason = f"a name has 1 to {_LONGEST_SEGMENT} characters, with its folders {_LONGEST_PATH}"
+        reason = f"each part of a path must have 1 to {_LONGEST_SEGMENT} characters, the path at most {_LONGEST_PATH}"
         return PlannedFile(name, "refused", code="name-invalid", reason=reason)
     if any(_CONTROL.search(part) for part in segments):
         return PlannedFile(
-            name, "refused", code="name-invalid", reason="a name has no line breaks or control characters"
+            name, "refused", code="name-invalid", reason="a name must not contain line breaks or control characters"
         )
     folder, stem = "/".join(segments[:-1]), PurePosixPath(segments[-1]).stem
     return PlannedFile(name, "motion", folder, segments[-1] if (folder, stem) in taken else stem)
@@ -146,7 +146,7 @@ def _pairing(row: FileFormat, path: PurePosixPath, name: str, companions: _Paths
         return Pairing(name, companions[0][1])
     wanted = str(row.companion)
     if companions:
-        reason = f"none of the {len(companions)} {wanted.upper()} files beside it has its name"
+        reason = f"none of the {len(companions)} {wanted.upper()} files in its folder has a matching name"
     else:
-        reason = f"no {wanted.upper()} file beside it; {row.needs_companion}"
+        reason = f"there is no {wanted.upper()} file in its folder; {row.needs_companion}"
     return Pairing(name, None, f"{wanted}-missing", reason)

@@ -330,7 +330,7 @@ def _unit_of_leg(body: _Measurements, hip_height: float, up_axis: UpAxis) -> flo
         body.warnings.append(
             CheckWarning(
                 "unit-inferred",
-                f"the file does not say its unit; taken as {fitting[0]}, because {measured}",
+                f"the file does not state its unit of length; {fitting[0]} is assumed, because {measured}",
                 values={"unit_scale_m": scale, "leg_length_m": body.leg * scale, "hip_height_m": hip_height * scale},
             )
         )
@@ -426,7 +426,7 @@ def _look_for_mirroring(source: SourceMotion, body: _Measurements, options: Impo
         body.warnings.append(
             CheckWarning(
                 "left-handed",
-                f"left is on the right (mean cosine {cosine:.2f}): the file may be left-handed; "
+                f"the left side of the body is on its right (mean cosine {cosine:.2f}): the file may be left-handed; "
                 "if so, import it with the option handedness=left",
                 values={"cosine": cosine},
             )

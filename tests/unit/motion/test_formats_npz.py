@@ -79,7 +79,7 @@ def test_a_compressed_archive_of_the_same_arrays_is_read(archive: dict[str, byte
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("format", member("other"), "must say"),
+        ("format", member("other"), "must contain the text"),
         ("parents", None, "'parents'"),
         ("offsets", member(np.zeros((3, 3))), "shape (22, 3)"),
         ("offsets", member(np.full((22, 3), np.nan)), "not finite"),

@@ -59,8 +59,8 @@ def test_where_the_stair_stands_time_goes_on_evenly() -> None:
         ({}, "'time_function' must be a list"),
         ({"time_function": "["}, "'time_function' cannot be read"),
         ({"time_function": [0, 0.5]}, "list of at least two frames"),
-        ({"time_function": [0, 1e308]}, "names frame 1e.308, which no source has"),
-        ({"time_function": [0, 5, 4]}, "goes back at canonical frame 2"),
+        ({"time_function": [0, 1e308]}, "contains frame 1e.308; the limit is"),
+        ({"time_function": [0, 5, 4]}, "decreases at canonical frame 2"),
         (
             {"time_function": [0, 1], "sections": [{"start_idx": 0, "end_idx": 3}]},
             "section 0:3 is not a range of the 2",
@@ -73,5 +73,5 @@ def test_damaged_alignments_are_refused_by_the_field(document: dict[str, Any], t
 
 
 def test_a_time_function_beyond_its_source_is_refused() -> None:
-    with pytest.raises(FormatError, match="names frame 9 of a source of 9"):
+    with pytest.raises(FormatError, match="contains frame 9, but the source has 9 frames"):
         as_increasing(np.array(FRAMES), 9)

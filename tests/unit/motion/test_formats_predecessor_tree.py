@@ -60,7 +60,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
     [
         (["data"], [], r"'data' has the shape \(0,\)"),
         (["data"], [[1.0], [2.0, 3.0]], "'data'"),
-        (["data", 3, 1], 1e308, "'data', row 3: a number beyond those of single precision"),
+        (["data", 3, 1], 1e308, "'data', row 3: a number is too large for single precision"),
         (["root", "indices"], [0, 1], "root: the field indices must contain the number of each of the 40"),
         (["root", "indices"], [*range(39), 40], "root: each of the indices must be from 0 to 39"),
         (["root", "children", 0, "indices"], [], "root.0: the field indices must contain at least one sample"),
@@ -85,7 +85,7 @@ def test_a_node_that_holds_other_samples_than_those_below_it_is_refused() -> Non
     document = models.tree()
     first, second = document["root"]["children"][0]["children"][:2]
     first["indices"] = second["indices"]
-    with pytest.raises(FormatError, match="node 5, counted level by level, holds other samples"):
+    with pytest.raises(FormatError, match="node 5, counted level by level, must contain the samples of its children"):
         read(document)
 
 

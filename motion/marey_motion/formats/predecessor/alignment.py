@@ -61,11 +61,11 @@ def read_predecessor_alignment(data: bytes, file: str) -> PredecessorAlignment:
     if frames.ndim != 1 or len(frames) < 2 or (frames != np.floor(frames)).any() or (frames < 0).any():
         raise FormatError(f"field {TIME_FUNCTION!r} must be a list of at least two frames", file=file)
     if frames.max() > MOST_FRAME:
-        message = f"field {TIME_FUNCTION!r} names frame {frames.max():g}, which no source has"
+        message = f"field {TIME_FUNCTION!r} contains frame {frames.max():g}; the limit is {MOST_FRAME:g}"
         raise FormatError(message, code="time-function-invalid", file=file)
     if (np.diff(frames) < 0).any():
         place = int(np.argmax(np.diff(frames) < 0)) + 1
-        message = f"field {TIME_FUNCTION!r} goes back at canonical frame {place}"
+        message = f"field {TIME_FUNCTION!r} decreases at canonical frame {place}"
         raise FormatError(message, code="time-function-invalid", file=file)
     sections = [
         (field_of(one, "start_idx", int, file), field_of(one, "end_idx", int, file))
@@ -115,7 +115,7 @@ def as_increasing(frames: NDArray[np.int64], source_frames: int) -> Floats:
     (N,) float64    strictly increasing from 0 to the last frame of the source
     """
     if frames.max() >= source_frames:
-        message = f"the time function names frame {int(frames.max())} of a source of {source_frames}"
+        message = f"the time function contains frame {int(frames.max())}, but the source has {source_frames} frames"
         raise FormatError(message, code="time-function-invalid")
     places = np.arange(len(frames), dtype=np.float64)
     values, inverse = np.unique(frames, return_inverse=True)

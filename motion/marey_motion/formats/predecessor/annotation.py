@@ -95,7 +95,7 @@ def layer_of_document(
     except AnnotationError as error:
         hint = ""
         if end_index == "inclusive" and _only_shares_ends(wanted):
-            hint = "; each section ends where the next one starts, so it seems to end before its end_idx: exclusive"
+            hint = "; each section ends where the next one starts: set end_index to exclusive"
         raise FormatError(f"{error}{hint}", code=error.code, file=file) from error
 
 

@@ -126,7 +126,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
         raise FormatError(message, code="document-unknown", file=file)
     own = _skeleton(document, file) or skeleton
     if own is None:
-        message = "the model does not hold its skeleton; name the skeleton of the project that it moves"
+        message = "the file does not contain the skeleton of the model; choose a skeleton of the project"
         raise FormatError(message, code="skeleton-missing", file=file)
     try:
         return _read(_as_parts(document, layout, file), layout, own, file)
@@ -306,7 +306,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
             file=file,
         )
     if part.get("n_coeffs", basis.count) != basis.count:
-        message = f"{what}: n_coeffs is {part['n_coeffs']}, but the knots are those of {basis.count} coefficients"
+        message = f"{what}: n_coeffs is {part['n_coeffs']}, but the knots fit {basis.count} coefficients"
         raise FormatError(message, file=file)
     channels = mean.size // basis.count
     if part.get("n_dims", channels) != channels:
@@ -357,7 +357,9 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
 def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
     """Refuse splines whose evaluation would need too much memory, even if the document is small."""
     if frames * coefficients > MOST_VALUES:
-        message = f"{what}: {coefficients} coefficients over {frames} frames; their product is at most {MOST_VALUES:,}"
+        message = (
+            f"{what}: {coefficients} coefficients over {frames} frames; the limit of the product is {MOST_VALUES:,}"
+        )
         raise FormatLimit(message, file=file)
 
 
@@ -365,7 +367,7 @@ def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleto
     """List the joints that the model rotates. Raises `FormatError` if the skeleton lacks them."""
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):
-        message = f"{mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
+        message = f"the mean has {mean.shape[1]} channels, but {len(animated)} joints need {3 + 4 * len(animated)}"
         raise FormatError(message, code="joints-mismatch", file=file)
     if len(set(animated)) != len(animated):
         raise FormatError("field 'animated_joints' names a joint twice", file=file)
@@ -414,7 +416,7 @@ def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
     if basis.frame_count != frames:
-        message = f"time spans {basis.frame_count} canonical frames, space {frames}"
+        message = f"the time part spans {basis.frame_count} canonical frames, but the space part {frames}"
         raise FormatError(message, code="model-invalid", file=file)
     return PredecessorTime(parts.time_form, basis, mean[:, 0], vectors[..., 0])
 
@@ -443,7 +445,8 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
         )
     covered = means.shape[1] - spatial
     if not 0 <= covered <= temporal:
-        message = f"gmm: {means.shape[1]} dimensions, but space has {spatial} components and time {temporal}"
+        parts = f"space has {spatial} components and time {temporal}"
+        message = f"gmm: the means have {means.shape[1]} dimensions, but {parts}"
         raise FormatError(message, code="model-invalid", file=file)
     if (weights <= 0).any() or abs(float(weights.sum()) - 1.0) > WEIGHTS_TOLERANCE:
         raise FormatError("gmm: the weights must be positive and add up to 1", code="model-invalid", file=file)

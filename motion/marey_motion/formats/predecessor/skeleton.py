@@ -95,7 +95,7 @@ def _listed_nodes(document: Document, file: str) -> list[tuple[str, str | None, 
     unknown = next((child for child in parents if child not in listed), None)
     roots = [name for name in listed if name not in parents]
     if unknown is not None or len(roots) != 1:
-        problem = f"jointDescs lacks the child {unknown!r}" if unknown else f"{len(roots)} joints have no parent"
+        problem = f"jointDescs has no entry for {unknown!r}" if unknown else f"{len(roots)} joints have no parent"
         raise FormatError(f"the joints are not a tree: {problem}", file=file)
     nodes: list[tuple[str, str | None, Document]] = []
     waiting = [roots[0]]

@@ -81,7 +81,7 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
         )
     if np.abs(samples).max(initial=0.0) > np.finfo(np.float32).max:
         place = int(np.argmax(np.abs(samples).max(axis=1)))
-        message = f"field 'data', row {place}: a number beyond those of single precision, which samples are kept in"
+        message = f"field 'data', row {place}: a number is too large for single precision, in which samples are stored"
         raise FormatError(message, code="bad-number", file=file)
     indices, children = _by_levels(field_of(document, "root", dict, file), len(samples), file)
     order = _in_tree_order(indices, children)
@@ -96,7 +96,7 @@ def tree_of_document(document: Mapping[str, Any], file: str) -> SampleTree:
         raise FormatError(str(error), code="tree-invalid", file=file) from error
     for number, (start, held) in enumerate(zip(tree.starts.tolist(), indices, strict=True)):
         if not np.array_equal(np.sort(order[start : start + len(held)]), np.sort(held)):
-            message = f"node {number}, counted level by level, holds other samples than the nodes below it"
+            message = f"node {number}, counted level by level, must contain the samples of its children and no others"
             raise FormatError(message, code="tree-invalid", file=file)
     return tree
 
