@@ -131,7 +131,7 @@ class Clip:
         return self.poses[:, 3:].reshape(self.frame_count, -1, 4)
 
     def sliced(self, start: int, stop: int) -> Clip:
-        """Take a range of frames, sharing memory with this clip.
+        """Make a clip of a range of frames, which shares memory with this clip.
 
         Parameters
         ----------

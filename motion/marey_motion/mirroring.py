@@ -65,10 +65,10 @@ def mirror_clip(clip: Clip, partners: AnyInts) -> Clip:
 
     Notes
     -----
-    Let F be the constant matrix that maps the local axes of the partner p to the axes of the joint j (improper, as it
-    mirrors). Then the global rotation is M·G_p·F_j⁻¹, so the local one is F_parent·L_p·F_j⁻¹, and -F is a rotation. F
-    comes from the rest pose, corrected to take the partner's bones to the joint's own where the rest pose is not
-    symmetric.
+    Let M be the reflection in x, G global and L local rotations before mirroring, and F_j the constant matrix that maps
+    the local axes of the partner p to those of the joint j. F_j mirrors, so -F_j is a rotation. The mirrored global
+    rotation of j is M·G_p·F_j⁻¹, and the mirrored local rotation is F_parent·L_p·F_j⁻¹. F_j is computed from the rest
+    pose; if the rest pose is not symmetric, F_j is corrected so that it maps the partner's bones to those of the joint.
     """
     mirrored = mirror_motion(clip.skeleton, partners, Motion.of(clip))
     return mirrored.as_clip(clip.skeleton, clip.frame_rate_hz)

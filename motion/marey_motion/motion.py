@@ -107,7 +107,7 @@ class Motion(NamedTuple):
         )
 
     def sliced(self, start: int, stop: int) -> Motion:
-        """Take a range of frames, sharing memory with this motion.
+        """Make a motion of a range of frames, which shares memory with this motion.
 
         Parameters
         ----------

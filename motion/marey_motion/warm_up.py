@@ -291,7 +291,7 @@ def main() -> None:
     """Compile everything, or only the stages named in the arguments."""
     parser = argparse.ArgumentParser(prog="python -m marey_motion.warm_up", description=__doc__)
     parser.add_argument("stages", nargs="*", metavar="stage", help=f"stages to run: {', '.join(STAGES)}; default: all")
-    parser.add_argument("--processes", type=int, default=1, help="number of processes; default: 1")
+    parser.add_argument("--processes", type=int, default=1, help="number of parallel processes; default: 1")
     arguments = parser.parse_args()
     if unknown := set(arguments.stages) - set(STAGES):
         parser.error(f"no stage {', '.join(sorted(unknown))}; there are {', '.join(STAGES)}")

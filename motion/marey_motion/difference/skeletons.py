@@ -1,4 +1,7 @@
-"""Differences between skeletons: joints added, removed, renamed and changed in the rest pose; and between mappings."""
+"""Differences between skeletons and between joint mappings.
+
+Joints can be added, removed, renamed, or changed in the rest pose.
+"""
 
 from __future__ import annotations
 

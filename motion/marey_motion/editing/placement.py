@@ -62,7 +62,7 @@ def rotate(take: Take, command: Rotate) -> Take:
 
 
 def face(take: Take, command: Face) -> Take:
-    """Rotate the motion about the vertical through the body at a frame, so that it has a given heading there.
+    """Rotate the motion about the vertical through the body, so that it has a given heading in a given frame.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class AsfSkeleton:
         return offsets
 
     def end_sites(self) -> tuple[tuple[int, NDArray[np.float64]], ...]:
-        """List the tips of the bones that end the hierarchy.
+        """List the tips of the bones without children.
 
         Returns
         -------

@@ -121,17 +121,18 @@ def _imported(file: FileToImport) -> ImportedFile:
 
 
 def mapping_part(found: ImportedFile) -> Tree:
-    """Make the part `mapping` of the skeleton in a file, with the axes that follow from its clip.
+    """Make the document `mapping` of the skeleton in a file, with the axes of its joints.
 
-    `import_file` leaves this part out: it takes long, and only a skeleton that is new to the project needs it.
+    `import_file` leaves this document out: it takes long, and only a skeleton that is new to the project needs it.
 
     Parameters
     ----------
-    found : ImportedFile    its first item is a skeleton
+    found : ImportedFile    a result of `import_file` whose first item is a skeleton; the clip, if there is one, shows
+        axes that the rest pose does not define
 
     Returns
     -------
-    dict    part `mapping`
+    dict    the document, as plain values
     """
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(found.items[0].parts["hierarchy"]))
     motion = next((item.parts["motion"] for item in found.items if item.kind is Kind.CLIP), None)

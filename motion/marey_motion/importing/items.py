@@ -23,7 +23,7 @@ Tree = dict[str, Any]
 
 @dataclass(frozen=True)
 class GivenSkeleton:
-    """A stored skeleton that the clips must use: its revision and its part `hierarchy`."""
+    """A stored skeleton that imported clips must use: a reference to its revision, and its document `hierarchy`."""
 
     item: str
     revision: int
@@ -96,7 +96,7 @@ class ImportedFile:
 
     Parameters
     ----------
-    items : a skeleton followed by a clip or model that uses it, or one of these alone. The skeleton has no part
+    items : a skeleton followed by a clip or model that uses it, or one of these alone. The skeleton has no document
         `mapping` yet: see `mapping_part`
     checks : findings about the motion, as documents
     frames : number of frames of the clip

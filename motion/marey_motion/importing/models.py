@@ -69,7 +69,7 @@ def import_document(file: FileToImport, source: SourceDocument) -> ImportedFile:
 
 
 def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[str, Tree]:
-    """Make the parts `model` and, where the file has a companion, `tree`."""
+    """Make the documents `model` and, if the file has a companion, `tree`."""
     name = found.primitive.name or model_name(file.planned.item_name)
     model = primitive_to_tree(replace(found.primitive, name=name), skeleton)
     known: Tree = {
@@ -88,7 +88,7 @@ def _parts(file: FileToImport, found: PredecessorModel, skeleton: Tree) -> dict[
 
 
 def _imported_tree(data: bytes, file: FileToImport, primitive: MotionPrimitive) -> Tree:
-    """Make the part `tree`; the seed and features of an imported tree are unknown."""
+    """Make the document `tree`; seed and features of an imported tree are unknown, so defaults are written."""
     name = str(file.planned.companion)
     tree = read_predecessor_tree(data, name)
     if tree.dimensions != primitive.dimensions:

@@ -106,9 +106,9 @@ def _place(name: str, taken: set[tuple[str, str]]) -> PlannedFile:
 def pair_companions(names: Iterable[str]) -> tuple[Pairing, ...]:
     """Find the companion of every file that needs one, such as the ASF of an AMC.
 
-    Only files of the same folder match. The first of these is the companion: the file with the same stem; the file with
-    the longest stem that precedes a separator in this file's stem (16.asf for 16_01.amc, 07.asf for 07_01-walk.amc);
-    the folder's only file of the companion's format.
+    Only files of the same folder match. The companion is the file with the same stem. If there is none, it is the file
+    with the longest stem that precedes a separator in the other stem (16.asf for 16_01.amc, 07.asf for 07_01-walk.amc).
+    If there is none either, it is the only file of the companion's format in the folder.
 
     Parameters
     ----------

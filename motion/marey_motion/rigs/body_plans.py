@@ -95,7 +95,7 @@ class LimbReading:
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """Legs and arms, and a score of how common their proportions are: at least 0 for most people, less for others."""
+    """Legs and arms, and a score of how common their proportions are: at least 0 for most people, else negative."""
 
     legs: LimbReading
     arms: LimbReading

@@ -20,8 +20,8 @@ def create_segment(layer: Layer, label: str, start: int, end: int, *, overwrite:
     Parameters
     ----------
     layer : Layer    the layer
-    label : str    its label
-    start, end : int    its frames
+    label : str    label of the segment
+    start, end : int    frames of the segment
     overwrite : bool    whether to shorten or remove segments that overlap; if False, an overlap is an error
 
     Returns
@@ -177,7 +177,7 @@ def relabel_segment(layer: Layer, at: int, label: str) -> Layer:
     ----------
     layer : Layer    the layer
     at : int    a frame of the segment
-    label : str    its new label
+    label : str    new label of the segment
 
     Returns
     -------
@@ -200,8 +200,8 @@ def add_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     Parameters
     ----------
     layer : Layer    the layer
-    label : str    its label
-    frame : int    its frame
+    label : str    label of the keyframe
+    frame : int    frame of the keyframe
 
     Returns
     -------
@@ -222,9 +222,9 @@ def move_keyframe(layer: Layer, label: str, frame: int, to: int) -> Layer:
     Parameters
     ----------
     layer : Layer    the layer
-    label : str    its label
-    frame : int    its frame
-    to : int    its new frame
+    label : str    label of the keyframe
+    frame : int    frame of the keyframe
+    to : int    new frame of the keyframe
 
     Returns
     -------
@@ -243,8 +243,8 @@ def remove_keyframe(layer: Layer, label: str, frame: int) -> Layer:
     Parameters
     ----------
     layer : Layer    the layer
-    label : str    its label
-    frame : int    its frame
+    label : str    label of the keyframe
+    frame : int    frame of the keyframe
 
     Returns
     -------

@@ -27,7 +27,7 @@ def read_predecessor(
     companion_name: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion | SourceDocument:
-    """Read a file with a motion, which stays in its own unit and axes, or with another document.
+    """Read a file of the predecessor: a motion, which stays in its own unit and axes, or a document without motion.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def read_predecessor(
 
     Returns
     -------
-    SourceMotion or SourceDocument    motion in centimetres, or the document
+    SourceMotion or SourceDocument    motion in centimetres, or the document of a model, tree or graph
 
     Raises
     ------

@@ -90,7 +90,7 @@ def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None 
     ----------
     data : bytes    content of the file
     file : str    its name, for messages
-    skeleton : Skeleton, optional    its skeleton, where the document does not hold one
+    skeleton : Skeleton, optional    skeleton of the model, needed if the document contains none
 
     Returns
     -------
@@ -110,7 +110,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
     ----------
     document : mapping    the document
     file : str    name of the file, for messages
-    skeleton : Skeleton, optional    its skeleton, where the document does not hold one
+    skeleton : Skeleton, optional    skeleton of the model, needed if the document contains none
 
     Returns
     -------

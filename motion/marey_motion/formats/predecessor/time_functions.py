@@ -135,7 +135,7 @@ def as_coefficients(primitive: MotionPrimitive) -> PredecessorTime:
 
     Returns
     -------
-    PredecessorTime    the time function, over the scores of the primitive's latents
+    PredecessorTime    the time function, which depends on the temporal scores in latent vectors of the primitive
     """
     scores, times = _drawn(primitive)
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
@@ -159,7 +159,7 @@ def as_increments(primitive: MotionPrimitive) -> PredecessorTime:
 
     Returns
     -------
-    PredecessorTime    the time function, over the scores of the primitive's latents
+    PredecessorTime    the time function, which depends on the temporal scores in latent vectors of the primitive
     """
     count = min(WRITTEN_COEFFICIENTS, primitive.frame_count)
     basis = SplineBasis.clamped(primitive.frame_count, max(DEGREE + 1, count))
