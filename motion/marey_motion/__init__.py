@@ -1,7 +1,7 @@
 """The mathematics of motion: arrays in, arrays out.
 
-`__init__.pyi` lists the exported names with their modules. A module is loaded when one of its names is first used, so
-importing the package takes hardly any time, and compiled kernels are loaded only when they are needed.
+`__init__.pyi` lists the exported names with their modules. A module is loaded when one of its names is first used.
+Importing the package therefore takes hardly any time, and compiled kernels are loaded only when they are needed.
 """
 
 import lazy_loader

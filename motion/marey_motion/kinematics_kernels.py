@@ -1,8 +1,8 @@
 """Compiled forward kinematics, kept apart so that importing the rest of the package does not load numba.
 
-The memory layout decides the speed. A block of frames is transposed from one row per pose to one contiguous row of
-frames per component, so that each step of the chain is the same few instructions on whole vector registers, and the
-working set of a block stays in the first two cache levels.
+The memory layout determines the speed. A block of frames is transposed from one row per pose to one contiguous row of
+frames per component. Each step along the joint chain then consists of the same few vector instructions for all frames
+of the block. The blocks are small enough for the first two cache levels.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Directions of bones in poses whose joints move relative to their parents.
 
-Some takes keep the shape of the body in position channels: examples are a shoulder blade that slides, and a rig whose
-offsets are not those of its performer. In such a take, the direction of a bone is not given by the rotation of its
-joint, but by the positions of this joint and the next one.
+Some takes store a part of the body's shape in position channels: examples are a shoulder blade that slides, and a rig
+whose offsets are not those of its performer. In such a take, the direction of a bone is not given by the rotation of
+its joint. It is the direction from the position of this joint to that of the next one.
 """
 
 from __future__ import annotations

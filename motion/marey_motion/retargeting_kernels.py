@@ -16,11 +16,12 @@ CARRIED = 2
 def rotations(local, parents, ways, sources, corrections, rests, target_parents, out):  # type: ignore[no-untyped-def]
     """Fill `out` (F, 4·K) with local rotations of the K target joints, continuous in sign from frame to frame.
 
-    `local` (F, 4·J) are the local rotations of the source joints, `parents` (J,) the indices of their parents. For each
-    target joint, `ways` (K,) is AT_REST (keeps its rest rotation), MAPPED (follows the global rotation of its source
-    joint) or CARRIED (copies the local rotation of its source joint). `sources` (K,) are the source joints,
-    `corrections` (K, 4) are multiplied from the right with the source's global rotation, `rests` (K, 4) are the rest
-    rotations, and `target_parents` (K,) the indices of the parents.
+    `local` (F, 4·J) are the local rotations of the source joints, `parents` (J,) the indices of their parents. The
+    other arrays describe the target joints. `ways` (K,) is AT_REST for a joint that keeps its rest rotation, MAPPED for
+    one that follows the global rotation of its source joint, and CARRIED for one that copies the local rotation of its
+    source joint. `sources` (K,) are the source joints. `corrections` (K, 4) are multiplied from the right to the global
+    rotations of the source joints. `rests` (K, 4) are the rest rotations, and `target_parents` (K,) the indices of the
+    parents.
     """
     joints, targets = parents.shape[0], target_parents.shape[0]
     source = np.empty((joints, 4))

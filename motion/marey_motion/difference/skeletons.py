@@ -39,8 +39,8 @@ class JointPairs(NamedTuple):
 def pair_joints(before: Skeleton, after: Skeleton) -> JointPairs:
     """Pair the joints of two skeletons.
 
-    Joints of the same name are paired. A joint whose name only one skeleton has was renamed if exactly one such joint
-    of the other skeleton has the same parent and nearly the same offset.
+    Joints of the same name are paired. Of the other joints, two are paired as renamed if they have the same parent and
+    nearly the same offset, and no other joint could be meant.
 
     Parameters
     ----------

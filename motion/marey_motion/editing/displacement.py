@@ -1,7 +1,7 @@
 """Changes of a few frames spread over their surroundings: displacement maps that are cubic B-splines.
 
-A displacement consists of a rotation vector d for each local rotation q, which is replaced by q·exp(d), and of a shift
-of the root (Lee and Shin 1999). There is one control point per frame. The displacement is the sum of two curves. The
+A displacement (Lee and Shin 1999) consists of a shift of the root and a rotation vector d per joint, which replaces the
+local rotation q with q·exp(d). There is one control point per frame. The displacement is the sum of two curves. The
 first is the curve of least bending through the smoothed changes of the given frames: without smoothing, it would
 continue the slope of the last two frames, which is mostly noise, far into the surroundings. The second, under high
 tension, passes through the remaining differences and hardly extends beyond the given frames. Near a smooth end of a

@@ -28,9 +28,9 @@ LEAST_LENGTH = 0.1
 def smooth(take: Take, command: Smooth) -> Take:
     """Replace the joints' rotations and translations and the root's path with weighted averages over time.
 
-    No frame is lost: beyond its ends, the motion is continued by its point reflection through the end poses, so that
+    No frame is lost: beyond each end, the motion is continued by its point reflection through the end pose. Therefore
     the first and the last frame, and straight paths, do not change. Rotations are averaged as quaternions of continuous
-    sign and normalised.
+    sign and then normalised.
 
     Parameters
     ----------

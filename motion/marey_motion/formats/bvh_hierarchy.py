@@ -1,8 +1,8 @@
 """The HIERARCHY of a BVH file and the header of its MOTION section.
 
-The reader is strict about the meaning of the data, but accepts the layouts of all exporters: any indentation, braces on
-the line of the joint or on a separate line, keywords in upper or lower case, end sites without or with names, and
-channels in any number and order.
+The reader is strict about the meaning of the data, but accepts the layouts of all exporters. Indentation is free, a
+brace may be on the line of the joint or on a separate line, and keywords may be in upper or lower case. End sites may
+have names, and joints may have any number of channels in any order.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Fast parsing of decimal numbers in text, with exactly the results of Python's `float`.
 
-A number whose digits form an integer of at most 2**53, scaled by a power of ten up to 10**22, needs one correctly
-rounded multiplication or division of exact doubles (Clinger, "How to read floating point numbers accurately", PLDI
-1990). All other numbers, which are rare in real files, are parsed by `float`. `plain_numbers` reads the usual numbers
-faster, with the same results.
+If the digits of a number form an integer of at most 2**53, and its power of ten is at most 10**22, the number is the
+correctly rounded product or quotient of two exact doubles (Clinger, "How to read floating point numbers accurately",
+PLDI 1990). All other numbers, which are rare in real files, are parsed by `float`. `plain_numbers` reads the usual
+numbers faster, with the same results.
 """
 
 from dataclasses import dataclass

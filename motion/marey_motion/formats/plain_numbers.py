@@ -1,8 +1,8 @@
 """Fast reading of plain decimal numbers, eight bytes of text at a time.
 
 Files of motion consist almost only of numbers such as -12.345678 and 1.5e-05. A loop over their bytes is slow, because
-the processor cannot predict where each number ends. The functions of this module load eight bytes as one integer, a
-word, whose lowest byte is the first of the text, and treat all bytes of a word at once.
+the processor cannot predict where each number ends. The functions of this module load eight bytes as one integer (a
+word), with the first byte of the text as the lowest, and process all bytes of a word at once.
 
 The results are the same as those of `numeric_text.parse_number`, which reads all numbers that are not plain.
 """

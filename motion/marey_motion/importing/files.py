@@ -1,8 +1,7 @@
 """Import of one file: conversion of its bytes, with the user's options, to items with documents.
 
-All callers import files through `import_file`. It needs no files, network or database, its results do not depend on
-earlier calls, and it takes and returns only plain values, bytes and arrays, so a caller can run it in a separate
-process.
+All callers import files through `import_file`, which can run in a separate process: it needs no files, network or
+database, and takes and returns only plain values, bytes and arrays. Its results do not depend on earlier calls.
 """
 
 from __future__ import annotations

@@ -143,9 +143,9 @@ def slerp(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> AnyFloats:
 def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLike | None = None) -> AnyFloats:
     """Compute the shortest rotations from one direction to another.
 
-    Opposite directions have no unique shortest rotation. They get half a turn about `half_turn_axis`, made
-    perpendicular to `start`, or, if that is None, about the perpendicular nearest to the coordinate axis with the
-    largest angle to `start`.
+    Opposite directions have no unique shortest rotation. For them, the result is half a turn about the component of
+    `half_turn_axis` that is perpendicular to `start`. If the argument is None or parallel to `start`, the coordinate
+    axis with the largest angle to `start` is used in its place.
 
     Parameters
     ----------

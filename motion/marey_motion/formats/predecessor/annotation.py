@@ -1,9 +1,13 @@
 """The predecessor's annotations: the documents in its data base, and the files it exports.
 
-Three forms: a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`; sections by label, `{"sections": {label:
-[{"start_idx", "end_idx"}]}}`; and the frames of each label, `{"semantic_annotation": {label: [frames]}}`. In some
-programs of the predecessor, the last frame of a section is `end_idx`, in others it is the frame before. The documents
-do not say which, so the reader has an option for it.
+An annotation has one of three forms:
+
+* a list of sections, `{"sections": [{"start_idx", "end_idx"}]}`;
+* sections by label, `{"sections": {label: [{"start_idx", "end_idx"}]}}`;
+* the frames of each label, `{"semantic_annotation": {label: [frames]}}`.
+
+In some programs of the predecessor, the last frame of a section is `end_idx`, in others it is the frame before. The
+documents do not say which, so the reader has an option for it.
 """
 
 from __future__ import annotations
