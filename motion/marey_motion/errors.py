@@ -1,6 +1,6 @@
-"""Errors in motion data, in one tree.
+"""Errors in motion data, all derived from `MotionError`.
 
-Each error has a stable `code` (a slug that clients may switch on) and says `where` in the input it was found.
+Each error has a stable `code`, a slug by which clients can distinguish errors, and may name its place in the input.
 """
 
 from __future__ import annotations

@@ -388,8 +388,8 @@ def foot_contacts(
     ----------
     toes : (F, k, 3)    positions of k toes in metres
     frame_rate_hz : float    frames per second
-    speed_limit_m_s : float    metres per second
-    window_s : float    seconds
+    speed_limit_m_s : float    speed limit of a standing toe, in metres per second
+    window_s : float    duration of the filter's window, in seconds
 
     Returns
     -------

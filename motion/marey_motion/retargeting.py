@@ -66,7 +66,8 @@ class RetargetPlan:
     at_rest : tuple of str    target joints that are neither paired nor carried; they keep their rest rotation
     missing : tuple of str    standard joints that only one of the skeletons has
     sources : (K,) int32    source joint that each target joint follows, -1 for none
-    corrections : (K, 4) float64    S·Tᵀ of each mapped joint as (w, x, y, z), identity for the others
+    corrections : (K, 4) float64    constant rotation S·Tᵀ of each mapped joint (see the description of this module) as
+        (w, x, y, z), identity for the others
 
     Examples
     --------
@@ -170,11 +171,11 @@ def plan_retarget(
 def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None) -> Clip:
     """Retarget a clip to the plan's target skeleton.
 
-    Mapped joints take the source's orientation; all others keep their rest rotation, or, if both skeletons are copies
-    of one rig, their source rotation. Bones keep the lengths of the target. If the source has translations, the
-    target's bones point in the directions of the source's translated bones; if the target is the source skeleton
-    itself, the clip keeps its translations. The pelvis travels as in the source, times the plan's scale; a root above
-    the pelvis moves along without turning.
+    A mapped joint takes the orientation of its source joint. Any other joint keeps its rest rotation or, if both
+    skeletons are copies of one rig, copies the local rotation of the source joint with its name. Bones keep the lengths
+    of the target. If the source has translations, the target's bones point in the directions of the source's translated
+    bones; if the target is the source skeleton itself, the clip keeps its translations. The pelvis travels as in the
+    source, times the plan's scale; a root above the pelvis moves along without turning.
 
     Parameters
     ----------
@@ -234,7 +235,7 @@ def retarget(clip: Clip, plan: RetargetPlan, bones: FollowedBones | None = None)
 
 
 def moved_bones(clip: Clip, plan: RetargetPlan) -> FollowedBones:
-    """Correct the source's rotations so that its bones point in the directions of its translated joints.
+    """Correct the rotations of a clip so that its bones keep their directions without the clip's translations.
 
     Parameters
     ----------

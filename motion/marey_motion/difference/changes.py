@@ -1,4 +1,4 @@
-"""Changes over matched frames: of the joints' rotations, of the body's path, and of translations."""
+"""Changes between matched frames of two clips: of joint rotations, of the path of the body, and of translations."""
 
 from __future__ import annotations
 

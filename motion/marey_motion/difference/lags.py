@@ -31,9 +31,9 @@ CHANNELS = 8
 
 
 def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
-    """Find shifts at which many frames are equal, by hashing frames.
+    """Find the lags at which many frames of two clips are equal, by hashing frames.
 
-    Frames that occur once in each clip vote for their shift. Of frames that repeat, as in still motion, the first and
+    A frame that occurs once in each clip votes for its lag. Of a frame that repeats, as in still motion, the first and
     the last occurrence vote. Frames are hashed twice, the second time without the root, because a clip may have been
     moved in space.
 
@@ -57,7 +57,7 @@ def exact_lags(before: Poses, after: Poses) -> tuple[int, ...]:
 
 
 def similar_lags(before: Poses, after: Poses, unmatched: AnyInts) -> tuple[int, ...]:
-    """Find shifts at which windows of `before` are most similar to frames of `after`.
+    """Find the lags at which windows of frames of `before` are most similar to frames of `after`.
 
     Each window is compared with every place of the other clip at once, by correlation in the frequency domain.
 

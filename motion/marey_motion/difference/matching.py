@@ -46,7 +46,7 @@ class Matching(NamedTuple):
 
 
 def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matching:
-    """Match the frames of two clips in which the motion has the same speed in frames.
+    """Match the frames of two clips in which the motion runs at the same speed per frame.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def match_frames(before: Poses, after: Poses, *, search: bool = True) -> Matchin
 
 
 def _poorly_matched(matching: Matching, count: int) -> Ints:
-    """Return the frames of the old clip that are unmatched, or matched with a different frame."""
+    """Return the frames of the old clip that have no match, or whose match costs more than `WELL_MATCHED`."""
     well = np.zeros(count, dtype=np.bool_)
     well[matching.pairs[matching.costs <= WELL_MATCHED, 0]] = True
     return np.flatnonzero(~well)
@@ -87,7 +87,7 @@ class _Diagonal(NamedTuple):
 
 
 def _cheapest(before: Poses, after: Poses, lags: Sequence[int]) -> Matching:
-    """Find the cheapest path through the diagonals of the lags."""
+    """Find the cheapest matching whose pairs of frames all have one of the given lags."""
     diagonals = [_diagonal(before, after, lag) for lag in lags if -before.frame_count < lag < after.frame_count]
     reached = [_start_cost(one) + one.costs for one in diagonals]
     for _ in range(MOST_ROUNDS):

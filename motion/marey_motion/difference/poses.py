@@ -144,9 +144,9 @@ def _steps(first: Poses, second: Poses, rows: AnyInts, others: AnyInts) -> NDArr
 
 
 def _chords(before: Poses, after: Poses, pairs: AnyInts) -> NDArray[np.float32]:
-    """Return the distances (n, J) of quaternions: 2·sin(a / 4) for the angle a.
+    """Return the distances (n, J) between paired quaternions: 2·sin(a / 4) for rotations that differ by the angle a.
 
-    Unlike the angle from a scalar product, they are exact near 0.
+    Unlike an angle computed from a scalar product, such a distance is exact near 0.
     """
     steps = _steps(before, after, pairs[:, 0], pairs[:, 1])
     return np.asarray(np.sqrt(np.einsum("fjc,fjc->fj", steps, steps)), dtype=np.float32)

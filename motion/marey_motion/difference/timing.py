@@ -118,7 +118,7 @@ def _better(best: Timing, before: Poses, after: Poses, pace: float, *, search: b
 
 
 def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing:
-    """Match the frames of two clips at a pace."""
+    """Sample the old clip at a pace, and match the samples with the frames of the new clip."""
     sampled = before
     if pace != Pace(1.0):
         count = int((before.frame_count - 1 - pace.phase) * pace.frames + ROUNDED_FRAMES) + 1

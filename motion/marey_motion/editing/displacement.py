@@ -51,8 +51,8 @@ def windows_around(frames: AnyInts, blend_frames: int, frame_count: int) -> tupl
 
     Parameters
     ----------
-    frames : (n,) int    increasing
-    blend_frames : int    frames on either side; 0 changes only the given frames
+    frames : (n,) int    increasing frame numbers
+    blend_frames : int    number of frames on either side that may change, too; 0 changes only the given frames
     frame_count : int    frames of the motion
 
     Returns

@@ -36,11 +36,11 @@ class PoseOffset(NamedTuple):
     translations: Floats
 
     def times(self, factor: float) -> PoseOffset:
-        """Multiply the offset.
+        """Multiply the offset by a number.
 
         Parameters
         ----------
-        factor : float    factor
+        factor : float    the number
 
         Returns
         -------
@@ -118,7 +118,7 @@ def step_of(motion: Motion, frame: int) -> PoseOffset:
 
 
 def seam_offset(before: Motion, after: Motion) -> tuple[PoseOffset, PoseOffset]:
-    """Compute the offset, and its change per frame, with which the start of a motion continues the end of another.
+    """Compute the offset, and its change per frame, that make `after` continue `before` in pose and velocity.
 
     The step across the seam belongs to neither motion. It is estimated as the mean of the last step before and the
     first step after the seam.

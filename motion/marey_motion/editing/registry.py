@@ -1,7 +1,8 @@
 """Table of all commands by name, and functions that apply lists of commands to clips.
 
-A command is a model of `marey_schemas.editing`, which declares its parameters. The function of the same name receives a
-take and the command, and returns one or more takes. It is pure: the same take and command give the same bytes.
+A command is an instance of a Pydantic model in `marey_schemas.editing`, which declares its parameters. The function of
+the same name receives a take and the command, and returns one or more takes. The function is pure: the same take and
+command give the same bytes.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ class EditedBody:
 
     @cached_property
     def matching(self) -> MatchingBody:
-        """Hips, shoulders, feet and toes. Raises `MappingError` naming the standard joints that are missing."""
+        """Joints of hips, shoulders, feet and toes. Raises `MappingError` naming the missing standard joints."""
         return MatchingBody.from_mapping(self.skeleton, self.mapping)
 
 
@@ -94,7 +94,7 @@ class Take:
     frame_rate_hz : frames per second
     body : the skeleton and its standard joints
     sources : other clips, by the names that commands use
-    findings : findings of the commands so far
+    findings : values that the commands reported so far
     pieces : for each split that was applied, the number of the piece that contains this motion, counted from 1
     most_numbers : largest number of values that the motion may have
     budget : remaining work of the whole edit

@@ -300,7 +300,7 @@ def _part(standard: str) -> str:
 
 
 def _twist(standard: str, body: _PosedBody) -> Floats:
-    """Compute the unit direction (3,) of a joint's bone in its frame."""
+    """Compute the unit direction (3,) of a joint's bone in the frame of the joint."""
     side, _, joint = standard.partition("_")
     prefix, joint = (f"{side}_", joint) if side in SIDES else ("", standard)
     for target in _TOWARDS.get(joint, ()):

@@ -139,7 +139,7 @@ def _readings(tree: BoneTree, pair: LimbPair, build: Build) -> list[LimbReading]
 
 
 def _likeliest_first(reading: LimbReading) -> tuple[float, int, int, int]:
-    """Make the key that sorts interpretations of limbs: highest score first, then by joints.
+    """Make the key that sorts interpretations of limbs by falling score, and those of equal score by their joints.
 
     Of several joints at the same position, the one farthest down the chain is preferred as hip, knee, shoulder or
     elbow, and the one nearest to the root as ankle or wrist.

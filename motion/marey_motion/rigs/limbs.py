@@ -70,7 +70,7 @@ class BoneTree:
             self.depth[parent] = max(self.depth[parent], 1 + self.depth[joint])
 
     def path_to_root(self, joint: int) -> tuple[int, ...]:
-        """List the joints up to the root, computed once for each joint.
+        """List the joints from one joint up to the root; the list is computed once for each joint.
 
         Parameters
         ----------
@@ -128,7 +128,7 @@ class BoneTree:
         return tuple(pairs)
 
     def are_apart(self, legs: LimbPair, arms: LimbPair) -> bool:
-        """Check whether two pairs start at different joints, neither on the limbs of the other.
+        """Check whether two pairs of limbs start at different joints, neither of which is on a limb of the other pair.
 
         Parameters
         ----------

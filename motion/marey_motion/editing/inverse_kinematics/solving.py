@@ -404,7 +404,7 @@ def limb_targets(
     Returns
     -------
     (PositionTarget, OrientationTarget or None) or None    None if there is no limb, if the position is not given in all
-        axes, or if there are more targets than these two
+        axes, or if there are other targets
     """
     positions = [target for target in targets if isinstance(target, PositionTarget)]
     orientations = [target for target in targets if isinstance(target, OrientationTarget)]

@@ -62,7 +62,7 @@ def _weighed(angle, zone):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bent(upper, fore, wished, hinge):  # type: ignore[no-untyped-def]
-    """Compute the lower bone's vector at the inner angle `wished` to the reversed upper bone."""
+    """Compute the vector of the lower bone that forms the inner angle `wished` with the reversed upper bone."""
     back, way = direction(upper), direction(fore)
     axis = cross(back, way)
     hinge = minus(hinge, scaled(back, dot(hinge, back)))

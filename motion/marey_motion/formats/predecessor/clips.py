@@ -122,7 +122,7 @@ def write_predecessor(clip: Clip, *, form: ClipForm = "poses", encoding: Encodin
 def write_predecessor_skeleton(
     skeleton: Skeleton, *, form: SkeletonForm = "database", encoding: Encoding = "json"
 ) -> bytes:
-    """Write a skeleton document, in the form of the data base or of files.
+    """Write a skeleton document, in the form of the predecessor's data base or in the form of its files.
 
     Parameters
     ----------

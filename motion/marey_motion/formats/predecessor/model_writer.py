@@ -113,7 +113,7 @@ def _flat_document(primitive: MotionPrimitive, animated_joints: tuple[str, ...])
 
 
 def _space(primitive: MotionPrimitive, animated_joints: tuple[str, ...]) -> tuple[Floats, Floats]:
-    """Convert mean (n, D) and components (k, n, D) of these joints to centimetres, relative to the root's offset."""
+    """Compute mean (n, D) and components (k, n, D) of the animated joints; the root in cm, relative to its offset."""
     columns = columns_of(animated_joints, primitive.skeleton)
     mean = primitive.spatial.mean[:, columns].copy()
     vectors = primitive.spatial.directions[..., columns].copy()

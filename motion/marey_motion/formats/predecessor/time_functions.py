@@ -104,9 +104,10 @@ def as_log_slopes(
 
 
 def components_of(basis: SplineBasis, mean: Floats, directions: Floats, variances: Floats) -> FunctionalComponents:
-    """Make components with the projections that invert their directions.
+    """Make components from directions; their projections are the pseudo-inverse of the directions.
 
-    The variance that the components do not explain is unknown, so the energy is that of the components alone.
+    The variance that the components do not explain is unknown. `energy` therefore contains shares of the variance that
+    the components explain together.
 
     Parameters
     ----------
