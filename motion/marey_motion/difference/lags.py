@@ -13,14 +13,14 @@ from marey_motion.difference.poses import Poses
 MOST_LAGS = 16
 """Maximum number of candidates from each of the two methods."""
 WINDOWS = 12
-"""Number of windows of the old clip that are searched in the whole clip after."""
+"""Number of windows of the old clip that are searched for in the whole new clip."""
 SHORTEST_WINDOW = 8
 SIMILAR = 4.0
 """Multiple of the least squared distance up to which the second-best place of a window is a candidate, too."""
 NEGLIGIBLE = 1e-3
 """Squared distance of two frames that is attributed to noise."""
 GREATEST_PACE = 4.0
-"""Greatest pace that is tried, in frames after per frame before; the least is 1 / `GREATEST_PACE`."""
+"""Greatest pace that is tried, in new frames per old frame; the least pace is 1 / `GREATEST_PACE`."""
 PACES = 97
 DECIMATED = 2048
 """Approximate number of frames of the longer clip that are used to search paces."""

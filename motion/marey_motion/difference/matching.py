@@ -17,7 +17,7 @@ from marey_motion.difference.lags import exact_lags, similar_lags
 from marey_motion.difference.poses import Poses, frame_costs
 
 UNMATCHED = 0.25
-"""Cost of a removed or inserted frame. Two frames that differ by more than twice as much are removed and inserted."""
+"""Cost of a removed or inserted frame. If a pair costs more than twice this, one is removed and the other inserted."""
 NEW_RUN = 1.0
 """Cost of a change of the lag inside the clips."""
 AT_AN_END = 0.995

@@ -19,7 +19,7 @@ WELL_EXPLAINED = 0.98
 MUCH_BETTER = 0.5
 """Another pace is chosen only if its cost is less than this share of the cost at the best pace so far."""
 SIMILAR_ENOUGH = 0.1
-"""Cost, as a share of the greatest one, up to which no pace is searched, unless there are `MANY_RUNS` or more runs."""
+"""A matching that costs at most this share of the greatest cost, and has fewer than `MANY_RUNS` runs, is accepted."""
 MANY_RUNS = 8
 MOST_REFINEMENTS = 8
 FEWEST_PAIRS = 8

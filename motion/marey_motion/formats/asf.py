@@ -143,8 +143,9 @@ def skeleton_source(skeleton: AsfSkeleton) -> SourceMotion:
 
 _LONGEST_KEPT = 1 << 18
 _KNOWN: LruCache[bytes, AsfSkeleton] = LruCache(max_entries=32)
-"""Cache of the skeletons parsed last, by digest of their file, since many AMC files share one ASF. They must not
-change.
+"""Cache of the skeletons parsed last, by digest of their file, since many AMC files share one ASF.
+
+The cached skeletons must not be changed.
 """
 
 
