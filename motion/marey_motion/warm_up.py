@@ -102,7 +102,7 @@ def _is_done() -> bool:
 
 
 def _record(state: str) -> None:
-    """Write the digest of the sources and `state`, such as that compilation is done, to `STAMP` if that is writable."""
+    """Write the digest of the sources and the state of the compilation to `STAMP`, if its folder is writable."""
     if os.access(STAMP.parent, os.W_OK):
         STAMP.write_text(f"{_origin()} {state}", "utf-8")
 

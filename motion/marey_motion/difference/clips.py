@@ -94,7 +94,7 @@ def compare_clips(
 
 
 def _carrier(before: Clip, after: Clip, pairing: JointPairs) -> int:
-    """Return the index, among the paired joints, of the first joint that moves; its path represents the body's."""
+    """Return the index, among the paired joints, of the first joint that moves, whose path is used as the body's."""
     if any(float(np.ptp(clip.root_translations, axis=0).max()) > STILL_M for clip in (before, after)):
         return 0
     for place, joints in enumerate(zip(pairing.before, pairing.after, strict=True)):

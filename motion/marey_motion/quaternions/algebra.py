@@ -144,8 +144,8 @@ def between_vectors(start: ArrayLike, end: ArrayLike, *, half_turn_axis: ArrayLi
     """Compute the shortest rotations from one direction to another.
 
     Opposite directions have no unique shortest rotation. For them, the result is half a turn about the component of
-    `half_turn_axis` that is perpendicular to `start`. If the argument is None or parallel to `start`, the coordinate
-    axis with the largest angle to `start` is used in its place.
+    `half_turn_axis` that is perpendicular to `start`. If `half_turn_axis` is None or parallel to `start`, the
+    coordinate axis with the largest angle to `start` is used in its place.
 
     Parameters
     ----------
