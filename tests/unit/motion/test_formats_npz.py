@@ -109,7 +109,7 @@ def test_a_wrong_member_is_named(archive: dict[str, bytes], name: str, content: 
     ("members", "words"),
     [
         (("poses", "trans", "betas", "mocap_framerate"), "a skeleton's bones; pose the model"),
-        (("positions", "fps"), "the archive has positions, fps"),
+        (("positions", "fps"), "the archive has the members positions, fps"),
         ((), "the archive has no members"),
     ],
 )

@@ -98,7 +98,7 @@ def test_labels_that_overlap_can_be_read_one_by_one() -> None:
         ({"sections": "{"}, "'sections' cannot be read"),
         ({"sections": [{"start_idx": 1, "end_idx": 99}]}, "within the clip's frames 0:40"),
         ({"sections": [{"start_idx": 5, "end_idx": 3}]}, "the end of a segment must be after its start"),
-        ({"semantic_annotation": {"a": [1.5]}}, "whole numbers"),
+        ({"semantic_annotation": {"a": [1.5]}}, "must be a whole number"),
         ({"semantic_annotation": {"a": ["x"]}}, "'a'"),
         ({"semantic_annotation": {"a": [True]}}, "list of frame numbers"),
         ({"semantic_annotation": {"a": [-3]}}, "within the clip's frames 0:40"),
