@@ -37,7 +37,7 @@ class Scope(StrEnum):
 
 
 class EndTokens(StrEnum):
-    """Tokens of a user to revoke when the user is changed; the token of the request itself stays valid."""
+    """Choice of the tokens that a change of a user revokes; the token of the request itself always stays valid."""
 
     NONE = "none"
     SESSIONS = "sessions"
@@ -110,19 +110,19 @@ class TokenCreate(Request):
         90 * 86400,
         ge=60,
         le=10 * 365 * 86400,
-        description="Time until the token ends; null if it never does. A token cannot outlive the one that creates it; "
-        "by default it ends after 90 days, or with that one if that is sooner.",
+        description="Seconds until the token ends; null: it never ends. A token cannot end later than the token that "
+        "creates it. If absent, the token ends after 90 days, or with the token that creates it if that ends sooner.",
     )
     labels: dict[str, str] | None = Field(
         None,
         description="Labels that a worker with this token may announce, by name; only for tokens with the scope "
-        "`work`. Jobs that require other labels cannot be claimed with it. Null: the labels of the token that creates "
-        "it, if it is bound to labels, else any.",
+        "`work`. Jobs that require other labels cannot be claimed with this token. Null: the labels of the token that "
+        "creates this one if that is bound to labels, else any labels.",
     )
 
 
 class TokenRotation(Request):
-    """Request to replace the token that authenticates it by a new token with the same rights and the same expiry."""
+    """Request to replace the token that authenticates this request by a new one with the same rights and expiry."""
 
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
@@ -130,7 +130,7 @@ class TokenRotation(Request):
         "gets the same successor. Keep it as secret as the token until you have the answer.",
     )
     grace_s: int = Field(
-        3600, ge=60, le=7 * 86400, description="Time for which the replaced token remains valid, unless it ends sooner."
+        3600, ge=60, le=7 * 86400, description="Seconds for which the replaced token remains valid, at most to its end."
     )
 
 
@@ -147,7 +147,9 @@ class Token(Answer):
     user: str | None = Field(None, description="The name of the user to whom the token belongs.")
     session: bool = Field(False, description="Whether a sign-in created the token.")
     created_by: str | None = Field(
-        None, description="The id of the token whose bearer created this one; null for sign-ins and for the server."
+        None,
+        description="The id of the token that authorised the creation of this one; null if a sign-in or the server "
+        "created this token.",
     )
     labels: dict[str, str] | None = Field(
         None, description="The labels that a worker with this token may announce; null: any."

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 MOST_STEPS = 64
-"""Greatest exponent of the growth, so that numbers do not overflow; the delay reaches its limit before."""
+"""Greatest exponent of the growth factor, so that numbers do not overflow."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Backoff:
     ----------
     first_s : seconds to wait after the first failure
     longest_s : longest wait in seconds
-    factor : growth of the wait from one failure to the next
+    factor : factor by which the wait grows with each failure
     jitter : largest share of a wait that is subtracted at random, from 0 to 1
     random_unit : function that returns a random number in [0, 1); tests replace it to make the waits predictable
     """

@@ -46,15 +46,16 @@ class FileFormat:
 
     Parameters
     ----------
-    name : name in choices and options, and of the modules of its reader and writer
-    endings : endings of file names, lower case; folders are searched for them, and the first is the one written
+    name : name of the format in options, and of its module in `marey_motion.formats`
+    endings : endings of file names in lower case; the first is that of written files, and a search of a folder for
+        files to import uses all of them
     media_type : media type of written files
-    reads, writes : contents that its reader understands and its writer can write
+    reads, writes : contents that the reader understands, and contents that can be written
     units : units of length in which files can be written; if there are several, the caller chooses one
-    begins : pattern that only the beginning of such a file matches; None if the name alone identifies it
-    other_endings : endings that identify a named file, but that folders are not searched for
+    begins : pattern that only the beginning of such a file matches; None if the name alone identifies the format
+    other_endings : endings that also identify the format of a named file, but are ignored in a search of a folder
     euler : whether rotations are Euler angles; an export keeps the rotation orders of the imported file
-    archive : whether files are ZIP archives with an ending of their own
+    archive : whether files are ZIP archives, although their ending is not `.zip`
     companion : format of a second file that the reader also needs or accepts
     needs_companion : reason why the second file is needed; empty if it is optional
     unread : reason why there is no reader, for formats that users may expect
@@ -75,7 +76,7 @@ class FileFormat:
     unread: str = ""
 
     def names(self, file: str) -> bool:
-        """Return whether a file name has one of the endings."""
+        """Return whether a file name has one of the endings of the format."""
         return file.lower().endswith(self.endings + self.other_endings)
 
 
@@ -153,7 +154,7 @@ _BY_NAME = {one.name: one for one in FORMATS}
 
 
 def format_named(name: str) -> FileFormat:
-    """Return the format of that name. Raises `KeyError`."""
+    """Return the format with the given name. Raises `KeyError` if there is none."""
     return _BY_NAME[name]
 
 

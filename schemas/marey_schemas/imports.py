@@ -56,7 +56,10 @@ def refused_entry(name: str, refusal: Refusal) -> ImportEntry:
 
 
 def skeleton_output(file_name: str) -> str:
-    """Return the name of an import job's output for a file's skeleton; the clip has the file's own name."""
+    """Return the name of the output with a file's skeleton, among the outputs of an import job.
+
+    The output with the file's clip has the name of the file.
+    """
     return f"{file_name}#skeleton"
 
 

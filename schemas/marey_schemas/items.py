@@ -58,23 +58,25 @@ class ItemRevert(Request):
     """Request to give an item the content of an earlier revision."""
 
     revision: int = Field(ge=1, le=(1 << 31) - 1)
-    message: Message = Field("", description="Message of the new revision; empty: a sentence that names the old one.")
+    message: Message = Field(
+        "", description="Message of the new revision; empty: a sentence that names the earlier revision."
+    )
 
 
 class HidingCondition(Answer):
-    """Condition of a query, with the number of items that do not meet it."""
+    """Condition of a query, with the numbers of items that it excludes."""
 
     condition: str
     hides: int = Field(description="Number of items that do not meet this condition.")
-    alone: int = Field(description="Number of items that meet all conditions but this one.")
+    alone: int = Field(description="Number of items that meet all other conditions, but not this one.")
 
 
 class QueryExplanation(Answer):
-    """Numbers of items that a query selects and hides."""
+    """Number of items that a query selects, and the numbers of items that its conditions exclude."""
 
     items: int = Field(description="Number of items that the query was applied to.")
     selected: int
-    conditions: tuple[HidingCondition, ...] = Field(description="Conditions of which a selected item meets all.")
+    conditions: tuple[HidingCondition, ...] = Field(description="Conditions that every selected item meets.")
 
 
 class PartSummary(Answer):
@@ -124,7 +126,7 @@ class Item(Answer):
 
     @property
     def path(self) -> str:
-        """Collection and name."""
+        """The collection and the name, joined by `/`."""
         return f"{self.collection}/{self.name}".lstrip("/")
 
 
@@ -185,7 +187,7 @@ class Page(Answer):
 
 
 class BlobsQuery(Request):
-    """Query for the given blobs that the server does not have; blobs that the caller may not read count as missing."""
+    """Query that asks which of the given blobs the server lacks, including those that the caller may not read."""
 
     digests: tuple[str, ...] = Field(max_length=10_000)
 
@@ -213,7 +215,7 @@ class Upload(Answer):
 
 
 class Event(Answer):
-    """Event in a project; events are ordered by the time of their commit."""
+    """Event in a project; events are ordered by the time at which their database transaction was committed."""
 
     seq: int
     at: datetime

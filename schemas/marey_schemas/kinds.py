@@ -65,4 +65,4 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
     Kind.METRIC: {"metric": PartSpec("marey/document@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/document@1", True)},
 }
-"""Parts by kind. `marey/document@1` is the open document of kinds whose own schema is not fixed yet."""
+"""Parts by kind of item. Kinds whose schema is not fixed yet use `marey/document@1`, which allows any members."""

@@ -31,7 +31,10 @@ class LineageOptions(Options):
         "both", description="`inputs`: what the revision was made from; `results`: what was made from it; `both`."
     )
     depth: int = Field(
-        MOST_REVISIONS, ge=1, le=MOST_REVISIONS, description="Greatest number of jobs between the start and a revision."
+        MOST_REVISIONS,
+        ge=1,
+        le=MOST_REVISIONS,
+        description="Greatest number of jobs between the start and a revision that the graph contains.",
     )
 
 
@@ -48,13 +51,17 @@ class LineageRevision(Answer):
     kind: Kind
     path: str = Field(description="Current folder and name of the item.")
     revision: int
-    newest: int = Field(description="Newest revision of the item. If it is greater than `revision`, this one is old.")
+    newest: int = Field(
+        description="Newest revision of the item. If it is greater than `revision`, `revision` is outdated."
+    )
     deleted: bool = False
     distance: int = Field(
         description="Number of jobs between the start and this revision: negative for inputs, positive for results."
     )
     job: str | None = Field(
-        None, description="Job that created the revision, or the parent of the task that did; absent: not a job."
+        None,
+        description="Job that created the revision; if a task created it, the parent job of the task; absent: no job "
+        "created it.",
     )
     created_at: datetime
 
@@ -62,8 +69,8 @@ class LineageRevision(Answer):
 class LineageLink(Answer):
     """A revision that a job used in order to create another one."""
 
-    source: int = Field(description="Position of the revision that was used in `revisions`.")
-    result: int = Field(description="Position of the revision that was created in `revisions`.")
+    source: int = Field(description="Index, in `revisions`, of the revision that was used.")
+    result: int = Field(description="Index, in `revisions`, of the revision that was created.")
     role: str = Field(description="Name of the job input for which the source was used.")
 
 
@@ -92,7 +99,7 @@ class LineageGroup(NamedTuple):
 
     Parameters
     ----------
-    revisions : positions in the revisions of the graph, in the order of the graph
+    revisions : indices into `LineageGraph.revisions`, in ascending order
     """
 
     revisions: tuple[int, ...]
@@ -101,7 +108,7 @@ class LineageGroup(NamedTuple):
 
 
 class GroupLink(NamedTuple):
-    """Links from a group of revisions to a group that was made from it, with the number of revisions that were used."""
+    """Links from a group of revisions to a group that jobs made from it, and the number of revisions that they used."""
 
     source: int
     result: int

@@ -10,9 +10,7 @@ from marey_schemas.base import Request
 
 
 def in_centimetres(name: str) -> Any:
-    """Declare a field of release 0.1 that contains, in centimetres, the value that the field `name` now contains in
-    metres.
-    """
+    """Declare a deprecated field of release 0.1: the value in centimetres that `name` contains in metres."""
     return Field(
         None,
         exclude=True,
@@ -22,7 +20,10 @@ def in_centimetres(name: str) -> Any:
 
 
 def read_old_unit(model: Request, name: str, old: str) -> None:
-    """Convert a value in centimetres to the field in metres. Raises `ValueError` if both are given."""
+    """Move the value of the field `old`, in centimetres, to the field `name`, in metres.
+
+    Raises `ValueError` if both fields are given.
+    """
     centimetres = getattr(model, old)
     if centimetres is None:
         return

@@ -29,7 +29,7 @@ SearchConstraints = Annotated[tuple[SearchConstraint, ...], Field(max_length=MOS
 
 
 class StartPlacement(Request):
-    """Start of a motion: position and heading of the model's canonical frame in the world."""
+    """Start of a motion: position and heading, in the world, of the coordinate frame of the model."""
 
     x: Coordinate = Field(0.0, description="Position along x, in metres.")
     z: Coordinate = Field(0.0, description="Position along z, in metres.")
@@ -52,7 +52,7 @@ class SearchRequest(RefineOptions):
         (), description="Constraints on a single motion; for several motions, use `steps`."
     )
     steps: tuple[SearchStep, ...] = Field(
-        (), max_length=MOST_STEPS, description="Several motions; each begins where the one before it ends."
+        (), max_length=MOST_STEPS, description="Several motions; each begins where the previous motion ends."
     )
     start: StartPlacement = StartPlacement()
     candidates: int = Field(
@@ -71,8 +71,8 @@ class SearchRequest(RefineOptions):
     refine: bool = Field(True, description="Improve the result of the tree by numerical optimisation.")
     transition_tolerance_m: Distance = Field(
         TRANSITION_TOLERANCE_M,
-        description="Discontinuity of hands, feet and height between two steps at which the weighted error "
-        "is 1, in metres.",
+        description="Distance, in metres, by which hands, feet and the height of the pelvis may jump between two "
+        "steps; it counts as an error of 1.",
     )
     transition_tolerance_cm: Tolerance | None = in_centimetres("transition_tolerance_m")
     finish: bool = Field(False, description="Remove the remaining errors of joint positions by inverse kinematics.")
@@ -107,7 +107,7 @@ class SearchRequest(RefineOptions):
 
 
 class ConstraintError(Answer):
-    """Error of a constraint; the unit is at the end of the field's name."""
+    """Error of a constraint before inverse kinematics, in one of the fields `error_cm`, `error_deg` and `error_s`."""
 
     step: int = Field(description="Index of the step, from 0.")
     constraint: int = Field(description="Index of the constraint within its step, from 0.")
@@ -116,9 +116,13 @@ class ConstraintError(Answer):
     error_cm: float | None = None
     error_deg: float | None = None
     error_s: float | None = None
-    searched_error: float = Field(description="Error after the search of the tree, in the same unit.")
-    finished_error: float | None = Field(None, description="Error after inverse kinematics, in the same unit.")
-    reached: bool = Field(description="Whether the final error is within the tolerance.")
+    searched_error: float = Field(
+        description="Error after the search of the tree and before numerical optimisation, in the unit of the error."
+    )
+    finished_error: float | None = Field(
+        None, description="Error after inverse kinematics, in the unit of the error; null without inverse kinematics."
+    )
+    reached: bool = Field(description="Whether the error of the answered motion is within the tolerance.")
 
 
 class FoundStep(Answer):
@@ -138,7 +142,8 @@ class FoundStep(Answer):
     placement: StartPlacement
     jumps_cm: dict[str, float] = Field(
         default_factory=dict,
-        description="Discontinuity of the joints and of the root between the step before and this one.",
+        description="Distances, in centimetres, by which the root and joints jump between the previous step and this "
+        "one, by joint.",
     )
     evaluations: int = Field(description="Number of motions that the search of the tree evaluated.")
 
@@ -150,7 +155,7 @@ class SearchAnswer(Answer):
     errors: tuple[ConstraintError, ...]
     reached: bool = Field(description="Whether all constraints are met.")
     out_of_reach: tuple[int, ...] = Field(
-        (), description="Indices of the entries of `errors` that are above 5 cm before inverse kinematics."
+        (), description="Indices of the entries of `errors` whose error exceeds 5 cm before inverse kinematics."
     )
     iterations: int = Field(description="Number of iterations of the optimisation.")
     motion: MotionDocument | None = None

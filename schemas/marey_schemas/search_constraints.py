@@ -1,6 +1,7 @@
 """Constraints on a motion at a moment: position or orientation of a joint, place and heading of the body, and time.
 
-Positions and directions are in the world. Each constraint has a tolerance, the error that counts as 1, and a weight.
+Positions and directions are in the world. The error of each constraint is divided by the tolerance of the constraint,
+and weighted by its weight, before the errors of several constraints are added up.
 """
 
 from __future__ import annotations
@@ -62,7 +63,9 @@ class _SearchConstraint(Tagged):
 
 
 class _PositionConstraint(_SearchConstraint):
-    tolerance_m: Distance = Field(0.01, description="Distance in metres at which the weighted error is 1.")
+    tolerance_m: Distance = Field(
+        0.01, description="Distance from the target, in metres, that counts as an error of 1."
+    )
     tolerance_cm: Tolerance | None = in_centimetres("tolerance_m")
 
     @model_validator(mode="after")
@@ -72,7 +75,7 @@ class _PositionConstraint(_SearchConstraint):
 
 
 class _AngularConstraint(_SearchConstraint):
-    tolerance_deg: Tolerance = Field(5.0, description="Angle in degrees at which the weighted error is 1.")
+    tolerance_deg: Tolerance = Field(5.0, description="Angle to the target, in degrees, that counts as an error of 1.")
 
 
 class JointPositionConstraint(_PositionConstraint):
@@ -104,12 +107,15 @@ class LookDirectionConstraint(_AngularConstraint):
     point_m: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="Target point (x, y, z) in the world, in metres, instead of a direction."
     )
-    axis: Direction = Field((0.0, 0.0, 1.0), description="Axis that points there, in the joint's own frame.")
+    axis: Direction = Field(
+        (0.0, 0.0, 1.0),
+        description="Axis, in the joint's own frame, that must point in the direction or at the point.",
+    )
 
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if (self.direction is None) == (self.point_m is None):
-            raise _invalid("give either direction or point_m")
+            raise _invalid("give exactly one of direction and point_m")
         return self
 
 
@@ -130,11 +136,11 @@ class RootHeadingConstraint(_AngularConstraint):
 
 
 class KeyframeTimeConstraint(_SearchConstraint):
-    """Constraint that a keyframe is reached at a time after the beginning of the motion."""
+    """Constraint that a keyframe is reached at a given time, counted from the beginning of the motion."""
 
     type: Literal["keyframe_time"] = "keyframe_time"
     seconds: float = Field(ge=0, le=1e6, allow_inf_nan=False, description="Seconds after the beginning of the motion.")
-    tolerance_s: Tolerance = Field(0.05, description="Deviation in seconds at which the weighted error is 1.")
+    tolerance_s: Tolerance = Field(0.05, description="Deviation in seconds that counts as an error of 1.")
 
 
 SearchConstraint = Annotated[

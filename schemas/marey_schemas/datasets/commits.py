@@ -27,7 +27,7 @@ EntryPath = Annotated[
 
 
 class PutEntry(Tagged):
-    """Change that adds or replaces an entry by a revision of an item of the project."""
+    """Change that sets the content of an entry, new or existing, to that of a revision of an item of the project."""
 
     tag = "change"
     change: Literal["put"] = "put"
@@ -66,19 +66,22 @@ class CommitCreate(Request):
     changes: tuple[EntryChange, ...] | None = Field(
         None,
         max_length=MOST_CHANGES,
-        description="Changes of the newest version of the branch; null: record the content of the dataset's folder.",
+        description="Changes to apply to the newest version of the branch; null: record the content of the dataset's "
+        "folder.",
     )
     expected: Digest | None = Field(
-        None, description="Commit that the branch must be at; null: whichever commit it is at."
+        None, description="Digest that the newest commit of the branch must have; null: any."
     )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
-        None, description="Name that the client chooses for this commit; a repeated request gets the same commit."
+        None,
+        description="Name that the client chooses for this commit; a repeated request with the same name gets the "
+        "same commit.",
     )
 
     @model_validator(mode="after")
     def _has_changes(self) -> CommitCreate:
         if self.changes == ():
-            raise ValueError("the list of changes is empty")
+            raise ValueError("changes: the list is empty; give at least one change, or omit `changes`")
         return self
 
 
@@ -86,7 +89,7 @@ class Commit(Answer):
     """One version of a dataset."""
 
     digest: str
-    tree: str = Field(description="Digest of the entries; versions with the same entries have the same.")
+    tree: str = Field(description="Digest of the entries; versions with the same entries have the same digest.")
     parents: tuple[str, ...]
     author: str
     message: str
@@ -106,11 +109,13 @@ class Entry(Answer):
 
 
 class Origin(Answer):
-    """Commit that last changed a part, the tags or the path of an entry."""
+    """Commit that last changed one part, the tags or the path of an entry."""
 
     commit: Commit
-    path: str = Field(description="Path of the entry in that commit; it may have been moved since.")
-    certain: bool = Field(description="Whether the commit made the change; false: it or an earlier one did.")
+    path: str = Field(description="Path of the entry in that commit; a later commit may have moved the entry.")
+    certain: bool = Field(
+        description="Whether this commit certainly made the change; false: this commit or an earlier one made it."
+    )
 
 
 class EntryOrigins(Answer):

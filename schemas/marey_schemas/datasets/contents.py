@@ -45,20 +45,23 @@ class ContentsRequest(Request):
 class ReceivedRevision(Request):
     """Revision from an archive or another server."""
 
-    content: Digest = Field(description="Content digest, which the server compares with that of the documents.")
+    content: Digest = Field(
+        description="Content digest of the revision, which the server compares with the digest of the documents."
+    )
     kind: Kind
     path: EntryPath | None = Field(
         description="Path of an entry that has the revision; null: no entry has it, but another revision refers to it."
     )
     parts: dict[PartName, Any] = Field(
         min_length=1,
-        description='Documents in which references to revisions are `{"content": digest}`. In place of a document, '
-        '`{"content": digest}` alone means the same part of a revision that the project has.',
+        description='Documents by part, in which references to revisions are `{"content": digest}`. If the project '
+        "already has a revision with the same document in this part, the document can be replaced by "
+        '`{"content": digest}` with the content digest of that revision.',
     )
 
 
 class ReceivedRevisions(Request):
-    """Revisions from an archive or another server, each after those that it refers to."""
+    """Revisions from an archive or another server, each after the revisions that it refers to."""
 
     revisions: tuple[ReceivedRevision, ...] = Field(min_length=1, max_length=MOST_CONTENTS)
 
@@ -74,7 +77,9 @@ class ReceivedChange(Request):
 
     path: EntryPath
     kind: Kind
-    parts: dict[PartName, Digest] | None = Field(description="Content digest of each part; null: it was removed.")
+    parts: dict[PartName, Digest] | None = Field(
+        description="Content digest of each part; null: the commit removed the entry."
+    )
     tags: tuple[Tag, ...] = Field((), max_length=64)
 
 
@@ -90,5 +95,5 @@ class ReceivedCommit(Request):
     )
     changes: tuple[ReceivedChange, ...] = Field(max_length=MOST_RECEIVED_CHANGES)
     begins: RefName | None = Field(
-        None, description="Branch without commits that begins at this commit; null: no branch moves."
+        None, description="Branch without commits that is set to this commit; null: no branch is changed."
     )

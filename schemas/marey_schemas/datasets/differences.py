@@ -33,10 +33,10 @@ class DatasetDifference(Answer):
 
     before: Commit
     after: Commit
-    counts: dict[ChangeKind, int] = Field(description="Number of entries by change.")
+    counts: dict[ChangeKind, int] = Field(description="Number of differing entries by kind of change.")
     folders: dict[str, dict[ChangeKind, int]] = Field(
-        description="Number of differing entries directly in each folder, by change. Removed entries count where they "
-        "were. At most as many folders as entries are listed."
+        description="Number of differing entries directly in each folder, by kind of change. A removed entry counts in "
+        "the folder that it was in. The limit of the list of entries also limits the number of folders."
     )
     entries: tuple[EntryDifference, ...]
     complete: bool = Field(description="Whether all differing entries are listed and counted.")

@@ -40,9 +40,13 @@ class CombineRequest(Request):
     message: Message = Field("", description="Message of the commit; empty: a sentence that names the versions.")
     resolutions: tuple[Resolution, ...] = Field((), max_length=10_000)
     preview: bool = Field(False, description="Compute the result without recording it.")
-    expected: Digest | None = Field(None, description="Commit that the branch must be at.")
+    expected: Digest | None = Field(
+        None, description="Digest that the newest commit of the branch must have; null: any."
+    )
     write_id: Annotated[str, StringConstraints(min_length=8, max_length=64)] | None = Field(
-        None, description="Name that the client chooses for this change; a repeated request gets the same commit."
+        None,
+        description="Name that the client chooses for this change; a repeated request with the same name gets the "
+        "same commit.",
     )
 
 
@@ -55,11 +59,11 @@ class MergeRequest(CombineRequest):
 class PickRequest(CombineRequest):
     """Request to apply the changes of one commit to a branch (cherry-pick), or to undo them on it (revert)."""
 
-    version: Version = Field(description="Commit whose changes are repeated or undone.")
+    version: Version = Field(description="Commit whose changes are applied or undone.")
     parent: Literal[1, 2] | None = Field(
         None,
-        description="For a merge: the parent with which the commit is compared to find its changes; 1: the branch that "
-        "the merge changed.",
+        description="Parent with which the commit is compared to find its changes; required if the commit is a merge. "
+        "1: the branch that the merge changed; 2: the version that was merged.",
     )
 
 
@@ -80,11 +84,16 @@ class EntryConflict(Answer):
 class MergeAnswer(Answer):
     """Result of a merge, cherry-pick or revert, or of the preview of one."""
 
-    commit: Commit | None = Field(description="New commit of the branch; null for a preview and for conflicts.")
-    base: str | None = Field(description="Digest of the commit with which both sides are compared.")
+    commit: Commit | None = Field(
+        description="New commit of the branch; null for a preview, and if conflicts are unresolved."
+    )
+    base: str | None = Field(
+        description="Digest of the commit with which both sides are compared; null if there is none."
+    )
     ours: str = Field(description="Digest of the newest commit of the branch.")
     theirs: str | None = Field(
-        description="Digest of the commit whose content is merged into the branch; null: before the first commit."
+        description="Digest of the commit whose content is merged into the branch; null: an empty version, because the "
+        "first commit of the dataset is undone."
     )
     changes: int = Field(description="Number of entries of the branch that change.")
     conflicts: tuple[EntryConflict, ...] = Field(description="The first conflicts without a resolution, by path.")
@@ -99,7 +108,7 @@ class CheckoutRequest(Request):
 
 
 class CheckoutAnswer(Answer):
-    """Changes that a checkout has made in the folder of a dataset."""
+    """Result of a checkout, with the numbers of entries that it changed in the folder of a dataset."""
 
     commit: str = Field(description="Digest of the commit that the folder has now.")
     added: int

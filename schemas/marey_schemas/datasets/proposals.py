@@ -32,7 +32,7 @@ class ProposalCreate(Request):
     title: Title
     description: str = Field("", max_length=MOST_TEXT)
     source: Version = Field(
-        description="Version whose changes are proposed. A proposal of a branch includes its later commits."
+        description="Version whose changes are proposed. If it is a branch, the proposal includes its later commits."
     )
     target: RefName = Field(MAIN, description="Branch that gets the changes.")
 
@@ -50,12 +50,18 @@ class CommentCreate(Request):
     @model_validator(mode="after")
     def _names_one_place(self) -> CommentCreate:
         if (self.path is None) != (self.kind is None):
-            raise ValueError("name an entry by its path and its kind, or by neither")
+            raise ValueError(
+                "give both path and kind to comment on an entry, or neither of them to comment on the proposal"
+            )
         if self.frames is not None:
             if self.kind not in WITH_FRAMES:
-                raise ValueError("only clips and annotations have frames; name such an entry")
+                raise ValueError(
+                    "frames: only clips and annotations have frames; give path and kind of such an entry, or no frames"
+                )
             if self.frames[0] >= self.frames[1]:
-                raise ValueError("the second number of frames must be greater than the first")
+                raise ValueError(
+                    f"frames: the end, frame {self.frames[1]}, must be after the start, frame {self.frames[0]}"
+                )
         return self
 
 
@@ -70,7 +76,7 @@ class ReviewCreate(Request):
 
 
 class CheckReport(Request):
-    """Report of the state of a check of a proposal's newest commit; it replaces the previous report of this check."""
+    """Report of the state of a check for a proposal's newest commit; it replaces this check's previous report."""
 
     name: CheckName
     state: CheckState
@@ -79,8 +85,8 @@ class CheckReport(Request):
     )
     job: ItemId | None = Field(
         None,
-        description="Job of the project that checks; a success is refused unless this job has succeeded, and has read "
-        "the newest commit if its inputs are versions of datasets.",
+        description="Job of the project that carries out the check. The state `succeeded` is refused unless this job "
+        "has succeeded. A job whose inputs are versions of datasets must also have read the newest commit.",
     )
     link: Annotated[str, StringConstraints(max_length=2000, pattern=r"^https?://[^\s\x00-\x1f\x7f]+$")] | None = Field(
         None, description="Address of a page about the check."
@@ -98,16 +104,16 @@ class ProposalMerge(Request):
     )
     when_green: bool = Field(
         False,
-        description="If something is missing, merge as soon as a review or a check adds the last missing thing. A "
-        "later commit of the proposal ends this.",
+        description="If approvals, checks or other requirements are still missing, merge as soon as a review or a "
+        "check meets the last one. A later commit of the proposal cancels this.",
     )
 
     @model_validator(mode="after")
     def _can_wait(self) -> ProposalMerge:
         if self.when_green and (self.resolutions or self.message):
             raise ValueError(
-                "a merge that waits for reviews and checks cannot have resolutions or a message; "
-                "resolve conflicts by a commit first"
+                "when_green: a merge that waits for reviews and checks cannot have resolutions or a message; omit "
+                "them, and resolve conflicts by a commit first"
             )
         return self
 
@@ -122,13 +128,18 @@ class Proposal(Answer):
     state: ProposalState
     source: str = Field(description="Version whose changes are proposed, as the author named it.")
     target: str = Field(description="Branch that gets the changes.")
-    head: str = Field(description="Digest of the proposed commit: the newest one, or the last one when it ended.")
-    target_commit: str | None = Field(
-        description="Digest of the newest commit of the target; after the end of the proposal, the one before its end."
+    head: str = Field(
+        description="Digest of the newest proposed commit; in a proposal that has ended, the one that was the newest "
+        "at that time."
     )
-    merged: str | None = Field(description="Digest of the commit that the merge made.")
+    target_commit: str | None = Field(
+        description="Digest of the newest commit of the target; in a proposal that has ended, the one that was the "
+        "newest just before that time."
+    )
+    merged: str | None = Field(description="Digest of the commit that the merge made; null if it is not merged.")
     when_green: str | None = Field(
-        description="User on whose behalf the proposal is merged as soon as nothing is missing."
+        description="User on whose behalf the proposal is merged as soon as no requirement is missing; null: nobody "
+        "has requested this."
     )
     ended_by: str | None = Field(description="User who merged or closed the proposal.")
     created_at: datetime
@@ -183,11 +194,13 @@ class Missing(Answer):
 
 
 class Mergeability(Answer):
-    """Result that a merge of the proposal would have at the moment."""
+    """Result that a merge of the proposal would have now."""
 
-    missing: tuple[Missing, ...] = Field(description="Reasons for which it cannot be merged yet; empty: it is green.")
+    missing: tuple[Missing, ...] = Field(
+        description="Reasons why the proposal cannot be merged yet; empty: it can be merged."
+    )
     changes: int | None = Field(
-        description="Number of entries that would change; null: it was not computed, because a side has changed too "
+        description="Number of entries that the merge would change; null: not computed, because a side has changed too "
         "many entries, or because the merge is impossible."
     )
     conflict_count: int | None = Field(description="Number of conflicts; null: it was not computed.")

@@ -22,12 +22,14 @@ class ProtectionRule(Request):
     A branch with a rule cannot be deleted, and moves only to descendants of its newest commit.
     """
 
-    role: Role = Field(Role.CONTRIBUTOR, description="Least role of a user who may move the branch.")
+    role: Role = Field(Role.CONTRIBUTOR, description="Lowest role of a user who may move the branch.")
     direct_commits: bool = Field(
-        False, description="Allow commits and merges without a proposal; impossible if approvals or checks are needed."
+        False,
+        description="Allow commits and merges without a proposal; cannot be combined with `approvals`, `checks` or "
+        "`up_to_date`.",
     )
     approvals: int = Field(
-        0, ge=0, le=MOST_REQUIRED, description="Number of other users than the author who must approve a proposal."
+        0, ge=0, le=MOST_REQUIRED, description="Number of users, other than the author, who must approve a proposal."
     )
     checks: tuple[CheckName, ...] = Field(
         (), max_length=MOST_REQUIRED, description="Checks that must have succeeded for the proposed commit."
@@ -43,7 +45,10 @@ class ProtectionRule(Request):
         if self.role is Role.READER:
             raise ValueError("readers cannot move a branch; require the role contributor, maintainer or owner")
         if self.direct_commits and (self.approvals or self.checks or self.up_to_date):
-            raise ValueError("direct commits would bypass the approvals and checks; allow them only without these")
+            raise ValueError(
+                "direct_commits: direct commits would bypass approvals, checks and up_to_date; set direct_commits to "
+                "false, or require none of these"
+            )
         return self
 
 

@@ -17,7 +17,7 @@ Metres = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ExampleRef(Request):
-    """Revision of a clip, either unchanged or mirrored."""
+    """Reference to an example: a revision of a clip, used as it is or mirrored."""
 
     item: str
     revision: int = Field(ge=1)

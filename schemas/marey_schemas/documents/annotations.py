@@ -36,7 +36,7 @@ class KeyframeDocument(Request):
 
 
 class Annotation(Request):
-    """Part `annotation`: one layer over a clip, by one author or algorithm. Segments do not overlap."""
+    """Part `annotation`: one layer of labels of a clip, by one author or algorithm. Segments do not overlap."""
 
     schema_: Literal["marey/annotation@1"] = Field("marey/annotation@1", alias="schema")
     clip: RevisionRef | OutputRef

@@ -16,7 +16,7 @@ _LEAVES = (str, float, int, bool, type(None))
 
 
 def is_array_reference(value: Any) -> bool:
-    """Return whether a value is a reference in place of an array."""
+    """Return whether a value is a reference that replaces an array."""
     return type(value) not in _LEAVES and isinstance(value, Mapping) and value.keys() == _REFERENCE_KEYS
 
 
@@ -46,7 +46,7 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Return the references in a stored document by JSON Pointer: first those to arrays, then the digests of files.
+    """Return two tables by JSON Pointer: the array references in a stored document, and its digests of files.
 
     Digests of files are in certain fields of the schema, and in members called `blob`.
     """

@@ -85,7 +85,8 @@ class ClipSource(Request):
     format: str | None = None
     details: dict[str, Any] = Field(
         default_factory=dict,
-        description="Unit scale, axes, channel orders, trimmed frames, floor shift, with the evidence.",
+        description="Facts about the import: unit scale, axes, channel orders, trimmed frames and floor shift, with "
+        "the evidence for each.",
     )
 
 

@@ -24,7 +24,7 @@ MatchedFloats = Annotated[NDArray[np.float32], ArrayOf("<f4", ndim=2)]
 
 
 class DifferenceOptions(Options):
-    """Options of a comparison: thresholds; times at which a motion changed by more than a threshold are listed."""
+    """Thresholds of a comparison. Times at which a motion changed by more than a threshold are listed."""
 
     threshold_deg: float = Field(
         1.0,
@@ -74,7 +74,7 @@ class FrameRun(Answer):
 
 
 class Exceeding(Answer):
-    """Size of a change over the matched frames, and the times at which it exceeds the threshold."""
+    """Size of a change over the matched frames, and the times at which the change exceeds the threshold."""
 
     mean: float = Field(description="Mean over all matched frames.")
     largest: float
@@ -87,7 +87,7 @@ class Exceeding(Answer):
 
 
 class JointChange(Exceeding):
-    """Change of a joint's local rotation or translation: degrees or centimetres."""
+    """Change of a joint's local rotation, in degrees, or translation, in centimetres."""
 
     joint: str = Field(description="Name of the joint in the revision `after`.")
 
@@ -110,8 +110,8 @@ class PathChange(Exceeding):
     )
     moved: PathMove | None = Field(
         None,
-        description="Movement of the whole path that explains nine tenths of the change, if there is one. Changes of "
-        "the root's rotation do not include its turn.",
+        description="Movement of the whole path that explains at least nine tenths of the change; absent if there is "
+        "none. Changes of the root's rotation do not include the turn of this movement.",
     )
 
 
@@ -130,9 +130,11 @@ class SkeletonDifference(Answer):
     joint_count: tuple[int, int]
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
-    renamed: tuple[tuple[str, str], ...] = Field((), description="Names before and after.")
-    joints: tuple[RestChange, ...] = Field((), description="Joints of both whose rest pose or parent differs.")
-    reordered: bool = Field(False, description="Whether the joints of both are in a different order.")
+    renamed: tuple[tuple[str, str], ...] = Field((), description="Names of each renamed joint before and after.")
+    joints: tuple[RestChange, ...] = Field(
+        (), description="Joints that both revisions have, but with another rest pose or parent."
+    )
+    reordered: bool = Field(False, description="Whether the two revisions have their joints in different orders.")
     end_sites_changed: bool = False
 
 
@@ -145,18 +147,26 @@ class MotionDifference(Answer):
     skeleton: SkeletonDifference | None = Field(None, description="Absent if the skeletons are equal.")
     runs: tuple[FrameRun, ...] = Field(description="All frames of both revisions, in order.")
     frames_per_frame: float = Field(
-        1.0, description="Frames after for each matched frame before; 1 unless the frames were resampled."
+        1.0,
+        description="Number of frames in the revision `after` for each matched frame in `before`; 1 unless the motion "
+        "was resampled.",
     )
     duration_ratio: float = Field(
-        1.0, description="Duration after of matched motion, divided by its duration before; 1 unless it was re-timed."
+        1.0,
+        description="Duration of the matched frames in the revision `after`, divided by their duration in `before`; "
+        "1 unless the motion was re-timed.",
     )
-    rotations: tuple[JointChange, ...] = Field((), description="Changed local rotations, largest first, degrees.")
+    rotations: tuple[JointChange, ...] = Field((), description="Changed local rotations in degrees, largest first.")
     path: PathChange | None = Field(None, description="Absent if the path of the body is equal.")
     translations: tuple[JointChange, ...] = Field(
-        (), description="Changed translations of joints whose path is not compared, largest first, centimetres."
+        (),
+        description="Changed translations in centimetres, largest first, of all joints other than the one whose path "
+        "is compared.",
     )
     translated_joints: tuple[tuple[str, ...], tuple[str, ...]] = Field(
-        ((), ()), description="Joints other than the root whose translations are stored."
+        ((), ()),
+        description="Joints other than the root whose translations are stored: those in `before`, and those in "
+        "`after`.",
     )
 
 
@@ -224,9 +234,12 @@ class DifferencePlot(Answer):
 
     joints: tuple[str, ...] = Field(description="Joints in the order of the columns of `rotation_deg`.")
     frame_rate_hz: float = Field(description="Frame rate of the revision `after`.")
-    frames: tuple[int, ...] = Field(description="First frame of each row of `rotation_deg`, and the end of the last.")
+    frames: tuple[int, ...] = Field(
+        description="First frame of each row of `rotation_deg`, then the frame after those of the last row."
+    )
     rotation_deg: MatchedFloats = Field(
-        description="[rows, joints]: largest change within the row's frames; -1: no frame is matched."
+        description="[rows, joints]: largest change of rotation within the row's frames, in degrees; -1: no frame is "
+        "matched."
     )
     path_before_m: MatchedFloats = Field(
         description="[points, 2]: x and z in metres of the path in the revision `before`."

@@ -25,7 +25,7 @@ CONTENT = {
 
 
 class StoredOriginal(Request):
-    """Imported file, and the digest (`content`) of the members of the part that the import created from the file."""
+    """Imported file, and `content`: the digest of those members of a part whose values come from the file."""
 
     name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest
@@ -41,6 +41,6 @@ def content_digest(part: str, document: Mapping[str, Any]) -> str:
 
 
 def original_of(part: str, document: Mapping[str, Any], file: str, digest: str) -> dict[str, Any]:
-    """Return the record of the file that a part was imported from."""
+    """Return a `StoredOriginal`, as a dictionary, for a part that was imported from a file with the given digest."""
     content = content_digest(part, document)
     return StoredOriginal(name=base_name(file), blob=digest, content=content).model_dump()

@@ -83,7 +83,7 @@ class Trim(NamedCommand):
 
 
 class Split(NamedCommand):
-    """Cut into several clips; the commands that follow apply to each."""
+    """Cut the motion into several clips; later commands of the edit apply to each of them."""
 
     examples: ClassVar[Examples] = ({"at": [60, 90]},)
     command: Literal["split"] = "split"
@@ -286,7 +286,7 @@ class FindContacts(NamedCommand, ContactOptions):
 
 
 class Mirror(NamedCommand):
-    """Swap left and right, by the skeleton's own symmetry."""
+    """Swap left and right, using the skeleton's own symmetry."""
 
     examples: ClassVar[Examples] = ({},)
     command: Literal["mirror"] = "mirror"

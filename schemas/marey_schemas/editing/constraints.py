@@ -101,7 +101,7 @@ class OrientationConstraint(_Constraint):
 
 
 class LookAtConstraint(_Constraint):
-    """Point at which a joint looks or points."""
+    """Target point at which an axis of a joint points."""
 
     kind: Literal["look_at"] = "look_at"
     point_m: Shift
@@ -121,7 +121,7 @@ class _Limit(Tagged):
 
 
 class HingeLimit(_Limit):
-    """Limit of a joint that turns about its swing axis alone, as knees and elbows do."""
+    """Limit of the angle of a joint that turns about its swing axis alone, such as a knee or an elbow."""
 
     kind: Literal["hinge"] = "hinge"
     joint: JointName
@@ -184,8 +184,8 @@ class PlantOptions(Options):
     )
     blend_s: Seconds = Field(
         0.15,
-        description="Seconds before and after a contact in which the foot is blended. If a leg is too short, "
-        "the body is lowered a little within three times as long.",
+        description="Seconds before and after a contact in which the foot is blended. If a leg is too short, the body "
+        "is also lowered a little, from at most three times as long before the contact to as long after it.",
     )
     knee_damping_deg: float = Field(
         10.0,

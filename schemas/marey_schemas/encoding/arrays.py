@@ -105,7 +105,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
 
 
 def with_blocks(leaf: Mapping[str, Any], array: NDArray[Any]) -> NDArray[Any] | EncodedArray:
-    """Return the array of a leaf, as an `EncodedArray` with the leaf's bytes if these may be stored as they are."""
+    """Return the decoded array of a leaf; if the leaf's bytes can be stored unchanged, as an `EncodedArray` of them."""
     if "encoding" in leaf and blocks.is_well_packed(leaf["data"]):
         return EncodedArray(array.dtype.str, array.shape, leaf["data"], array)
     return array
@@ -127,7 +127,7 @@ def _from_bytes(data: bytes, spec: ArraySpec) -> NDArray[Any]:
 
 
 def _from_lists(data: object, spec: ArraySpec) -> NDArray[Any]:
-    """Return the array of nested lists, after a check of each level, because numpy would truncate and cast silently."""
+    """Convert nested lists to an array. Each level is checked, because numpy would truncate and cast silently."""
     level: list[Any] = [data]
     for axis, size in enumerate(spec.shape):
         for item in level:

@@ -58,11 +58,11 @@ class _Layout:
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
-        """Return the number of frames in a block."""
+        """Return the frames of a block."""
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
 
     def group(self, index: int) -> slice:
-        """Return the number of columns in a group of tiles."""
+        """Return the columns of a group."""
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:
@@ -92,7 +92,8 @@ def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
 def is_well_packed(data: bytes) -> bool:
     """Return whether valid bytes may be stored instead of the bytes that `encode` would produce for the same array.
 
-    They may if their layout is that of `encode`, every tile is predicted, and they are not larger than the plain array.
+    This is so if they have the same layout as the bytes from `encode`, if every tile has a predicting form, and if they
+    are not larger than the plain array.
     """
     layout, starts = _read_head(data)
     return (
@@ -110,8 +111,8 @@ def _layout_of(spec: ArraySpec) -> _Layout:
 def cut_frames(data: bytes, start: int, stop: int) -> bytes:
     """Return frames `start` to `stop` of an encoded array as another encoded array.
 
-    If `start` is the start of a block, whole blocks are copied as they are. All others are decoded and written
-    uncompressed. Raises `BlockError`.
+    If `start` is the first frame of a block, whole blocks are copied unchanged. All other frames are decoded and
+    written uncompressed. Raises `BlockError`.
     """
     layout, starts = _read_head(data)
     cut = layout.of_frames(stop - start)
@@ -232,7 +233,7 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Yield the index of each block with some of the rows, and the indices of these in the result and in the block.
+    """Yield the index of each block that contains some of the rows, and their indices in the result and in the block.
 
     `rows` are in ascending order.
     """
@@ -249,7 +250,7 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Yield the index of each group with some of the columns, and the indices of these in the result and the group."""
+    """Yield the index of each group that contains picked columns, and their indices in the result and in the group."""
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)
@@ -261,7 +262,7 @@ def _columns_by_group(
 
 
 def _column_indices(columns: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """Return `columns` as indices of at least zero, as negative ones count from the end. Raises `IndexError`."""
+    """Return `columns` with negative indices, which count from the end, made positive. Raises `IndexError`."""
     picked = np.asarray(columns)
     if picked.ndim != 1 or (picked.size and picked.dtype.kind not in "iu"):
         raise IndexError("columns must be a one-dimensional list of integers")

@@ -31,7 +31,7 @@ MAX_VALUES = 1 << 21
 FREE_LISTS = 1 << 17
 """Number of objects and lists that a document of any size may contain; larger documents may contain more."""
 BYTES_PER_LIST = 6
-"""Least average size in bytes of an object or a list in a large document; each takes 70 bytes of memory."""
+"""Least average size in bytes of the objects and lists in a large document; each takes 70 bytes of memory."""
 BSON_COPIES = 8
 """Greatest number of bytes copied per byte of a BSON document; reading it copies nested objects once for each level."""
 
@@ -96,10 +96,11 @@ def decode_tree(
 ) -> Any:
     """Decode a tree; array leaves become writable numpy arrays.
 
-    With `keep_blocks`, arrays in the block encoding of `encode_tree` become `EncodedArray`, after a check that they can
-    be decoded. `max_bytes` limits the size of the input, and `max_array_bytes` the size of all arrays together, by
-    default to `max_bytes`. `take_bytes` is called with the size of each array before it is decoded, and may raise an
-    error of its own. The number of values is limited, too. Raises `CodecError`.
+    With `keep_blocks`, arrays in the block encoding become `EncodedArray` if their bytes can be stored unchanged; they
+    are decoded nevertheless, as a check. `max_bytes` limits the size of the input. `max_array_bytes` limits the total
+    size of all arrays; it is never more than `max_bytes`, which is the default. `take_bytes` is called with the size of
+    each array before the array is decoded, and may raise an error of its own. The number of values is limited, too.
+    Raises `CodecError`.
     """
     _require_media_type(media_type)
     if len(data) > max_bytes:

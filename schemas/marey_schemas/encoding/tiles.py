@@ -91,7 +91,7 @@ def _restore(content: Bytes, dtype: np.dtype[Any], frames: int, columns: int) ->
     elif form == QUATERNIONS and dtype == np.dtype("<f4"):
         tile = _from_integers(_undo_prediction(body, columns, frames), dtype).T
     else:
-        raise TileError(f"the tile has the form {form}, which the dtype {dtype.str} does not have")
+        raise TileError(f"the tile has the form {form}, which is not allowed for the dtype {dtype.str}")
     body.require_end()
     return tile
 
@@ -172,7 +172,8 @@ def _difference(channels: Integers) -> list[Bytes]:
 def _bits_needed(folded: Integers) -> NDArray[np.int64]:
     """Return an estimate of the bits that each channel needs; it grows with the sum of log2 of the channel's numbers.
 
-    The bits of a float, read as an integer, grow almost linearly with its logarithm."""
+    The bits of a positive float, read as an integer, grow almost linearly with log2 of the float.
+    """
     logarithms = (folded | 1).astype(np.float32).view(np.int32)
     cost: NDArray[np.int64] = logarithms.sum(axis=1, dtype=np.int64)
     return cost

@@ -13,20 +13,25 @@ CostMethod = Literal["turned", "plain"]
 
 MEDOID = "medoid"
 NEAREST_MEAN_LENGTH = "nearest_mean_length"
-"""Methods that choose the reference; any other value is the name of an example."""
+"""Name of a method that chooses the reference, as `MEDOID` is; any other value is the id of an example."""
 
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 
 
 class CostOptions(Options):
-    """Options of the cost of a pair of poses."""
+    """Options that determine the cost of matching a pair of poses."""
 
     cost: CostMethod = Field(
         "turned",
         description="Cost of a pair of poses. turned: the distance after the best rotation about the vertical and "
         "the best shift on the ground; plain: the distance without rotation and shift.",
     )
-    window: int = Field(1, ge=1, le=61, description="Number of frames in the window that is compared; odd.")
+    window: int = Field(
+        1,
+        ge=1,
+        le=61,
+        description="Number of frames, centred on each of two poses, that are compared with each other; odd.",
+    )
 
     @field_validator("window")
     @classmethod

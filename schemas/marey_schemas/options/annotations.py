@@ -15,7 +15,7 @@ Degrees = Annotated[float, Field(ge=0, le=360, allow_inf_nan=False)]
 
 
 OUT_OF_REST = 0.25
-"""Distance of a hand from its rest position, as a share of its farthest reach, above which it counts as reaching."""
+"""Distance from the rest position, as a share of the farthest reach, above which a hand counts as reaching."""
 
 
 class ContactOptions(Options):
@@ -103,7 +103,7 @@ class VelocityMinimaProposal(_Proposal):
 
 
 class WristContactProposal(_Proposal):
-    """Movements of a hand away from its rest position and back, with a keyframe `contact` on its arrival."""
+    """Movements of a hand away from its rest position and back, with a keyframe `contact` when the hand arrives."""
 
     method: Literal["wrist_contact"] = Field(
         "wrist_contact", description="Name of the method that proposes segments and keyframes."

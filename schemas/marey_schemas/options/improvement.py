@@ -13,15 +13,18 @@ _Factor = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 
 
 class ObjectiveOptions(Options):
-    """Weights of the objective, the cost of a set of clips in metres: the smaller, the better."""
+    """Weights of the objective, which is the cost of a set of clips in metres; a smaller cost is better."""
 
     offset: _Price = Field(1.0, description="Weight of the mean distance between the character and its reference.")
-    abs_se_v: _Price = Field(0.5, description="Metres in the objective for a speed error of 1 m/s.")
-    abs_se_omega_deg: _Price = Field(0.005, description="Metres in the objective for a turn rate error of 1 degree/s.")
-    pose_cost: _Price = Field(0.5, description="Metres in the objective for a pose cost of 1 m.")
+    abs_se_v: _Price = Field(0.5, description="Metres that a speed error of 1 m/s adds to the objective.")
+    abs_se_omega_deg: _Price = Field(
+        0.005, description="Metres that a turn rate error of 1 degree/s adds to the objective."
+    )
+    pose_cost: _Price = Field(0.5, description="Metres that a pose cost of 1 m adds to the objective.")
     seconds: _Price = Field(
         0.0001,
-        description="Metres in the objective for each second of data; a clip whose benefit is smaller is removed.",
+        description="Metres that each second of data adds to the objective; a clip that lowers the other terms by less "
+        "is removed.",
     )
 
 
@@ -38,7 +41,7 @@ class SuggestionOptions(ObjectiveChoice):
         10,
         ge=0,
         le=1000,
-        description="Number of removals to plan after the unused clips; 0: none.",
+        description="Number of clips whose removal is planned, in addition to that of the unused clips; 0: none.",
     )
     consider: int | None = Field(
         50,
@@ -72,7 +75,7 @@ class OptimisationOptions(ObjectiveChoice):
         ge=0,
         le=1000,
         allow_inf_nan=False,
-        description="End when no step lowers the objective by at least this many metres.",
+        description="The optimisation ends when no step lowers the objective by at least this many metres.",
     )
     max_steps: int = Field(50, ge=1, le=10_000, description="Greatest number of steps.")
     max_evaluations: int | None = Field(

@@ -38,7 +38,7 @@ class FeatureWeights(Options):
 
 
 class DatabaseOptions(Options):
-    """Conversion of clips to a database for motion matching."""
+    """Options of the conversion of clips to a database for motion matching."""
 
     mirroring: Mirroring = Field(
         "none", description="add: a mirrored copy of every clip beside it; only: the mirrored copies alone."
@@ -104,7 +104,7 @@ class DatabaseOptions(Options):
 
 
 class ControllerOptions(Options):
-    """Controller that plays a database."""
+    """Options of the controller that selects and plays frames of a database for motion matching."""
 
     follow: Follow = Field(
         "time",

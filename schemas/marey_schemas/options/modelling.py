@@ -20,7 +20,7 @@ _Share = Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)]
 
 
 class MixtureOptions(Options):
-    """Fit of a mixture of normal distributions to latent vectors."""
+    """Options of the fit of a mixture of normal distributions to latent vectors."""
 
     criterion: Criterion = Field("bic", description="Criterion that selects the number of mixture components.")
     most_mixture_components: int = Field(
@@ -48,7 +48,7 @@ class MixtureOptions(Options):
 
 
 class ModelOptions(MixtureOptions):
-    """Training of a model."""
+    """Options of the training of a generative model."""
 
     scaling: Scaling = Field(
         "jacobian",
@@ -93,7 +93,7 @@ class ModelOptions(MixtureOptions):
 
 
 class TreeOptions(Options):
-    """Tree that groups samples of a model."""
+    """Options of a tree that groups samples of a model."""
 
     samples: int = Field(10_000, ge=1, le=MOST_TREE_SAMPLES, description="Number of samples drawn from the model.")
     branching: int = Field(4, ge=2, le=64, description="Greatest number of children of a node.")

@@ -38,17 +38,21 @@ class TransitionOptions(Options):
     joints: tuple[JointName, ...] = Field(
         ("left_wrist", "right_wrist", "left_ankle", "right_ankle"),
         max_length=256,
-        description="Standard names of the joints that continue where they were; the joints that the skeletons of all "
-        "motions have are used.",
+        description="Standard names of the joints that should not jump between motions; joints that a skeleton of any "
+        "motion lacks are ignored.",
     )
     tolerance_m: float = Field(
         TRANSITION_TOLERANCE_M,
         ge=1e-5,
         le=1e4,
         allow_inf_nan=False,
-        description="Discontinuity of the joints and of the height of the pelvis, in metres, at which the weighted "
-        "error is 1.",
+        description="Distance, in metres, by which joints and the height of the pelvis may jump between two motions; "
+        "it counts as an error of 1.",
     )
     weight: float = Field(
-        1.0, ge=1e-6, le=1e6, allow_inf_nan=False, description="Weight of the continuity against the constraints."
+        1.0,
+        ge=1e-6,
+        le=1e6,
+        allow_inf_nan=False,
+        description="Weight of the continuity, relative to the weights of the constraints.",
     )

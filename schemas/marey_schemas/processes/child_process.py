@@ -1,7 +1,7 @@
 """Child process: its start in an environment without secrets, its messages, and its termination.
 
-A message is a sequence of bytes after its length; parent and child define the meaning of the bytes. `pickle` is not
-used, because a child that reads untrusted files may have been taken over and could send anything.
+A message consists of its length and a sequence of bytes, whose meaning parent and child define. `pickle` is not used,
+because a child that reads untrusted files may have been taken over by an attacker and could send anything.
 """
 
 from __future__ import annotations
@@ -62,7 +62,10 @@ class ChildProcess:
         self._sending = threading.Lock()
 
     def wait_until_ready(self) -> None:
-        """Wait until the child has loaded its modules. Raises `ChildBroken` if it ends before."""
+        """Wait until the child has loaded its modules.
+
+        Raises `ChildBroken` if the child ends before that, or is killed because it takes longer than `READY_S`.
+        """
         deadline = time.monotonic() + READY_S
         try:
             while self.receive(max(0.0, deadline - time.monotonic())) != READY:
@@ -84,7 +87,7 @@ class ChildProcess:
 
     @property
     def resident_bytes(self) -> int:
-        """Return the memory of the process and its descendants."""
+        """The resident memory of the process and its descendants, in bytes."""
         return resident_bytes(self.pid)
 
     def send(self, message: bytes) -> None:

@@ -30,8 +30,7 @@ def die_with_parent() -> None:
 
 
 def allow_memory(limit_bytes: int | None) -> None:
-    """Limit the memory that this process may allocate to `limit_bytes` more than now; without a number, remove the
-    limit.
+    """Let this process allocate at most `limit_bytes` more than it has now; None removes the limit.
 
     An allocation beyond the limit raises `MemoryError` at once, before the machine runs out of memory.
     """
@@ -43,7 +42,7 @@ def allow_memory(limit_bytes: int | None) -> None:
 
 
 def allow_processor_time(seconds: float) -> None:
-    """Let this process use at most `seconds` more of processor time; beyond that, the kernel sends SIGXCPU.
+    """Let this process use at most `seconds` of further processor time; beyond that, the kernel sends SIGXCPU.
 
     The limit has a resolution of one second, and is rounded up.
     """
@@ -53,7 +52,7 @@ def allow_processor_time(seconds: float) -> None:
 
 
 def resident_bytes(pid: int) -> int:
-    """Return the memory of a process and its descendants; 0 if it has ended."""
+    """Return the resident memory of a process and its descendants, in bytes; 0 if the process has ended."""
     try:
         process = psutil.Process(pid)
         family = [process, *process.children(recursive=True)]

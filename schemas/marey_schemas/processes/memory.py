@@ -1,7 +1,7 @@
 """Memory settings of the C library.
 
-By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. When a
-clip is read, this takes as long as all the rest.
+By default, glibc returns freed blocks of some 100 kB to the system at once and requests them again page by page. This
+doubles the time to read a clip.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import ctypes
 KEPT_BLOCK_BYTES = 20 * 2**20
 """Size in bytes above which freed blocks are returned to the system at once; writing a clip as JSON takes 17 MB."""
 KEPT_BYTES = 32 * 2**20
-"""Number of free bytes at the end of a heap above which they are returned; each thread has its own heap."""
+"""Number of free bytes at the end of a heap above which glibc returns them; each thread has its own heap."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h of glibc
 
 
 def keep_freed_memory() -> None:
-    """Keep freed memory for the next computation. Affects glibc only."""
+    """Make glibc keep freed memory for the next computation; has no effect with other C libraries."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, KEPT_BLOCK_BYTES)

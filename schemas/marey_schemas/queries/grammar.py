@@ -84,7 +84,7 @@ class Negation:
 
 @dataclass(frozen=True, slots=True)
 class Junction:
-    """Queries of which all must be true, or at least one."""
+    """Queries joined by one word: with `and`, all must be true; with `or`, at least one."""
 
     word: Literal["and", "or"]
     queries: tuple[Query, ...]
@@ -95,7 +95,7 @@ Query = Condition | Negation | Junction
 
 
 def parse(text: str) -> Query:
-    """Return the query in a text. Raises `QueryError`, with the place and what is expected there."""
+    """Parse the text of a query. Raises `QueryError`, which says where the text is wrong and what is expected there."""
     from lark.exceptions import UnexpectedCharacters, UnexpectedEOF, UnexpectedToken
 
     if len(text) > MOST_CHARACTERS:
@@ -145,12 +145,15 @@ def _parser() -> Lark:
 
 
 def _require_shallow(text: str) -> None:
-    """Check the depth of brackets and negations before they are parsed; quoted ones count, too, which does no harm."""
+    """Raise `QueryError` if the query has too many nested brackets or too many negations to be parsed.
+
+    Brackets and negations between quotation marks count, too.
+    """
     depth = 0
     for column, character in enumerate(text, 1):
         depth += (character == "(") - (character == ")")
         if depth > DEEPEST:
-            raise QueryError(f"more than {DEEPEST} brackets are open", column)
+            raise QueryError(f"more than {DEEPEST} brackets are open; use fewer nested brackets", column)
     if len([word for word in text.lower().split() if word == "not"]) > MOST_CONDITIONS:
         raise QueryError(f"at most {MOST_CONDITIONS} negations are accepted", 1)
 
@@ -245,7 +248,7 @@ def _value(field: QueryField, token: Any) -> str | float | date | datetime:
 
 
 def _unquoted(text: str) -> str:
-    """Return a quoted text without its backslashes."""
+    """Return the content of a quoted text without the backslashes that escape characters."""
     characters = iter(text)
     return "".join(next(characters) if character == "\\" else character for character in characters)
 

@@ -30,26 +30,31 @@ class KindDeclaration:
     `version` changes whenever the same inputs, parameters and seed may give other results; cached results of another
     version are not used. `implementation` names the worker's function `run(context, params)` as `module:function`.
 
-    A job is split into tasks in one of two ways. With `fan_out`, each task gets `batch_size` items of that input, and
-    the result of the job is the sum of the results of its tasks. With `task_count`, this function returns the number of
-    tasks for given parameters; each task gets all inputs, and `context.task` is its number. When all tasks have
-    succeeded, a worker runs `gathering`, a function `gather(context, params, results)`, on their results in order. If
-    there is only one task, a single job runs both functions.
+    A job is split into tasks in one of two ways:
 
-    Identical jobs reuse results. Jobs are identical if they have the same parameters, seed, and inputs with the same
-    names, places and contents. Further facts that determine the results of a kind are declared, and distinguish jobs:
+    * With `fan_out`, which names an input, each task gets `batch_size` items of that input. The result of the job
+      combines the results of its tasks: numbers are added, lists are concatenated, and objects are merged.
+    * With `task_count`, a function that returns the number of tasks for given parameters, each task gets all inputs.
+      `context.task` says which task it is. When all tasks have succeeded, a worker calls
+      `gather(context, params, results)`, the function that `gathering` names, with their results in order. If there is
+      only one task, a single job runs both `run` and `gather`.
 
-    * `place_counts`: whether the path of the collection that receives the results is such a fact.
-    * `newest_of`: parameters that are the id of an item, or null; the newest revision of that item is such a fact.
+    A job reuses the results of an identical job. Jobs are identical if they have the same parameters, the same seed,
+    and as inputs the same items with the same names, places and contents. A kind can declare further facts that must be
+    the same:
+
+    * `place_counts`: whether the path of the collection that receives the results must be the same.
+    * `newest_of`: parameters that contain the id of an item, or null; the item must have the same newest revision.
+
+    Some jobs never reuse results:
+
     * `never_cached_for`: function that returns whether a job with the given parameters looks up names while it runs.
     * `never_cached_without`: inputs without which a job looks up names while it runs.
     * `in_place`: parameter with which results replace their sources, if these are still the newest revisions.
 
-    Results of jobs that look up names are never reused.
-
     `named_after` is the input whose items determine the names and relative collections of the results; the parameter
-    `suffix` is appended to the names. `unclear_place` returns the reason if parameters and a collection do not
-    determine the place of the results.
+    `suffix` is appended to the names. `unclear_place` is a function of the parameters and a collection; it returns why
+    these do not determine the place of the results, or None if they do.
     """
 
     name: str
@@ -124,15 +129,15 @@ def _params_schema(params: type[Request]) -> dict[str, Any]:
 _RIG = InputSpec(
     kind=Kind.SKELETON,
     required=False,
-    description="The clips' skeleton at the revision whose joint mapping is used; for mappings edited "
-    "after the import.",
+    description="The revision of the clips' skeleton whose joint mapping is used; needed only if the mapping was "
+    "edited after the import of the clips.",
 )
 _RIGS = InputSpec(
     kind=Kind.SKELETON,
     many=True,
     required=False,
-    description="The clips' skeletons at the revisions whose joint mappings are used; for mappings "
-    "edited after the import.",
+    description="The revisions of the clips' skeletons whose joint mappings are used; needed only for mappings that "
+    "were edited after the import of the clips.",
 )
 
 
@@ -402,7 +407,7 @@ class UnknownKindError(LookupError):
 def job_kinds() -> Mapping[str, KindDeclaration]:
     """Return every kind by name: the built-in ones and those of installed distributions.
 
-    Raises `TypeError` for an entry point that is no declaration, `ValueError` for a name that is taken.
+    Raises `TypeError` if an entry point is not a `KindDeclaration`, and `ValueError` if two kinds have the same name.
     """
     kinds = {kind.name: kind for kind in BUILT_IN}
     for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
@@ -419,7 +424,7 @@ def job_kinds() -> Mapping[str, KindDeclaration]:
 
 
 def find_kind(name: str) -> KindDeclaration:
-    """Return the kind called `name`; `UnknownKindError` if there is none."""
+    """Return the kind called `name`. Raises `UnknownKindError` if there is none."""
     try:
         return job_kinds()[name]
     except KeyError:

@@ -228,7 +228,7 @@ class TreeParams(TreeOptions):
 
     def unclear_place(self, into: str) -> str | None:
         """Return the reason why the tree cannot be stored in a collection, or None if it can."""
-        return f"a tree becomes a part of its model and cannot go to {into}; leave `into` empty" if into else None
+        return f"a tree is stored as a part of its model, not in {into}; leave `into` empty" if into else None
 
 
 class EditParams(SuffixedResults):
@@ -252,11 +252,14 @@ class EditParams(SuffixedResults):
         return self
 
     def unclear_place(self, into: str) -> str | None:
-        """Return the reason why `into` contradicts `in_place`, or None if it does not."""
+        """Return the reason why `into`, `suffix` and `in_place` do not determine the place of the results, or None."""
         if self.in_place and into:
-            return f"the results cannot both take the place of the clips and go to {into}"
+            return (
+                f"with in_place the results replace the clips, so they cannot be stored in {into}; leave `into` empty, "
+                "or set in_place to false"
+            )
         if not (self.in_place or into or self.suffix):
-            return "the results would take the place of the clips; give a folder or a suffix, or in_place"
+            return "the results would have the places of the clips; give a folder or a suffix, or set in_place"
         return None
 
 

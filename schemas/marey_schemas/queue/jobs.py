@@ -32,7 +32,7 @@ class JobState(StrEnum):
 
 
 class FailureReason(StrEnum):
-    """Reason of the final failure of a job."""
+    """Reason why a job has finally failed."""
 
     ERROR = "error"
     TIMEOUT = "timeout"
@@ -42,13 +42,13 @@ class FailureReason(StrEnum):
 
 
 class InputSpec(Answer):
-    """Named input of a kind."""
+    """Declaration of a named input of a job kind."""
 
     kind: Kind
     many: bool = False
     required: bool = True
     parts: tuple[str, ...] = Field(
-        (), description="Parts of the items that the job reads, if its result depends on no others; empty: all parts."
+        (), description="Parts of the items that the result of the job depends on; empty: all parts."
     )
     description: str = ""
 
@@ -64,10 +64,13 @@ class JobKind(Answer):
     fan_out: str | None = Field(None, description="The input whose items are distributed over many tasks.")
     batch_size: int = Field(1, description="Number of items that each task of a fan-out takes.")
     gathers: bool = Field(
-        False, description="The parameters determine the number of tasks, and one worker gathers their results."
+        False,
+        description="Whether the parameters determine the number of tasks, and a worker gathers the results of the "
+        "tasks.",
     )
     deterministic: bool = Field(
-        True, description="The same inputs, parameters and seed give the same bytes, so that results may be cached."
+        True,
+        description="Whether the same inputs, parameters and seed give the same bytes, so that results may be cached.",
     )
 
 
@@ -85,10 +88,10 @@ class CollectionInput(Request):
 
 
 class DatasetInput(Request):
-    """All entries of the input's kind in a version of a dataset, at the revisions that have their content.
+    """All entries of the input's kind in a version of a dataset, each as a revision of an item with the same content.
 
     The version is resolved at submission, so that later commits do not change the inputs. Entries with the same content
-    are one input.
+    count as one input.
     """
 
     dataset: DatasetName
@@ -97,9 +100,10 @@ class DatasetInput(Request):
 
 
 class JobOutputsInput(Request):
-    """All outputs of another job of the project that have the input's kind, pinned when that job has succeeded.
+    """All outputs, of the input's kind, of another job of the project.
 
-    The job waits for the other job, as for the jobs in `after`.
+    The job with this input waits for the other job, as for the jobs in `after`. The revisions of the outputs are fixed
+    when the other job has succeeded.
     """
 
     job: str = Field(min_length=1, max_length=40)
@@ -113,7 +117,7 @@ JobInput = ExistingInput | JobOutputsInput
 
 
 class Resources(Request):
-    """Limits of one attempt."""
+    """Limits of time and memory of one attempt to run a job."""
 
     time_limit_s: int = Field(3600, ge=1, le=7 * 86400)
     memory_limit_mb: int = Field(4096, ge=64, le=1_048_576)
@@ -196,9 +200,9 @@ class Job(Answer):
     state: JobState
     params: dict[str, Any]
     inputs: dict[str, Any] = Field(
-        description="Inputs by name: items with their revisions, and the commits they were taken from; or `{job}` "
-        "for outputs of an unfinished job. Instead of the items that a fan-out gave to its tasks, it has their number "
-        "and their commits."
+        description="Inputs by name: items with their revisions, and the commits that they were taken from. Outputs of "
+        "a job that has not ended are given as `{job}`. If the items of an input were distributed over tasks, only "
+        "their number and their commits are given."
     )
     after: tuple[str, ...] = Field((), description="Jobs that must succeed before this one starts.")
     into: str
@@ -209,8 +213,10 @@ class Job(Answer):
     max_attempts: int
     interruptions: int = 0
     parent: str | None = None
-    position: int | None = Field(None, description="Index of the task in its fan-out, from 0; null for other jobs.")
-    size: int | None = Field(None, description="Number of tasks of a fan-out.")
+    position: int | None = Field(
+        None, description="Index of the task among the tasks of its parent job, from 0; null if the job is not a task."
+    )
+    size: int | None = Field(None, description="Number of tasks that the job is split into.")
     children: dict[str, int] = Field(default_factory=dict, description="Number of tasks in each state.")
     retry_of: str | None = None
     cached_from: str | None = Field(None, description="The job whose cached result this one reuses.")

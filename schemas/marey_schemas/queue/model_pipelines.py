@@ -67,7 +67,7 @@ class ModelPlan(Request):
 
 
 def model_pipeline(plan: ModelPlan, **shared: Any) -> PipelineCreate:
-    """Return the pipeline for a plan. `shared` are further fields of the pipeline, such as `seed` and `priority`."""
+    """Return the pipeline for a plan. `shared` contains further fields of the pipeline, such as `seed`."""
     steps: dict[str, PipelineStep] = {}
     clips: Any = plan.clips
     annotations: Any = plan.annotations

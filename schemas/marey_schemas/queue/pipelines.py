@@ -25,7 +25,7 @@ StepInput = JobInput | StepOutputsInput
 
 
 class PipelineStep(Request):
-    """Job of a pipeline. The fields from `into` on default to those of the pipeline."""
+    """Job of a pipeline. The field `into` and all fields below it default to the values of the pipeline."""
 
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, StepInput | tuple[StepInput, ...]] = Field(default_factory=dict)
@@ -108,7 +108,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """Return the job request of a step; `ids` are the ids of the jobs that were made for the steps it depends on."""
+    """Return the job request of a step; `ids` contains the id of the job of each step that this one depends on."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:

@@ -33,7 +33,8 @@ class ClaimRequest(Request):
         None,
         min_length=16,
         max_length=64,
-        description="Random name of the claim. A repeated claim of the same token gets the same leases, renewed.",
+        description="Random id of the claim. If a claim with the same id and the same token is repeated, it gets the "
+        "same leases, renewed.",
     )
 
 
@@ -46,14 +47,16 @@ class PinnedInput(Answer):
     name: str
     collection: str
     below: str | None = Field(
-        None, description="For results of another job: their collection, relative to that job's `into`."
+        None,
+        description="Collection of the input relative to the `into` of the job that created it; null if the input was "
+        "not given as an output of a job.",
     )
 
     commit: str | None = Field(None, description="Commit of a dataset from which the input was taken.")
 
     @property
     def folder(self) -> str:
-        """The folder of this input; results are stored in the folder of this name below the job's `into`."""
+        """The folder of this input. Its results are stored in a folder with the same path below the job's `into`."""
         return self.collection if self.below is None else self.below
 
     @property
@@ -81,10 +84,12 @@ class Lease(Answer):
     inputs: dict[str, tuple[PinnedInput, ...]]
     into: str
     seed: int
-    position: int | None = Field(None, description="Index of the task in its fan-out, from 0; null for other jobs.")
+    position: int | None = Field(
+        None, description="Index of the task among the tasks of its parent job, from 0; null if the job is not a task."
+    )
     size: int | None = Field(
         None,
-        description="Number of tasks of the fan-out; set for its tasks and for the job that gathers their results.",
+        description="Number of tasks of the parent job; set for its tasks, and for the job that gathers their results.",
     )
     resources: Resources
     fence: int
@@ -129,7 +134,10 @@ class StagedOutput(Request):
         default_factory=dict, description="Inputs that this result was made from, by input name."
     )
     reuse: Literal["by_name", "by_content"] = Field(
-        "by_name", description="by_content: reuse an item of the project with equal parts, if there is one."
+        "by_name",
+        description="Choice of an existing item for the result. by_name: the item with the same kind, name and "
+        "collection gets a new revision if its content differs; by_content: an item with equal parts, anywhere in the "
+        "project, is used unchanged. If there is no such item, a new one is created.",
     )
 
 
@@ -157,10 +165,12 @@ class FailRequest(Request):
     signature: str | None = Field(
         None,
         max_length=255,
-        description="Signature of the failure; a job is not retried after two attempts with the same one.",
+        description="Signature of the failure; a job is not retried after two attempts with the same signature.",
     )
     retryable: bool = True
-    interrupted: bool = Field(False, description="The worker was stopped; the attempt is not counted.")
+    interrupted: bool = Field(
+        False, description="Whether the attempt ended because the worker was stopped; such attempts are not counted."
+    )
 
 
 class BatchCompletion(CompleteRequest):
@@ -189,7 +199,9 @@ class FailAnswer(Answer):
 
     job: str
     state: JobState
-    retry_in_s: float | None = Field(None, description="Time of the next attempt, if the job is queued again.")
+    retry_in_s: float | None = Field(
+        None, description="Seconds until the next attempt; null if the job is not queued again."
+    )
 
 
 class BatchCompletionResult(Answer):
@@ -218,4 +230,4 @@ class LogAnswer(Answer):
     """Length of the attempt's log."""
 
     offset: int = Field(description="Number of bytes received, which is where the next piece starts.")
-    capped: bool = Field(default=False, description="The log is full, and further output is dropped.")
+    capped: bool = Field(default=False, description="Whether the log is full, so that further output is dropped.")
