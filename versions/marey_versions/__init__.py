@@ -1,1 +1,4 @@
-"""Versions of datasets: trees of entries, their differences and merges. It uses no database, network or clock."""
+"""Versions of datasets: trees of entries, their differences and merges.
+
+This package uses no database, network or clock.
+"""

@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class HistoricCommit(Protocol):
-    """Commit in the form that a search for origins needs."""
+    """Commit as the searches for common ancestors and for origins need it."""
 
     @property
     def tree(self) -> str:
@@ -20,7 +20,7 @@ class HistoricCommit(Protocol):
 
     @property
     def generation(self) -> int:
-        """A number that is greater than those of all parents."""
+        """A number that is greater than the generations of all parents."""
 
 
 _OURS, _THEIRS, _FOLLOWED = 1, 2, 4
@@ -28,10 +28,11 @@ _COMMON = _OURS | _THEIRS
 
 
 def nearest_common(commit_of: Callable[[str], HistoricCommit], ours: str, theirs: str) -> list[str]:
-    """Return the nearest common commits of two commits, sorted: common ancestors that no other one follows.
+    """Return the nearest common ancestors of two commits, sorted by digest.
 
-    A commit counts as its own ancestor. Commits are read from the newest generation to the oldest, and only until all
-    that remain precede a common commit. So the work does not grow with the history before it.
+    These are the common ancestors from which no other common ancestor descends. A commit counts as its own ancestor.
+    Commits are read from the newest generation to the oldest, until all commits that remain are ancestors of common
+    ones. So the work does not depend on the length of the history before these.
 
     Parameters
     ----------

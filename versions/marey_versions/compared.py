@@ -13,14 +13,14 @@ from marey_versions.tree.difference import Changed
 
 @dataclass(frozen=True)
 class ComparedEntry:
-    """Entry that differs in two versions; `before` or `after` is None where the version does not have it."""
+    """Entry that differs between two versions; `before` or `after` is None if that version does not have the entry."""
 
     before: DatasetEntry | None
     after: DatasetEntry | None
 
     @property
     def present(self) -> DatasetEntry:
-        """The entry after the change, or, if it was removed, before it."""
+        """The entry after the change; if the entry was removed, the entry before the change."""
         present = self.after or self.before
         assert present is not None
         return present
@@ -46,7 +46,7 @@ class ComparedEntry:
 
     @staticmethod
     def tags_of(side: DatasetEntry | None) -> set[str]:
-        """Return the tags of one side, none where the version does not have the entry."""
+        """Return the tags of one side; empty if that version does not have the entry."""
         return set(side.tags) if side is not None else set()
 
 

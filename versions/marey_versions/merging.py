@@ -15,18 +15,21 @@ from marey_versions.tree.chunks import Value
 class MergeConflict(NamedTuple):
     """Entry that both sides have changed in ways that exclude each other.
 
-    A side is None where it does not have the entry; `base` is None if both sides added the entry.
+    `ours` or `theirs` is None if that side does not have the entry. `base` is None if both sides added the entry, or
+    moved different entries to the same path.
     """
 
     base: DatasetEntry | None
     ours: DatasetEntry | None
     theirs: DatasetEntry | None
     parts: tuple[str, ...]
-    """Parts that both sides have changed; `path` if both have moved the entry, `entry` if one has removed it."""
+    """Parts that both sides have changed; `path` if both have moved the entry or want the same path, `entry` if one
+    side has removed it.
+    """
 
     @property
     def key(self) -> str:
-        """The key of the entry, by which a resolution names it: that of our side, or else of the base or theirs."""
+        """The key by which a resolution names the conflict: that of the entry in `ours`, else in `base` or `theirs`."""
         present = self.ours or self.base or self.theirs
         assert present is not None
         return present.key
@@ -34,7 +37,7 @@ class MergeConflict(NamedTuple):
 
 @dataclass
 class MergedEntries:
-    """Result of a merge: changes of our tree, and conflicts without a resolution."""
+    """Result of a merge: changes to apply to our tree, and conflicts without a resolution."""
 
     changes: dict[str, Value | None] = field(default_factory=dict)
     conflicts: list[MergeConflict] = field(default_factory=list)
@@ -119,9 +122,9 @@ def _apply(
     resolutions: Mapping[str, Side],
     merged: MergedEntries,
 ) -> None:
-    """Add the changes of our tree; entries that come to an occupied place are conflicts.
+    """Add changes of our tree to `merged`; an entry whose new key is occupied by another entry is a conflict.
 
-    `occupied` contains the entries that our side has changed, by their present keys.
+    `occupied` contains the entries that our side has changed, by the keys that they have on our side.
     """
     for one in decided:
         if one.ours is not None and (one.moves or one.merged is None):

@@ -19,7 +19,7 @@ PATH = "path"
 TAGS = "tags"
 """Name of the origin of an entry's tags."""
 MOST_CHANGES = 100_000
-"""Greatest number of entries that differ between two commits among which a moved entry is sought."""
+"""Greatest number of changed entries of a commit among which a moved entry is searched for."""
 
 
 class FoundOrigin(NamedTuple):
@@ -39,11 +39,11 @@ class _OriginSearch:
     reader: ChunkReader
     commit_of: Callable[[str], HistoricCommit]
     waiting: list[tuple[int, str, str]] = field(default_factory=list)
-    """Commits and keys to look at, as a heap by falling generation."""
+    """Commits and keys to look at, as a heap: the commit with the greatest generation is first."""
     sought: dict[tuple[str, str], set[str]] = field(default_factory=dict)
-    """Names of the parts whose origin is this commit or an earlier one, by commit and key."""
+    """For each commit and key: names of the parts whose origin is this commit or an earlier one."""
     ended: set[str] = field(default_factory=set)
-    """Commits that changed so many entries that moved ones were not sought."""
+    """Commits that changed so many entries that moved entries were not searched for."""
 
     def add(self, commit: str, key: str, names: set[str]) -> None:
         if (commit, key) not in self.sought:
@@ -55,7 +55,7 @@ class _OriginSearch:
         return None if value is None else entry_of(key, value)
 
     def before(self, parent: str, commit: str, key: str) -> DatasetEntry | None:
-        """Return an entry as a parent of a commit has it, perhaps under another key; None if it is new."""
+        """Return the entry that a parent of a commit had, perhaps under another key; None if the commit added it."""
         trees = [self.commit_of(one).tree for one in (parent, commit)]
         same, present = self.entry(parent, key), self.entry(commit, key)
         if trees[0] == trees[1] or (same and present and same.parts.items() & present.parts.items()):
@@ -75,15 +75,15 @@ def find_origins(
 ) -> dict[str, FoundOrigin]:
     """Return the origin of each part of an entry, of its path and of its tags, by name.
 
-    A merge is an origin only of what differs from both sides. Moved entries are followed by their content, as
-    differences recognise them.
+    A merge is the origin of a part only if the part differs from that of both parents. An entry that was moved is
+    recognised by its content, as in `compare_entries`.
 
     Parameters
     ----------
     reader : chunks of the trees of all commits
     commit_of : returns a commit by its digest
     commit, key : the commit and the entry in it, which exists
-    most : greatest number of commits to look at; origins that were not found then are not certain
+    most : greatest number of commits to look at; origins that are not found within them are marked as not certain
     """
     search = _OriginSearch(reader, commit_of)
     present = search.entry(commit, key)
@@ -104,7 +104,7 @@ def find_origins(
 
 
 def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
-    """Add the parents that have the same content to the search, and return the names of that content."""
+    """Continue the search, for each name whose value a parent already has, in that parent; return these names."""
     present = search.entry(commit, key)
     assert present is not None
     values = _named(present)
@@ -120,5 +120,5 @@ def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[st
 
 
 def _named(entry: DatasetEntry) -> Mapping[str, Any]:
-    """Return the path, the tags and the parts of an entry by name, which a commit can change."""
+    """Return everything in an entry that a commit can change, by name: the parts, the path and the tags."""
     return {**entry.parts, PATH: entry.path, TAGS: entry.tags}

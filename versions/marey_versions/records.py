@@ -1,8 +1,8 @@
 """Entries and commits of datasets, and digests of content that do not depend on the ids of a server.
 
-Documents refer to other items by id and revision, which differ between servers. The content digest of a document is
-that of the document in which each reference names the content digest of the revision that it refers to. So two servers
-with the same content have the same digests, and the same trees.
+Documents refer to other items by id and revision, which differ between servers. Therefore, the content digest of a
+document is computed after each reference has been replaced by the content digest of the revision that it refers to. So
+two servers with the same content have the same digests, and the same trees.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from marey_versions.tree.chunks import Value, digest_of
 COMMIT_SCHEMA = "marey/commit@1"
 
 _SEPARATOR = "\t"
-"""Character between path and kind in a key. Paths cannot contain it, and it sorts before every character of a path."""
+"""Character between path and kind in a key. It sorts before every character that a path can contain."""
 
 
 class RevisionKey(NamedTuple):
@@ -31,7 +31,7 @@ class RevisionKey(NamedTuple):
 
 
 class DatasetEntry(NamedTuple):
-    """Content of one path and kind in a version of a dataset."""
+    """Entry in a version of a dataset: the content that has a certain path and kind."""
 
     path: str
     kind: str
@@ -51,7 +51,7 @@ class DatasetEntry(NamedTuple):
 
     @property
     def content(self) -> str:
-        """The content digest of the revision, which does not depend on path and tags."""
+        """The content digest of the entry's revision, which does not depend on path and tags."""
         return revision_content(self.kind, self.parts)
 
 
@@ -107,9 +107,10 @@ def portable_document(value: Any, content_of: Callable[[RevisionKey], str | None
 
 
 def local_document(value: Any, revision_of: Callable[[str], RevisionKey | None]) -> Any:
-    """Return a portable document with each `{"content": digest}` replaced by a revision, as one server stores it.
+    """Return a portable document with each `{"content": digest}` replaced by a reference to a revision on this server.
 
-    If `revision_of` returns None for a digest, the reference remains unchanged. Arrays may be of any type.
+    If `revision_of` returns None for a digest, the reference remains unchanged. Arrays in the document may be
+    references, numpy arrays or `EncodedArray`.
     """
     if isinstance(value, dict):
         content = _content_of(value)
@@ -124,7 +125,8 @@ def local_document(value: Any, revision_of: Callable[[str], RevisionKey | None])
 def contents_in(portable: Any) -> Iterator[str]:
     """Return the content digests of the revisions that a portable document refers to.
 
-    An array, and the record of an imported file (which has the member `blob`), also have a member `content`.
+    References to arrays and records of imported files, which have a member `blob`, also have a member `content`, but
+    are skipped.
     """
     for found in _objects(portable):
         if (content := _content_of(found)) is not None:
@@ -132,7 +134,7 @@ def contents_in(portable: Any) -> Iterator[str]:
 
 
 def _content_of(found: Mapping[str, Any]) -> str | None:
-    """Return the content digest of the revision that an object of a portable document refers to, None for others."""
+    """Return the content digest of the revision that an object in a portable document refers to; None if to none."""
     content = found.get("content")
     if not isinstance(content, str) or "blob" in found or is_array_reference(found):
         return None
@@ -157,7 +159,7 @@ def _reference(found: Mapping[str, Any]) -> RevisionKey | None:
 
 
 def _canonical(body: Any) -> bytes:
-    """Return the canonical JSON of a tree whose numbers are canonical already, as those of stored documents are."""
+    """Return the canonical JSON of a tree whose numbers are already in canonical form, as in stored documents."""
     return json.dumps(body, sort_keys=True, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 

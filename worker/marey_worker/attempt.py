@@ -94,7 +94,7 @@ class LogUploader:
 
 @cache
 def environment() -> dict[str, str]:
-    """Return the versions of the interpreter and of the libraries that affect numbers."""
+    """Return the versions of the interpreter and of the libraries that affect numeric results, by name."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for library in LIBRARIES:
         try:
@@ -127,7 +127,7 @@ class Watch:
     weighed: float = 0.0
 
     def verdict(self, child: ChildProcess | None) -> Stop | None:
-        """Return the reason to stop the attempt now, or None; `child` is None once it has computed all results."""
+        """Return the reason to stop the attempt now, or None. `child` is None after it has computed all results."""
         if self.keeper.lost.is_set():
             return Stop.LEASE_LOST
         if self.keeper.cancelled.is_set():
@@ -198,7 +198,8 @@ class RunningAttempt:
     def finish(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
         """Wait until all results are stored, report the end to the server, and return it.
 
-        The child may run the next job meanwhile. A success becomes a failure or a stop if results cannot be stored.
+        The child may run the next job meanwhile. If results cannot be stored, a failure or a stop is reported instead
+        of a success.
         """
         try:
             if isinstance(end, Done):
@@ -294,7 +295,7 @@ class RunningAttempt:
                 return None
 
     def _read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Return documents from the cache or the server; if their total size is large, the last ones are left out."""
+        """Return documents from the cache or the server. If their total size is large, the last ones are omitted."""
         keys = [self._cache_key(f"{place.item}@{place.revision}/{place.part}") for place in places]
         found = self._cache.get_many(keys, lambda missing: self._api.read_parts([places[index] for index in missing]))
         sizes = accumulate(len(data or b"") for data in found)
@@ -324,7 +325,7 @@ class RunningAttempt:
         return done
 
     def _report(self, end: Done | Failed | Stop) -> Done | Failed | Stop:
-        """Report the end to the server and return it; a success becomes a failure if its results cannot be published.
+        """Report the end to the server and return it. If the results cannot be published, report a failure instead.
 
         Heartbeats continue, because the server may be unreachable for a while.
         """

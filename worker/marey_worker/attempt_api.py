@@ -99,7 +99,7 @@ class AttemptApi:
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find items by name, directly in a collection, or, for None, anywhere in the project."""
+        """Find items by name, directly in a collection; if `collection` is None, anywhere in the project."""
         asked = f"{name}*" if name.endswith("*") else name  # a final asterisk asks for names that begin so
         query = {"name": asked, "directly_in": collection}
         with _dead_token_is_lost_lease():
@@ -131,9 +131,7 @@ class AttemptApi:
 
 @contextmanager
 def _dead_token_is_lost_lease() -> Iterator[None]:
-    """Raise `LeaseLost` if the token is refused: the token of an attempt becomes invalid when the attempt loses the
-    job.
-    """
+    """Raise `LeaseLost` if the token is refused, because an attempt's token becomes invalid when its lease is lost."""
     try:
         yield
     except Unauthenticated as error:

@@ -116,9 +116,10 @@ def write_output_to(path: Path) -> None:
 
 
 def _perform(kind: KindDeclaration, context: Context, run: Run) -> dict[str, Any]:
-    """Run a task, a parent job, or a whole job.
+    """Run the functions of a kind that a task, a parent job or an undivided job needs.
 
-    A kind with a gathering function whose job is not split into tasks runs both functions."""
+    If the kind has a gathering function, an undivided job runs both functions.
+    """
     params = kind.params.model_validate(run.params)
     is_task, gathers = run.position is not None, run.position is None and run.size is not None
     results = context.task_results() if gathers else [_function(kind.implementation)(context, params)]

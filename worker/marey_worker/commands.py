@@ -38,10 +38,10 @@ def work(
     log_form: LogForm | None = None,
     attached: bool = False,
 ) -> None:
-    """Run a worker until SIGTERM or SIGINT; the exit status is not 0 if a job was running then.
+    """Run a worker until SIGTERM or SIGINT, then exit; the exit status is not 0 if a job was running at that time.
 
-    `log_form`: default text if standard error is a terminal, else JSON, as for the server. `attached`: stop also when
-    standard input closes, because the process that started this worker has ended.
+    Without `log_form`, log lines are text if standard error is a terminal, else JSON, as for the server. With
+    `attached`, the worker stops also when standard input closes, because the process that started it has ended.
     """
     if credential.token is None:
         raise NoCredential(
@@ -69,13 +69,17 @@ def work(
 def main() -> None:
     """Run `python -m marey_worker`, which `marey serve` starts."""
     parser = argparse.ArgumentParser(prog="python -m marey_worker", description="Run jobs of a Marey server.")
-    parser.add_argument("--server", help="address of the server")
-    parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time")
-    parser.add_argument("--name", help="name of the worker, shown to people")
-    parser.add_argument("--cache", type=Path, help="folder that keeps downloaded inputs")
-    parser.add_argument("--token-file", type=Path, help="file that holds a token with the scope `work`")
+    parser.add_argument("--server", help="address of the server; default: that of MAREY_URL or of the stored login")
+    parser.add_argument("--slots", type=int, default=1, help="number of jobs that run at the same time; default: 1")
+    parser.add_argument("--name", help="name of the worker, shown to people; default: host name and process id")
     parser.add_argument(
-        "--attached", action="store_true", help="read the token from standard input; stop when that closes"
+        "--cache", type=Path, help="folder in which downloaded inputs are cached; default: marey/inputs below ~/.cache"
+    )
+    parser.add_argument("--token-file", type=Path, help="file that contains a token with the scope `work`")
+    parser.add_argument(
+        "--attached",
+        action="store_true",
+        help="read the token from standard input, and stop the worker when standard input closes",
     )
     given = parser.parse_args()
     try:

@@ -63,7 +63,7 @@ class NoSuchThing(RequestRefused):
 
 
 class Task(NamedTuple):
-    """Position of a task among the tasks of its job, from 0, and their number."""
+    """Position of a task among the tasks of its job, counted from 0, and the number of these tasks."""
 
     position: int
     size: int
@@ -129,7 +129,7 @@ class Context:
         return Item.model_validate(self._value(asked, f"no-{kind}"))
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find items by name, directly in a collection, or, for None, anywhere in the project."""
+        """Find items by name, directly in a collection; if `collection` is None, anywhere in the project."""
         found = self._ask(lambda request: FindItems(request, kind, name, collection))
         return [Item.model_validate(item) for item in found]
 

@@ -1,7 +1,7 @@
 """Fault injection for tests: named points in the code where a test can kill or stop a worker.
 
 `MAREY_FAULT=worker.after_claim:kill` kills the process (SIGKILL) when it passes that point, `:stop` stops it (SIGSTOP);
-`worker.after_blob@3:kill` acts on the third pass. Several are separated by commas; points of other programs are
+`worker.after_blob@3:kill` acts on the third pass. Several faults are separated by commas; points of other programs are
 ignored. Points: `worker.after_claim`, `worker.after_blob`, `worker.before_complete`, `worker.after_complete`.
 """
 

@@ -15,12 +15,15 @@ from marey_worker.attempt_api import AttemptApi
 log = logging.getLogger(__name__)
 
 CONFIRM_AFTER = 2 / 3
-"""If no heartbeat succeeded for this share of the lease, one must succeed before results are published."""
+"""Share of a lease's duration. If no heartbeat has succeeded for that long, one must succeed before publication."""
 
 PROGRESS_EVERY_S = 2.0
 RETRY_S = 1.0
 FIRST_S = 1.0
-"""Greatest delay in seconds of the first heartbeat, which shows the server that the job runs; short jobs need none."""
+"""Greatest delay in seconds of the first heartbeat, which shows the server that the job runs.
+
+Jobs that end sooner send no heartbeat.
+"""
 
 TICK_S = 0.25
 JITTER = 0.2
@@ -60,7 +63,7 @@ class LeaseKeeper:
         self._stopped.set()
 
     def confirm(self, *, patiently: bool) -> None:
-        """Check that the lease is still valid before the final request; `patiently` retries for longer.
+        """Check that the lease is still valid before the final request. With `patiently`, retry for longer.
 
         Raises `LeaseLost`, or the client's error if the server does not answer.
         """

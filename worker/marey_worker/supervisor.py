@@ -41,8 +41,8 @@ CHILD_MODULE = "marey_worker.child"
 class WorkerOptions:
     """Options of a worker.
 
-    `kinds` and `labels` select its jobs; `slots` is the number of concurrent jobs; `threads` is the number of threads
-    for all of them.
+    `kinds` and `labels` select the jobs of the worker; `slots` is the number of concurrent jobs; `threads` is the total
+    number of threads of all slots.
     """
 
     name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
@@ -85,7 +85,10 @@ class Supervisor:
         self._stopping.set()
 
     def run(self) -> int:
-        """Work until stopped; the exit status is not 0 if a job was running, or the worker failed or was refused."""
+        """Work until stopped, and return the exit status.
+
+        The status is not 0 if a job was running at that time, if the worker failed, or if the server refused it.
+        """
         slots = [threading.Thread(target=self._work, name=f"slot-{n}", daemon=True) for n in range(self._options.slots)]
         for slot in slots:
             slot.start()
@@ -191,7 +194,8 @@ class Supervisor:
 class _OpenClaim:
     """Claim that is repeated with the same token and the same id until it is answered.
 
-    The token stays the same even if it is rotated meanwhile, because an answer can only be repeated for one token.
+    The same token is used even if it is rotated meanwhile, because the server repeats an answer only for the token that
+    sent the claim first.
     """
 
     transport: Transport

@@ -259,7 +259,10 @@ class EditParams(SuffixedResults):
                 "or set in_place to false"
             )
         if not (self.in_place or into or self.suffix):
-            return "the results would have the places of the clips; give a folder or a suffix, or set in_place"
+            return (
+                "the results would have the same folders and names as the clips; give a folder or a suffix, or set "
+                "in_place"
+            )
         return None
 
 

@@ -144,7 +144,7 @@ def test_the_originals_stay_unless_they_are_edited_in_place(marey: Marey, lab: P
 
 
 def test_where_results_should_go_must_be_clear(marey: Marey, lab: ProjectHandle) -> None:
-    with pytest.raises(Invalid, match="would have the places of the clips"):
+    with pytest.raises(Invalid, match="would have the same folders and names as the clips"):
         lab.edit("walks", [{"command": "mirror"}])
     with pytest.raises(Invalid, match="with in_place the results replace the clips"):
         lab.edit("walks", [{"command": "mirror"}], in_place=True, into="elsewhere")

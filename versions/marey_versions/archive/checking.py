@@ -1,4 +1,4 @@
-"""Check of a whole archive: every member, and that none is missing or superfluous."""
+"""Check of a whole archive: that every member is intact, and that no member is missing or superfluous."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from marey_versions.archive.reading import Archive
 from marey_versions.records import contents_in, path_and_kind, revision_content
 
 OnProgress = Callable[[int, int], None]
-"""Function called with the number of members that were checked, and the number of all."""
+"""Function called with the number of members that were checked, and the number of all members."""
 
 
 @dataclass
 class _Check:
-    """Check in progress."""
+    """State of the check of an archive."""
 
     archive: Archive
     on_progress: OnProgress
@@ -44,7 +44,8 @@ class _Check:
             if value is not None:
                 if unchanged and not self.archive.manifest.base:
                     raise BadArchive(
-                        f"{ArchiveMember(MemberKind.CHANGES, commit).name}: it refers to an earlier archive"
+                        f"{ArchiveMember(MemberKind.CHANGES, commit).name}: the member refers to an earlier archive, "
+                        "but this archive contains the whole history"
                     )
                 documents = [digest for part, digest in value["parts"].items() if part not in unchanged]
                 self._revision(revision_content(path_and_kind(key)[1], value["parts"]), documents)
@@ -69,7 +70,7 @@ class _Check:
         found = self.archive.tree(MemberKind.REVISION, content)
         self._mark(member)
         if not isinstance(found, dict) or not isinstance(found.get("parts"), dict):
-            raise BadArchive(f"{member.name}: it does not describe a revision")
+            raise BadArchive(f"{member.name}: the content of the member does not describe a revision")
         self._revision(content, found["parts"].values())
 
     def _array(self, leaf: Mapping[str, Any], document: str) -> None:
@@ -78,7 +79,7 @@ class _Check:
             array = self.archive.array(member.digest)
             if leaf != {"dtype": array.dtype, "shape": list(array.shape), "content": member.digest}:
                 name = ArchiveMember(MemberKind.DOCUMENT, document).name
-                raise BadArchive(f"{name}: it says that {member.name} has another type or shape than it has")
+                raise BadArchive(f"{name}: the dtype or shape given here differs from that of the array {member.name}")
             self._mark(member)
 
     def _file(self, digest: str) -> None:
@@ -98,7 +99,7 @@ class _Check:
 def check_archive(archive: Archive, on_progress: OnProgress = lambda _done, _all: None) -> None:
     """Check that an archive contains its commit and everything below it, unchanged, and nothing else.
 
-    Of an archive that has only the later part of a history, the trees of entries are not checked: the server does this
-    when it is imported. Raises `BadArchive`, which names the member.
+    If an archive has only the later part of a history, the entries of its versions are not compared with its commits:
+    the server does this at the import. Raises `BadArchive`, which names the faulty member.
     """
     _Check(archive, on_progress).run()

@@ -24,7 +24,7 @@ MOST_BYTES = 256 * MIB
 
 
 class BadArchive(Exception):
-    """The file is not an archive, or not a whole one; the message names the member."""
+    """The file is not an archive, or the archive is incomplete or damaged; the message names the faulty member."""
 
 
 class MemberKind(StrEnum):
@@ -32,7 +32,7 @@ class MemberKind(StrEnum):
 
     COMMIT = "commits"
     CHANGES = "changes"
-    """Entries that differ between a commit and its first parent, named by the commit."""
+    """Entries that differ between a commit and its first parent; the digest of the commit names the member."""
     REVISION = "revisions"
     """Kind and content digests of the parts of a revision that documents refer to."""
     DOCUMENT = "documents"
@@ -41,7 +41,7 @@ class MemberKind(StrEnum):
 
     @property
     def ending(self) -> str:
-        """The end of the names of members of this kind."""
+        """The file ending in the names of members of this kind."""
         return _ENDINGS.get(self, ".json")
 
 
@@ -50,19 +50,19 @@ _NAME = re.compile(r"([a-z]+)/([0-9a-f]{64})([.a-z]*)")
 
 
 class ArchiveMember(NamedTuple):
-    """ArchiveMember of an archive: its kind, and the digest that names its content."""
+    """Member of an archive: its kind, and the digest that is part of its name."""
 
     kind: MemberKind
     digest: str
 
     @property
     def name(self) -> str:
-        """The name in the archive."""
+        """The name of the member in the archive, such as `files/<64 hexadecimal digits>`."""
         return f"{self.kind.value}/{self.digest.removeprefix('sha256:')}{self.kind.ending}"
 
     @classmethod
     def of_name(cls, name: str) -> ArchiveMember:
-        """Return the member with a name. Raises `BadArchive` for a name that no member has."""
+        """Parse the name of a member. Raises `BadArchive` for a text that is not the name of a member."""
         found = _NAME.fullmatch(name)
         try:
             member = None if found is None else cls(MemberKind(found[1]), f"sha256:{found[2]}")
@@ -74,10 +74,11 @@ class ArchiveMember(NamedTuple):
 
 
 def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
-    """Read the headers of an archive, each with the position of its bytes.
+    """Yield the header of each member of an archive, with the position of the member's bytes.
 
-    Only the headers that `ArchiveWriter` writes are accepted: other kinds, such as those that contain long names, can
-    make a reader use as much memory as the file has bytes. Raises `BadArchive`, also where the file was cut off.
+    Only headers of the kind that `ArchiveWriter` writes are accepted: headers of other kinds, such as those for long
+    names, can make a reader use as much memory as the file has bytes. Raises `BadArchive` for other headers, and where
+    the file was cut off.
     """
     size_bytes = file.seek(0, io.SEEK_END)
     position = 0
@@ -91,7 +92,7 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
         except (tarfile.TarError, ValueError) as error:
             raise BadArchive(f"the file is no archive, or was cut off after {position:,} bytes: {error}") from error
         if header.type != tarfile.REGTYPE or header.size < 0:
-            raise BadArchive(f"{header.name}: it is not a member of an archive")
+            raise BadArchive(f"{header.name}: the archive contains something other than a regular file")
         header.offset_data = position + tarfile.BLOCKSIZE
         position = header.offset_data + -(-header.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
         if position > size_bytes:
@@ -100,20 +101,26 @@ def read_headers(file: BinaryIO) -> Iterator[tarfile.TarInfo]:
 
 
 def canonical_tree(member: ArchiveMember, data: bytes) -> Any:
-    """Return the tree in a member of JSON. Raises `BadArchive` if its digest differs or its text is not canonical."""
+    """Parse the JSON of a member.
+
+    Raises `BadArchive` if the data do not have the digest in the member's name, or are not canonical JSON.
+    """
     require_digest(member, digest_of(data))
     try:
         tree = json.loads(data)
         same = canonical_json(tree) == data
     except (ValueError, RecursionError, TypeError) as error:
-        raise BadArchive(f"{member.name}: it is not JSON: {error}") from error
+        raise BadArchive(f"{member.name}: the content of the member is not JSON: {error}") from error
     if not same:
         raise BadArchive(f"{member.name}: the JSON is not in canonical form")
     return tree
 
 
 def stored_array(member: ArchiveMember, data: bytes) -> EncodedArray:
-    """Return the array in a member. Raises `BadArchive` if it cannot be decoded or is another array."""
+    """Return the array of a member.
+
+    Raises `BadArchive` if the array cannot be decoded, or does not have the digest in the member's name.
+    """
     try:
         spec = read_spec(data)
         array = EncodedArray(spec.dtype, spec.shape, data)
@@ -125,6 +132,6 @@ def stored_array(member: ArchiveMember, data: bytes) -> EncodedArray:
 
 
 def require_digest(member: ArchiveMember, digest: str) -> None:
-    """Raise `BadArchive` if the content of a member has another digest than its name says."""
+    """Raise `BadArchive` if the digest of a member's content is not the digest in the member's name."""
     if digest != member.digest:
         raise BadArchive(f"{member.name}: the content has the digest {digest}; it was changed or damaged")

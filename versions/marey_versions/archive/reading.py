@@ -41,22 +41,22 @@ class Manifest:
     commit: str
     """The commit that the archive was made of."""
     base: tuple[str, ...]
-    """Commits that the archive builds on, without having them; empty if it has the whole history."""
+    """Commits that precede those of the archive and that it does not contain; empty if it has the whole history."""
 
 
 class EntryChange(NamedTuple):
     """Change of an entry between a commit and its first parent."""
 
     value: Value | None
-    """The entry now; None if the commit removed it."""
+    """The entry after the commit; None if the commit removed it."""
     unchanged: Mapping[str, str]
-    """Parts whose documents the archive lacks, with the content digest of an earlier revision that has them."""
+    """Parts whose documents the archive lacks, each with the content digest of an earlier revision with this part."""
 
 
 class Archive:
-    """Open archive; members are read, and compared with their digests, when they are asked for.
+    """Archive that is open for reading; a member is read, and compared with its digest, when it is requested.
 
-    Raises `BadArchive` if the file is not a complete archive or has members that no archive has.
+    Raises `BadArchive` if the file is not a complete archive, or has members with names that archives do not have.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -69,7 +69,7 @@ class Archive:
         manifest: Manifest | None = None
         for header in read_headers(self._file):
             if manifest is not None:
-                raise BadArchive(f"{header.name}: it comes after {MANIFEST}, which is the last member of an archive")
+                raise BadArchive(f"{header.name}: the member follows {MANIFEST}, which must be the last member")
             if header.name == MANIFEST:
                 manifest = _manifest(self._bytes(MANIFEST, header.offset_data, header.size))
             else:
@@ -86,17 +86,17 @@ class Archive:
     # -- members -------------------------------------------------------------------------------------------------------
 
     def tree(self, kind: MemberKind, digest: str) -> Any:
-        """Return the tree in a commit, revision or document."""
+        """Return the parsed JSON of a member that contains a commit, a revision or a document."""
         member = ArchiveMember(kind, digest)
         return canonical_tree(member, self._read(member))
 
     def array(self, digest: str) -> EncodedArray:
-        """Return an array, which has been decoded."""
+        """Return an array after a check that it can be decoded and has the given digest."""
         member = ArchiveMember(MemberKind.ARRAY, digest)
         return stored_array(member, self._read(member))
 
     def file(self, digest: str) -> Iterator[bytes]:
-        """Return the bytes of a file in pieces. Raises `BadArchive` after the last one if they are not its bytes."""
+        """Yield the bytes of a file in pieces. Raises `BadArchive` after the last piece if the digest differs."""
         member = ArchiveMember(MemberKind.FILE, digest)
         position, left = self._place(member)
         hashed = hashlib.sha256()
@@ -124,7 +124,7 @@ class Archive:
             lines = [json.loads(line) for line in self._read(member).splitlines()]
             return {key_of(str(one["path"]), str(one["kind"])): _change(one) for one in lines}
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise BadArchive(f"{member.name}: it is not a list of changes: {error!r}") from error
+            raise BadArchive(f"{member.name}: the content of the member is not a list of changes: {error!r}") from error
 
     def _read(self, member: ArchiveMember) -> bytes:
         return self._bytes(member.name, *self._place(member))
@@ -136,7 +136,7 @@ class Archive:
 
     def _bytes(self, name: str, position: int, size_bytes: int) -> bytes:
         if size_bytes > MOST_BYTES:
-            raise BadArchive(f"{name}: it has {size_bytes:,} bytes; at most {MOST_BYTES:,} are read")
+            raise BadArchive(f"{name}: the member has {size_bytes:,} bytes; at most {MOST_BYTES:,} are accepted")
         self._file.seek(position)
         data = self._file.read(size_bytes)
         if len(data) < size_bytes:
@@ -146,7 +146,7 @@ class Archive:
     # -- versions ------------------------------------------------------------------------------------------------------
 
     def history(self) -> list[tuple[str, CommitRecord]]:
-        """Return the commit of the manifest and those before it that the archive has, each after its parents."""
+        """Return the commit that the manifest names and its ancestors in the archive, each commit after its parents."""
         records: dict[str, CommitRecord] = {}
         ordered: dict[str, None] = {}
         path = [self.manifest.commit]
@@ -160,14 +160,17 @@ class Archive:
         return [(digest, records[digest]) for digest in ordered]
 
     def versions(self) -> Versions:
-        """Compute the entries of all versions.
+        """Compute the entries of all versions from the changes of their commits.
 
-        Raises `BadArchive` if they are not those that a commit names, and for an archive that has only the later part
-        of a history.
+        Raises `BadArchive` if the entries of a version do not have the digest that its commit names, and if the archive
+        has only the later part of a history.
         """
         if self.manifest.base:
             earlier = self.manifest.base[0]
-            raise BadArchive(f"{MANIFEST}: it has only the versions after {earlier}; import it where that one is")
+            raise BadArchive(
+                f"{MANIFEST}: the archive has only the versions after the commit {earlier}; import it into a dataset "
+                "that has this commit"
+            )
         store = ChunksInMemory()
         empty = build(store, ())
         roots: dict[str, str] = {}
@@ -180,7 +183,9 @@ class Archive:
             except (TypeError, ValueError) as error:
                 raise BadArchive(f"{name}: an entry is not valid: {error}") from error
             if root != record.tree:
-                raise BadArchive(f"{name}: the entries are not those that the commit names; they were changed")
+                raise BadArchive(
+                    f"{name}: the entries do not have the digest that the commit names; the changes were altered"
+                )
             roots[digest] = root
         return Versions(store, roots)
 
@@ -193,7 +198,7 @@ class Versions:
     _roots: Mapping[str, str]
 
     def entries(self, commit: str) -> Iterator[DatasetEntry]:
-        """Return the entries of a version by path."""
+        """Return the entries of a version, sorted by path."""
         return (entry_of(key, value) for key, value in Tree(self._store, self._roots[commit]).entries())
 
 
@@ -203,9 +208,9 @@ def _manifest(data: bytes) -> Manifest:
         base = tuple(map(str, tree["base"]))
         schema, manifest = tree["schema"], Manifest(str(tree["dataset"]), str(tree["commit"]), base)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise BadArchive(f"{MANIFEST}: it is not the manifest of an archive") from error
+        raise BadArchive(f"{MANIFEST}: the content of the member is not the manifest of an archive") from error
     if schema != SCHEMA:
-        raise BadArchive(f"{MANIFEST}: this version of Marey reads {SCHEMA}, not {str(schema)[:80]!r}; update it")
+        raise BadArchive(f"{MANIFEST}: this version of Marey reads {SCHEMA}, not {str(schema)[:80]!r}; update Marey")
     for digest in (manifest.commit, *base):
         if not is_digest(digest):
             raise BadArchive(f"{MANIFEST}: {digest[:80]!r} is not the digest of a commit")

@@ -13,9 +13,9 @@ from marey_versions.archive.members import MANIFEST, SCHEMA, ArchiveMember, BadA
 
 
 class ArchiveWriter:
-    """Writer of an archive to a file, whose complete members from an earlier attempt are kept.
+    """Writer of an archive to a file. Members that an interrupted attempt has completely written are kept.
 
-    Members have no times, owners or permissions, so that the file depends on its content alone.
+    Members have no times, owners or permissions, so that the file depends on the content of its members alone.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -40,7 +40,7 @@ class ArchiveWriter:
     def finish(self, dataset: str, commit: str, base: Sequence[str] = ()) -> None:
         """Add the manifest, which says that the archive is complete, and end the file.
 
-        `base` lists the commits that the archive builds on, without having them.
+        `base` lists the commits that precede those of the archive and that the archive does not contain.
         """
         counts = Counter(name.partition("/")[0] for name in self._held)
         manifest = {
@@ -59,7 +59,7 @@ class ArchiveWriter:
 
 
 def _complete_members(file: BinaryIO) -> tuple[set[str], int]:
-    """Return the names of the members that an unfinished archive has, and the position after the last one."""
+    """Return the names of the complete members of an unfinished archive, and the position after the last of them."""
     names: set[str] = set()
     end = 0
     try:

@@ -26,7 +26,7 @@ T = TypeVar("T")
 def build(store: ChunkStore, entries: Iterable[Entry]) -> str:
     """Store a tree with the given entries, sorted by key, and return the digest of its root.
 
-    Raises `ValueError` if a key does not follow the one before it.
+    Raises `ValueError` if a key is not greater than the previous one.
     """
     writer = ChunkWriter(store)
     children = [writer.add(Leaf(chunk)) for chunk in _split(0, _increasing(entries), _key_of_entry)]
@@ -34,7 +34,7 @@ def build(store: ChunkStore, entries: Iterable[Entry]) -> str:
 
 
 class Splitter(Generic[T]):
-    """Splits a sequence of keys with their values, at one level of a tree, into chunks."""
+    """Splitter of a sequence of keys with their values into the chunks of one level of a tree."""
 
     def __init__(self, level: int) -> None:
         self._level = level
@@ -56,7 +56,7 @@ class Splitter(Generic[T]):
         return self._take()
 
     def finish(self) -> Iterator[tuple[T, ...]]:
-        """Return the last chunk, which no key ended, or None if there is no such chunk."""
+        """Yield the last chunk if its last key did not end it; otherwise, yield nothing."""
         if self._open:
             yield self._take()
 
@@ -70,7 +70,7 @@ class Splitter(Generic[T]):
 
 
 class ChunkWriter:
-    """Collects new chunks, and stores those that belong to the new tree."""
+    """Collector of new chunks, which stores those that belong to the new tree."""
 
     def __init__(self, store: ChunkStore) -> None:
         self.reader = ChunkReader(store)
@@ -124,7 +124,7 @@ def _increasing(entries: Iterable[Entry]) -> Iterator[Entry]:
     before: str | None = None
     for key, value in entries:
         if before is not None and key <= before:
-            raise ValueError(f"the key {key!r} does not follow {before!r}")
+            raise ValueError(f"the key {key!r} must be greater than the previous key, {before!r}")
         before = key
         yield key, value
 

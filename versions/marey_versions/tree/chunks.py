@@ -1,4 +1,4 @@
-"""Chunks of a tree, their canonical bytes, and where chunks are stored."""
+"""Chunks of a tree, their canonical bytes, and the interface of stores of chunks."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class Changed(NamedTuple):
 def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, prefix: str = "") -> Iterator[Changed]:
     """Return the keys that start with `prefix` and whose values differ in the trees with the given roots, sorted.
 
-    Comparisons with one reader share the chunks that it remembers.
+    If `store` is a `ChunkReader`, several comparisons can share the chunks that it remembers.
     """
     changes = _difference(
         ChunkReader.of(store), before, after, KeyRange(_before_all_with(prefix), after_all_with(prefix))
@@ -34,7 +34,7 @@ def difference(store: ChunkStore | ChunkReader, before: str, after: str, *, pref
 
 
 def _before_all_with(prefix: str) -> str | None:
-    """Return a text shortly before all texts with the prefix, in the order of texts; None for an empty prefix."""
+    """Return a text that sorts before all texts with the prefix and after most others; None for an empty prefix."""
     if not prefix:
         return None
     last = ord(prefix[-1])
@@ -73,7 +73,7 @@ class KeyRange(NamedTuple):
 def _compare(
     reader: ChunkReader, level: int, before: Sequence[Child], after: Sequence[Child], within: KeyRange
 ) -> Iterator[Changed]:
-    """Return the differences, within a range of keys, between the chunks of one level in two trees."""
+    """Yield the differing keys, within a range of keys, below chunks of one level in two trees."""
     shared = {child.digest for child in before} & {child.digest for child in after}
     before, after = ([child for child in side if child.digest not in shared] for side in (before, after))
     if level == 0:
@@ -85,7 +85,7 @@ def _compare(
 
 
 def _parts(before: Sequence[Child], after: Sequence[Child], within: KeyRange) -> Iterator[KeyRange]:
-    """Split a range of keys so that each part contains few chunks of the tree that has more of them."""
+    """Split a range of keys so that no part contains more than `COMPARED_TOGETHER` chunks of the longer side."""
     longer = max(before, after, key=len)
     start = within.after
     for place in range(COMPARED_TOGETHER - 1, len(longer) - 1, COMPARED_TOGETHER):

@@ -1,4 +1,4 @@
-"""Changes of trees. They rewrite the chunks with changed keys, and the chunks above these, and nothing else."""
+"""Changes of trees. A change rewrites only the chunks with changed keys, and the chunks above these."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ class _Change:
         return Child(chunk.last_key, self._root, chunk.count)
 
     def _rewrite(self, level: int, changes: Sequence[tuple[str, Any]]) -> list[tuple[str, Child | None]]:
-        """Add the chunks of a level that differ after changes, and return the changes of the level above.
+        """Add the new chunks of one level after `changes`, and return the resulting changes of the level above.
 
-        `changes` has the entries of a leaf, or the children of a branch, by key; None removes one.
+        `changes` contains entries if the level is that of the leaves, and children of branches otherwise, by key; None
+        removes the key.
         """
         changed: dict[str, Child | None] = {}
         old = _ChunksOfLevel(self._writer.reader, self._root, level)
@@ -86,7 +87,7 @@ class _Change:
 
 
 class _ChunksOfLevel:
-    """Chunks of one level of a tree in order, from a position that only moves forward."""
+    """Cursor over the chunks of one level of a tree; it moves only forward."""
 
     def __init__(self, reader: ChunkReader, root: str, level: int) -> None:
         self._reader = reader
@@ -94,7 +95,7 @@ class _ChunksOfLevel:
         top = reader.one(root)
         self._root = Child(top.last_key, root, top.count)
         self._path: list[tuple[Branch, int]] = []
-        """Branches from the root down to the level above, each with the index of the child that is next on the path."""
+        """Branches on the way from the root down to the present chunk, each with the index of the child on this way."""
 
     def seek(self, key: str) -> None:
         """Go to the chunk in which `key` is or would be."""
@@ -125,7 +126,7 @@ class _ChunksOfLevel:
 
 
 def _merged(chunk: Chunk, changes: Sequence[tuple[str, Any]]) -> Iterator[tuple[str, Any]]:
-    """Return the members of a chunk after changes, each with its key, sorted."""
+    """Return the entries or children of a chunk after changes, each with its key, sorted by key."""
     members: dict[str, Any]
     if isinstance(chunk, Leaf):
         members = {entry[0]: entry for entry in chunk.entries}

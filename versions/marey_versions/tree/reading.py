@@ -23,7 +23,7 @@ LOADED_TOGETHER = 256
 
 
 class ChunkReader:
-    """Reads chunks from a store, several at a time, and remembers those that were read."""
+    """Reader of chunks in a store, which loads several at a time and remembers the chunks that it has loaded."""
 
     def __init__(self, store: ChunkStore) -> None:
         self._store = store
@@ -39,7 +39,10 @@ class ChunkReader:
         return self.several([digest])[0]
 
     def several(self, digests: Sequence[str]) -> list[Chunk]:
-        """Return chunks in the order of their digests. Raises `DamagedChunk` for one that is missing or damaged."""
+        """Return chunks in the order of the given digests.
+
+        Raises `DamagedChunk` if a chunk is missing or damaged.
+        """
         missing = {digest for digest in digests if digest not in self._known}
         if missing:
             loaded = self._store.load(missing)
@@ -52,7 +55,7 @@ class ChunkReader:
     def below(self, children: Sequence[Child], level: int) -> list[Chunk]:
         """Return the chunks of `level` that `children` refer to.
 
-        Raises `DamagedChunk` if one differs from what its parent says about it.
+        Raises `DamagedChunk` if a chunk does not have the level, last key and number of entries that its parent states.
         """
         chunks = self.several([child.digest for child in children])
         for child, chunk in zip(children, chunks, strict=True):
@@ -66,7 +69,7 @@ class ChunkReader:
 
 
 class Tree:
-    """Tree with a given root, to be read. Trees with one reader share the chunks that it remembers."""
+    """Tree with a given root, open for reading. Trees with the same reader share the chunks that it remembers."""
 
     def __init__(self, store: ChunkStore | ChunkReader, root: str) -> None:
         self.root = root
@@ -77,7 +80,7 @@ class Tree:
         return self._reader.one(self.root).count
 
     def get(self, key: str) -> Value | None:
-        """Return the value of a key, or None."""
+        """Return the value of a key, or None if the tree does not have the key."""
         return self.get_several([key]).get(key)
 
     def get_several(self, keys: Iterable[str]) -> dict[str, Value]:
@@ -99,7 +102,7 @@ class Tree:
                 yield key, value
 
     def _from(self, chunk: Chunk, start: str) -> Iterator[Entry]:
-        """Return the entries below a chunk whose keys are at least `start`."""
+        """Return those entries below a chunk whose keys are not less than `start`."""
         if isinstance(chunk, Leaf):
             yield from chunk.entries[bisect_left(chunk.entries, start, key=_key_of) :]
             return
@@ -129,9 +132,9 @@ class Tree:
 
 
 def leaves_with(reader: ChunkReader, root: str, keys: Sequence[str]) -> list[tuple[Leaf, Sequence[str]]]:
-    """Return the leaves in which keys, given sorted, are or would be, each with its keys.
+    """Return the leaves that have, or would have, the given sorted keys; each leaf with its share of the keys.
 
-    Each level is loaded with one request to the store.
+    The chunks of each level are loaded with one request to the store.
     """
     parts: list[tuple[Chunk, Sequence[str]]] = [(reader.one(root), keys)]
     level = parts[0][0].level
@@ -144,7 +147,10 @@ def leaves_with(reader: ChunkReader, root: str, keys: Sequence[str]) -> list[tup
 
 
 def _spread(chunk: Branch, keys: Sequence[str]) -> Iterator[tuple[Child, Sequence[str]]]:
-    """Return the children in which keys, given sorted, are or would be; the last child also gets all greater keys."""
+    """Yield the children that have, or would have, the given sorted keys, each with its share of the keys.
+
+    The last child also gets all greater keys.
+    """
     start = 0
     while start < len(keys):
         place = min(bisect_left(chunk.children, keys[start], key=_last_key_of), len(chunk.children) - 1)

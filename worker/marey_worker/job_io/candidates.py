@@ -1,4 +1,4 @@
-"""Candidates: clips that may be added to an evaluated set, as matching databases by folder and skeleton."""
+"""Candidates: clips that may be added to an evaluated set, in one matching database for each folder and skeleton."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ class Unusable(NamedTuple):
 
 @dataclass
 class Candidates:
-    """Matching databases by folder, with the options and normaliser of the evaluated set, and unusable folders."""
+    """Matching databases of candidates by group name, and folders whose clips cannot be used.
+
+    The databases have the options and the normaliser of the evaluated set.
+    """
 
     databases: dict[str, MatchingDatabase] = field(default_factory=dict)
     unusable: list[Unusable] = field(default_factory=list)
@@ -46,7 +49,7 @@ class _Group(NamedTuple):
 
 
 def read_candidates(context: Context, evaluated: EvaluatedSet) -> Candidates:
-    """Return the job's input `candidates`, without clips that the set already contains."""
+    """Return the matching databases of the job's input `candidates`, without clips that the set already contains."""
     database = evaluated.clips.database
     known = {source_of(clip) for clip in database.clips}
     pins = [pin for pin in context.inputs.get("candidates", ()) if uid_of(pin) not in known]

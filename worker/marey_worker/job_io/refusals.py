@@ -34,7 +34,7 @@ class Refusals:
     def add(
         self, pin: PinnedInput, error: MotionError | ValidationError | NoSuchThing, *, name: str | None = None
     ) -> None:
-        """Add a refused input. `name` is the name that its result would have had, if that is not the input's path."""
+        """Add a refused input. `name` identifies the refusal to users; by default, the path of the input does."""
         shown = name or pin.path
         code = "bad-document" if isinstance(error, ValidationError) else error.code
         self._context.log(f"{shown}: {error}")
@@ -42,5 +42,5 @@ class Refusals:
 
     @property
     def first(self) -> str:
-        """The text of the first refusal, for the end of a sentence; empty if there is none."""
+        """The first refusal as the end of a sentence, beginning with a semicolon; empty if there is no refusal."""
         return f"; {self.entries[0]['name']}: {self.entries[0]['detail']}" if self.entries else ""

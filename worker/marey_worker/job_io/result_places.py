@@ -23,7 +23,8 @@ class ResultPlaces:
     def take(self, kind: Kind, collection: str, *names: str) -> None:
         """Reserve names in a collection below `into` for results.
 
-        Raises `MotionError`, and reserves no name, if a name is too long, taken, or would replace an input.
+        If a name is too long, or taken, or if its result would replace an input, raises `MotionError` and reserves
+        none of the names.
         """
         for name in names:
             self._require_free(kind, collection, name)
@@ -37,7 +38,10 @@ class ResultPlaces:
         self._taken |= {(kind, collection, name) for name in names}
 
     def keep(self, pin: PinnedInput) -> None:
-        """Reserve the folder and name of an input for its result. Raises `MotionError` if another result has them."""
+        """Reserve the folder and name of an input for the result made from it.
+
+        Raises `MotionError` if they are reserved for another result.
+        """
         self._require_free(pin.kind, pin.collection, pin.name)
         self._taken.add((pin.kind, pin.collection, pin.name))
 

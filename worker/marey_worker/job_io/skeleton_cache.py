@@ -1,4 +1,4 @@
-"""Cache of skeletons for retargeting, kept between jobs of a process; a revision never changes."""
+"""Cache of skeletons and retargeting plans, kept between the jobs of a process, because revisions never change."""
 
 from __future__ import annotations
 

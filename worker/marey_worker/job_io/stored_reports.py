@@ -15,7 +15,7 @@ from marey_worker.context import Context
 def store_report(
     context: Context, kind: type[Report], title: str, page: str, figures: Iterable[tuple[str | None, DrawnFigure]]
 ) -> dict[str, Any]:
-    """Store the page and the figures of a report; return its document, in which a figure names the trial it shows."""
+    """Store the page and the figures of a report as files; return the document that refers to these files."""
     report = kind.model_validate(
         {
             "title": title,
@@ -28,8 +28,9 @@ def store_report(
 
 
 def _scripts(page: str) -> tuple[str, ...]:
-    """Return the script of the page: the last element that looks like a script, because earlier ones can be names of
-    clips.
+    """Return the digest of the page's script, or nothing if it has none.
+
+    The script is the last element that looks like one, because earlier ones can be names of clips.
     """
     _, found, rest = page.rpartition("<script>")
     digest = hashlib.sha256(rest.partition("</script>")[0].encode()).digest()

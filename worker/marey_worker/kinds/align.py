@@ -181,7 +181,7 @@ class _Job:
     # -- annotations --
 
     def _read_annotations(self) -> dict[str, list[_ClipAnnotation]] | None:
-        """Return the annotations of the requested layer by clip; None if the job has none."""
+        """Return the annotations of the requested layer by id of the clip; None if no annotations are given."""
         pins = self._context.inputs.get("annotations", ())
         if not pins:
             if self._params.layer is not None or self._params.labels:
@@ -198,7 +198,7 @@ class _Job:
         return found
 
     def _cuts(self, clip: _Clip, annotations: Mapping[str, Sequence[_ClipAnnotation]]) -> tuple[Cut, ...]:
-        """Return the boundaries from a clip's annotation; an annotation of the same revision is preferred."""
+        """Return the frames at which a clip's annotation cuts it. An annotation of the clip's revision is preferred."""
         known = annotations.get(clip.pin.item, ())
         known = [one for one in known if one.clip.revision == clip.pin.revision] or known
         if len(known) != 1:
@@ -231,7 +231,10 @@ class _Job:
     # -- options --
 
     def _options(self) -> AlignOptions:
-        """Return the options of the alignment; a reference given as the id of an item gets its newest revision."""
+        """Return the options of the alignment.
+
+        If the reference is the id of a clip, it is replaced by the uid of the newest revision among the inputs.
+        """
         options = AlignOptions.of(self._params)
         if options.reference in (MEDOID, NEAREST_MEAN_LENGTH):
             return options

@@ -29,8 +29,8 @@ def run(context: Context, params: CompareParams) -> dict[str, Any]:
         comparison = compare_results(before, after)
     except MotionError as error:
         again = (
-            f"`marey evaluate … --normaliser PROJECT/{first.path}` with the options of that evaluation makes one "
-            "that can be compared"
+            f"`marey evaluate … --normaliser PROJECT/{first.path}` with the options of that evaluation makes an "
+            "evaluation that can be compared"
         )
         raise JobRefused(error.code, f"{error}; {again}") from error
     document = {**comparison_to_tree(comparison), "names": {"before": first.path, "after": second.path}}

@@ -111,7 +111,7 @@ class _Cutting:
         return self._clip_pins.get((clip.item, clip.revision), self._clips[clip.item])
 
     def _named(self, annotation: Annotation, clip: Item | PinnedInput) -> Iterator[tuple[Segment, str]]:
-        """Yield each selected segment with the name of its piece, which is numbered among all segments of the label."""
+        """Yield each selected segment with the name of its piece, numbered among all segments with the same label."""
         numbers: Counter[str] = Counter()
         for one in annotation.segments:
             numbers[one.label] += 1
@@ -133,7 +133,7 @@ class _Cutting:
             raise JobRefused(
                 "same-name",
                 f"{count} pieces would have the path {folder}/{name}; cut one layer at a time, or cut clips of one "
-                "folder whose pieces have the same name into different folders",
+                "folder in separate jobs with different folders for the results",
             )
         long = [name for _, name in places if len(name) > MAX_NAME_LENGTH]
         if long:

@@ -102,8 +102,9 @@ class _Importing:
         return graph_item(graph, self._find_models)
 
     def _find_models(self, name: str, collection: str | None) -> tuple[int, list[NamedModel]]:
-        """Find models of this job and of the project; if this job creates a new revision of a model, the new revision
-        is returned.
+        """Find models of this job and of the project by name; return their number and the first few of them.
+
+        If this job creates a new revision of a model, the new revision is returned.
         """
         stored = self._context.find_items(Kind.MODEL, name, collection)
         found = {one.path: NamedModel(one.path, {"item": one.id, "revision": one.revision}) for one in stored}

@@ -69,7 +69,7 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
 
 
 def _simulation(context: Context, evaluated: EvaluatedSet, database: MatchingDatabase) -> Resimulation:
-    """Return a simulation of the set. It reuses the evaluation's records if the database contains no further clips."""
+    """Return a simulation of the set, which reuses the evaluation's records if the database has no further clips."""
     alone = database is evaluated.clips.database
     return Resimulation(
         database,
