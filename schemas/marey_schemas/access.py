@@ -90,14 +90,16 @@ class User(Answer):
 
 
 class Me(Answer):
-    """The caller, and the rights of the token of the request."""
+    """The caller, and the rights of the token that authenticates the request."""
 
     user: User | None
     scopes: tuple[str, ...]
     job: str | None = Field(
         None, description="The id of the job whose attempt uses the token; null for tokens of users."
     )
-    expires_at: datetime | None = Field(None, description="The end of the token of this request; null if it has none.")
+    expires_at: datetime | None = Field(
+        None, description="Time at which the token of this request ends; null: it never ends."
+    )
     token: str | None = Field(None, description="The id of the token of this request; null for tokens of attempts.")
 
 
@@ -127,7 +129,7 @@ class TokenRotation(Request):
     rotation_id: str = Field(
         pattern=r"^[A-Za-z0-9_-]{32,64}$",
         description="Random text, for example 32 hexadecimal digits. A repeated request with the same `rotation_id` "
-        "gets the same successor. Keep it as secret as the token until you have the answer.",
+        "gets the same new token. Keep it as secret as the token until you have the answer.",
     )
     grace_s: int = Field(
         3600, ge=60, le=7 * 86400, description="Seconds for which the replaced token remains valid, at most to its end."

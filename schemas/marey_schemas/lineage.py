@@ -108,7 +108,7 @@ class LineageGroup(NamedTuple):
 
 
 class GroupLink(NamedTuple):
-    """Links from a group of revisions to a group that jobs made from it, and the number of revisions that they used."""
+    """Links from a group of revisions to a group that jobs made from it; `used` counts the revisions that were used."""
 
     source: int
     result: int

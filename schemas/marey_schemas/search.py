@@ -130,7 +130,8 @@ class FoundStep(Answer):
 
     model: RevisionRef
     tree: Literal["stored", "drawn"] = Field(
-        description="Origin of the samples; drawn: the model has no tree, or an outdated one."
+        description="Origin of the samples. stored: the tree of the model; drawn: samples were drawn for this search, "
+        "because the model has no tree, or an outdated one."
     )
     latent: tuple[float, ...]
     log_likelihood: float

@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class HistoricCommit(Protocol):
-    """Commit as the searches for common ancestors and for origins need it."""
+    """Commit with the facts that searches for common ancestors and for origins need."""
 
     @property
     def tree(self) -> str:

@@ -104,7 +104,7 @@ def find_origins(
 
 
 def _pass_to_parents(search: _OriginSearch, commit: str, key: str, names: set[str]) -> set[str]:
-    """Continue the search, for each name whose value a parent already has, in that parent; return these names."""
+    """Continue the search in the parents for those of `names` whose values a parent already had; return these names."""
     present = search.entry(commit, key)
     assert present is not None
     values = _named(present)

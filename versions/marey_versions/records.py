@@ -31,7 +31,7 @@ class RevisionKey(NamedTuple):
 
 
 class DatasetEntry(NamedTuple):
-    """Entry in a version of a dataset: the content that has a certain path and kind."""
+    """Entry in a version of a dataset: its path and kind, the content digests of its parts, and its tags."""
 
     path: str
     kind: str

@@ -38,7 +38,7 @@ _NONE: bytes = msgpack.packb(None)
 
 
 def claim(transport: Transport, request: ClaimRequest) -> tuple[Lease, ...]:
-    """Claim jobs. If the answer is lost, the same request gets the same leases."""
+    """Claim jobs. If the answer is lost, the request is repeated and gets the same leases."""
     response = transport.send(
         "POST", "/leases", content=as_json(request), repeatable=True, timeout_s=request.wait_s + 30.0
     )

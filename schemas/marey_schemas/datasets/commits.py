@@ -119,7 +119,7 @@ class Origin(Answer):
 
 
 class EntryOrigins(Answer):
-    """Origins of the content, the tags and the path of an entry."""
+    """Commits that last changed each part, the tags and the path of an entry."""
 
     path: str
     kind: Kind

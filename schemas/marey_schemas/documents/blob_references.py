@@ -46,7 +46,7 @@ def members_of(tree: Any) -> list[tuple[str, Any]]:
 
 
 def references_of(schema: str, body: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Return two tables by JSON Pointer: the array references in a stored document, and its digests of files.
+    """Return two dictionaries by JSON Pointer: a stored document's references to arrays, and its digests of files.
 
     Digests of files are in certain fields of the schema, and in members called `blob`.
     """

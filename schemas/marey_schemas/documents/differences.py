@@ -209,7 +209,7 @@ class MappingDifference(Answer):
 
 
 class ModelDifference(Answer):
-    """Differences between the trainings of two models. Changed options are among the changed fields."""
+    """Differences between the trainings of two models. Changed options are listed in `Difference.fields`."""
 
     examples: tuple[int, int] = Field(description="Numbers of training examples.")
     examples_added: tuple[str, ...] = ()

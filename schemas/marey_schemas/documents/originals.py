@@ -21,7 +21,7 @@ CONTENT = {
     "tree": ("samples", "sizes", "children"),
     "graph": ("actions", "start"),
 }  # fmt: skip
-"""Names of the members of each part whose values come from the imported file."""
+"""For each part, names of the members whose values come from the imported file."""
 
 
 class StoredOriginal(Request):

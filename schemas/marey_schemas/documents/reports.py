@@ -41,7 +41,7 @@ class StoredFigure(Request):
 
 
 class Report(Request):
-    """Page for people, and its figures."""
+    """HTML page of a report, and its figures."""
 
     schema_: str = Field(alias="schema")
     title: str

@@ -101,7 +101,7 @@ class OrientationConstraint(_Constraint):
 
 
 class LookAtConstraint(_Constraint):
-    """Target point at which an axis of a joint points."""
+    """Target at which an axis of a joint, such as the direction of view, must point."""
 
     kind: Literal["look_at"] = "look_at"
     point_m: Shift

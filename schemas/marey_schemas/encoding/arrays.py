@@ -105,7 +105,7 @@ def array_from_leaf(leaf: Mapping[str, Any], *, max_bytes: int = MAX_ARRAY_BYTES
 
 
 def with_blocks(leaf: Mapping[str, Any], array: NDArray[Any]) -> NDArray[Any] | EncodedArray:
-    """Return the decoded array of a leaf; if the leaf's bytes can be stored unchanged, as an `EncodedArray` of them."""
+    """Return a leaf's bytes as an `EncodedArray` if they can be stored unchanged, else `array`, the decoded leaf."""
     if "encoding" in leaf and blocks.is_well_packed(leaf["data"]):
         return EncodedArray(array.dtype.str, array.shape, leaf["data"], array)
     return array

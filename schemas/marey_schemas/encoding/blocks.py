@@ -81,8 +81,8 @@ class _Layout:
 def encode(array: NDArray[Any], *, predict: bool = True) -> bytes:
     """Encode an array of any shape and allowed dtype; the same array always gives the same bytes.
 
-    Without `predict`, tiles are not compressed: this takes hardly more time than copying, and is meant for bytes that
-    are read once. Raises `ArrayError` for a dtype or shape that is not allowed.
+    Without `predict`, tiles are hardly compressed: this takes little more time than copying, and is meant for bytes
+    that are read once. Raises `ArrayError` for a dtype or shape that is not allowed.
     """
     array = little_endian(array)
     layout = _layout_of(ArraySpec.of(array))
@@ -112,7 +112,7 @@ def cut_frames(data: bytes, start: int, stop: int) -> bytes:
     """Return frames `start` to `stop` of an encoded array as another encoded array.
 
     If `start` is the first frame of a block, whole blocks are copied unchanged. All other frames are decoded and
-    written uncompressed. Raises `BlockError`.
+    encoded again without prediction. Raises `BlockError`.
     """
     layout, starts = _read_head(data)
     cut = layout.of_frames(stop - start)
@@ -233,7 +233,7 @@ def _unpack(packed: bytes, layout: _Layout, block: int, group: int) -> NDArray[A
 
 
 def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, slice]]:
-    """Yield the index of each block that contains some of the rows, and their indices in the result and in the block.
+    """Yield, for each block with some of the rows, its index, and the rows' indices in the result and in the block.
 
     `rows` are in ascending order.
     """
@@ -250,7 +250,7 @@ def _rows_by_block(layout: _Layout, rows: range) -> Iterator[tuple[int, slice, s
 def _columns_by_group(
     layout: _Layout, picked: NDArray[np.intp] | None
 ) -> Iterator[tuple[int, slice | NDArray[np.intp], slice | NDArray[np.intp]]]:
-    """Yield the index of each group that contains picked columns, and their indices in the result and in the group."""
+    """Yield, for each group with picked columns, its index, and the columns' indices in the result and in the group."""
     if picked is None:
         for index in range(layout.groups):
             yield index, layout.group(index), slice(None)

@@ -1,8 +1,8 @@
 """Tiles of the block codec: some frames of some columns of an array, as one losslessly compressed zstd frame.
 
-Compression is based on integer prediction, which is exact: float bits become integers in the order of the numbers, each
-column is differenced up to three times, and the largest component of a unit quaternion is predicted from the other
-three up to a few units in the last place. docs/reference/block-format.md describes the layout.
+Compression is based on integer prediction, which is exact. Floats are mapped to integers with the same order. Each
+column is replaced by its differences of up to the third order. The largest component of a unit quaternion is predicted
+from the other three, up to a few units in the last place. docs/reference/block-format.md describes the layout.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,8 @@ class TileError(ValueError):
 def pack(tile: NDArray[Any], lead: int | None) -> bytes:
     """Compress a (frames, columns) little-endian array.
 
-    `lead` is the number of columns before the first quaternion, None if there are no quaternions. The tile gets the
-    first predicting form that decodes to the same bits, unless the plain bytes compress better.
+    `lead` is the number of columns before the first quaternion; None if there are no quaternions. The tile gets the
+    first form with prediction that decodes to the same bits, or the form `RAW` if its compressed bytes are fewer.
     """
     plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
     packed = _compress([np.array([RAW], np.uint8), plain])
@@ -41,13 +41,16 @@ def pack(tile: NDArray[Any], lead: int | None) -> bytes:
 
 
 def pack_raw(tile: NDArray[Any]) -> bytes:
-    """Store a (frames, columns) little-endian array uncompressed, at about the speed of copying."""
+    """Encode a (frames, columns) little-endian array without prediction, at about the speed of copying."""
     plain = np.ascontiguousarray(tile).view(np.uint8).reshape(-1)
     return _compress([np.array([RAW], np.uint8), plain], level=FASTEST)
 
 
 def unpack(data: bytes | memoryview, dtype: np.dtype[Any], frames: int, columns: int) -> NDArray[Any]:
-    """Return the (frames, columns) array of a tile. Raises `TileError` before allocating more than a tile needs."""
+    """Return the (frames, columns) array of a tile.
+
+    Raises `TileError` for bytes that are not such a tile, before it allocates more memory than the tile needs.
+    """
     try:
         size = zstandard.frame_content_size(data)
         if not 0 < size <= 2 + 2 * columns + frames * columns * dtype.itemsize:
@@ -152,7 +155,7 @@ def _unfold_sign(folded: Integers) -> Integers:
 
 
 def _difference(channels: Integers) -> list[Bytes]:
-    """Difference each channel by the order that needs the fewest bits.
+    """Replace each channel by its differences of that order which needs the fewest bits.
 
     Returns the order of each channel (one byte), then the byte planes of the differences, lowest byte first.
     """

@@ -54,8 +54,8 @@ class AlignOptions(CostOptions):
         gt=0,
         le=1000,
         allow_inf_nan=False,
-        description="Rate of the canonical frames, in hertz; absent: the rate of the reference if it is "
-        "given, else the most common rate.",
+        description="Rate of the canonical frames, in hertz; absent: the frame rate of the reference if a clip is "
+        "given as reference, else the most common frame rate of the clips.",
     )
     slope_limit: int | None = Field(
         3,
@@ -70,4 +70,6 @@ class AlignOptions(CostOptions):
         description="Weight of each joint in the cost, by its own or its standard name; default 1, and 0 for "
         "joints that move no part of the body.",
     )
-    keep_height: bool = Field(True, description="Keep the heights above the floor.")
+    keep_height: bool = Field(
+        True, description="Keep the heights above the floor; false: the body begins at height 0 in every clip."
+    )

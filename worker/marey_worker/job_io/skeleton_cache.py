@@ -34,7 +34,7 @@ class Rig(NamedTuple):
 
     @classmethod
     def as_stored(cls, ref: RevisionRef) -> Rig:
-        """Return the rig of a skeleton with its own mapping."""
+        """Return a `Rig` that uses the joint mapping of the same revision."""
         return cls(ref, ref)
 
 

@@ -30,7 +30,7 @@ Headline = dict[str, float | int | None]
 
 
 def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
-    """Run this task's share of the trials by motion matching; the result names the file of their records."""
+    """Simulate this task's share of the trials by motion matching; the result names the file with their records."""
     options = EvaluationOptions.of(params)
     trials = _trials(params, options)[context.task.position :: context.task.size]
     clips = read_clips(context, params, options.database)
@@ -54,7 +54,7 @@ def run(context: Context, params: EvaluateParams) -> dict[str, Any]:
 
 
 def gather(context: Context, params: EvaluateParams, results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Compute the measures from the records of all trials, and stage the evaluation with its report, if requested."""
+    """Compute the measures from the records of all trials; stage the evaluation, and its report if one is requested."""
     options = EvaluationOptions.of(params)
     context.progress(0, GATHERING_STEPS, "reading the records of the trials")
     database = read_clips(context, params, options.database).database
@@ -128,7 +128,7 @@ def headline_of(result: EvaluationResult) -> Headline:
 
 
 def write_report(context: Context, result: EvaluationResult, params: EvaluateParams) -> dict[str, Any]:
-    """Draw every figure, write the page, and return the document that names them."""
+    """Draw every figure, write the page, store both as files, and return the document that refers to these files."""
     figures = draw_figures(result)
     page = render_report(result, title=params.name, figures=figures)
     drawn = [*((None, figure) for figure in figures.values()), *_trial_figures(result, params)]
