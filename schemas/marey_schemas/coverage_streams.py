@@ -187,7 +187,7 @@ class CoverageNow(Answer):
 
 
 class CoverageProgress(CoverageNow):
-    """Coverage after the frames of a request, and the changes that they made."""
+    """Coverage after the frames of a request, and the changes of the coverage by these frames."""
 
     offset: int = Field(description="Number of frames received so far.")
     windows: int = Field(description="Number of one-second windows that these frames completed, in any cell.")

@@ -148,7 +148,7 @@ def title_of(graph: LineageGraph, group: LineageGroup) -> str:
 
 
 def remarks_on(graph: LineageGraph, group: LineageGroup) -> list[str]:
-    """Return what a reader should know about the revisions of a group: that some are old, that some are deleted."""
+    """Return remarks about the revisions of a group: how many of them are outdated, and how many deleted."""
     members = [graph.revisions[position] for position in group.revisions]
     old = [one for one in members if one.newest > one.revision]
     deleted = [one for one in members if one.deleted]

@@ -126,7 +126,7 @@ class ConstraintError(Answer):
 
 
 class FoundStep(Answer):
-    """Motion found for a step."""
+    """Motion that the search found for one step of the request."""
 
     model: RevisionRef
     tree: Literal["stored", "drawn"] = Field(

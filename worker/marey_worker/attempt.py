@@ -145,15 +145,15 @@ class Watch:
         return None
 
     def explain(self, stop: Stop) -> str:
-        """Return the reason for stopping as a sentence, with the limit and the measured value."""
+        """Return the reason for stopping in words, with the limit that was exceeded."""
         resources = self.lease.resources
         return {
             Stop.LEASE_LOST: "the lease was lost",
             Stop.CANCELLED: "the job was cancelled",
             Stop.INTERRUPTED: "the worker is being stopped",
-            Stop.TIME: f"the job ran longer than its {resources.time_limit_s} s",
-            Stop.MEMORY: f"the job needs more than its {resources.memory_limit_mb} MiB of memory",
-            Stop.LOG: f"the job's log grew beyond {LOG_LIMIT_BYTES // MIB} MiB",
+            Stop.TIME: f"the job ran longer than its time limit of {resources.time_limit_s} s",
+            Stop.MEMORY: f"the job needs more memory than its limit of {resources.memory_limit_mb} MiB",
+            Stop.LOG: f"the job's log grew beyond its limit of {LOG_LIMIT_BYTES // MIB} MiB",
         }[stop]
 
 

@@ -83,9 +83,9 @@ class AttemptApi:
         self._post("fail", as_json(request))
 
     def read_parts(self, places: Sequence[PartPlace]) -> list[bytes | None]:
-        """Read documents as MessagePack with arrays in blocks, undecoded; None for one that does not exist.
+        """Read documents as undecoded MessagePack with arrays in blocks; None replaces a document that does not exist.
 
-        Documents at the end of a long list may be left out, but not the first one.
+        Documents at the end of a long list may be omitted, but not the first one.
         """
         path = f"/projects/{self._project}/parts"
         body = as_json(PartsRequest(parts=tuple(places)))

@@ -72,7 +72,7 @@ class Garbage:
 
 
 def load(kinds: list[str]) -> None:
-    """Import the modules that the kinds need, so that the first job does not wait for it."""
+    """Import the modules that the kinds of jobs need, so that the first job does not wait for the import."""
     for name in kinds:
         module = find_kind(name).implementation.partition(":")[0]
         try:
@@ -95,7 +95,9 @@ def run_job(run: Run, pipe: Connection) -> End:
         return Failed("invalid-params", str(error), None, retryable=False)
     except MemoryError:
         limit_mb = run.memory_limit_bytes >> 20
-        return Failed("memory-limit", f"the job needs more than its {limit_mb} MiB of memory", "memory-limit", True)
+        return Failed(
+            "memory-limit", f"the job needs more memory than its limit of {limit_mb} MiB", "memory-limit", True
+        )
     except Exception as error:  # noqa: BLE001 - whatever a kind raises ends this job, not the process
         sys.stderr.write("".join(traceback.format_exception(error)))
         what = "".join(traceback.format_exception_only(error)).strip()[:DETAIL_CHARACTERS]

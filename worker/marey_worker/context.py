@@ -72,7 +72,7 @@ class Task(NamedTuple):
 class Context:
     """Running job: its inputs, and methods that read documents, report progress and stage results.
 
-    All methods send requests to the supervisor; reading ahead and staging overlap with computation.
+    All methods send requests to the supervisor. Parts are read in advance, and results staged, during computation.
     """
 
     def __init__(self, run: Run, pipe: Connection) -> None:
@@ -100,7 +100,7 @@ class Context:
     ) -> Iterator[tuple[PinnedInput, Any]]:
         """Yield each input with one of its parts, or with None if an optional part does not exist.
 
-        Parts are read ahead of the caller.
+        Further parts are read before the caller needs them.
         """
         for pin, (document,) in self.documents_of_each(pins, part):
             if document is None and required:
@@ -113,7 +113,8 @@ class Context:
     ) -> Iterator[tuple[PinnedInput, tuple[Any, ...]]]:
         """Yield each input with several of its parts, and None for each part that does not exist.
 
-        Parts are read ahead of the caller."""
+        Further parts are read before the caller needs them.
+        """
         wanted = (
             (pin, PartPlace(kind=pin.kind, item=pin.item, revision=pin.revision, part=part))
             for pin in pins

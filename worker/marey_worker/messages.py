@@ -58,9 +58,9 @@ class ChildReply:
 
 @dataclass(frozen=True)
 class ReadParts:
-    """Request for parts of revisions; the answer contains encoded documents, None for one that does not exist.
+    """Request for parts of revisions; the answer contains encoded documents, and None if a document does not exist.
 
-    The answer may leave out documents at the end of a long list, but not the first one.
+    The answer may omit documents at the end of a long list, but not the first one.
     """
 
     request: int

@@ -69,7 +69,7 @@ class ArraySpec:
 
     @property
     def nbytes(self) -> int:
-        """The size of the array in bytes; an axis of size 0 counts as one."""
+        """The size of the array in bytes; an axis of size 0 counts as one of size 1."""
         return int(np.dtype(self.dtype).itemsize * math.prod(max(size, 1) for size in self.shape))
 
     def require(self, max_bytes: int) -> None:

@@ -1,7 +1,7 @@
 """Encoding of documents as JSON, MessagePack and BSON, which represent the same trees with the same limits.
 
-A tree consists of objects (str keys), lists, str, int (64 bit), finite float, bool, None, and arrays. BSON has objects
-only at its top level, so a list or a scalar there is refused in BSON.
+A tree consists of objects (str keys), lists, str, int (64 bit), finite float, bool, None, and arrays. A BSON document
+is an object, so a tree that is a list or a scalar is refused in BSON.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Default speeds of a foot in contact with the ground. Imports nothing, so that kinematics load quickly."""
+"""Default speeds of a foot in contact with the ground. This module imports nothing, so that kinematics load quickly."""
 
 TOE_SPEED_M_S = 0.15
 """Greatest speed of a planted toe or heel, judged in each frame."""

@@ -1,4 +1,4 @@
-"""Options of motion matching: the database of clips, and the controller that plays it."""
+"""Options of motion matching: the database of clips, and the controller that plays clips from it."""
 
 from __future__ import annotations
 

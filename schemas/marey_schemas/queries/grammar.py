@@ -101,7 +101,7 @@ def parse(text: str) -> Query:
     if len(text) > MOST_CHARACTERS:
         raise QueryError(f"the query has {len(text)} characters; at most {MOST_CHARACTERS} are accepted", 1)
     if "\0" in text:
-        raise QueryError("a query contains no NUL character", text.index("\0") + 1)
+        raise QueryError("the query contains a NUL character; remove it", text.index("\0") + 1)
     if not text.strip():
         raise QueryError("the query is empty; write a condition, such as frames > 120", 1)
     _require_shallow(text)

@@ -137,7 +137,8 @@ class JobCreate(Request):
     priority: int = Field(0, ge=-100, le=100, description="Jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(
-        "fail", description="Consequence for this job if a job in `after` does not succeed."
+        "fail",
+        description="Final state of this job if a job in `after` does not succeed. fail: failed; skip: cancelled.",
     )
     concurrency_key: str | None = Field(
         None, max_length=255, description="Key of a lock: one job per project and key runs at a time."
@@ -181,7 +182,7 @@ class JobOutput(Answer):
 
 
 def commits_of(inputs: Mapping[str, Any]) -> set[str]:
-    """Return the digests of the commits from which the inputs of a job were taken, as the job records them."""
+    """Return the digests of the commits from which the inputs of a job were taken; `inputs` is `Job.inputs`."""
     found: set[str] = set()
     for recorded in inputs.values():
         if isinstance(recorded, Mapping):

@@ -58,7 +58,7 @@ class ModelPlan(Request):
                 "`annotate` proposes its own"
             )
         if self.cut is not None and not self.annotations and self.annotate is None:
-            raise ValueError("cut: cutting needs annotations; give some, or let them be proposed")
+            raise ValueError("cut: cutting needs annotations; give `annotations`, or `annotate` to have them proposed")
         if self.annotations and self.skeleton is not None and self.cut is None:
             raise ValueError(
                 "annotations: the annotations of the takes cannot be used after retargeting; cut the clips first"

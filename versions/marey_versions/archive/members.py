@@ -1,4 +1,4 @@
-"""Names of the members of an archive, and the checks that their bytes are what the names say."""
+"""Names of the members of an archive, and checks that the bytes of a member match the digest in its name."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ TEMPORARY = ".new-"
 class InputCache:
     """Cache of bytes by key, in a folder that the workers of a machine may share.
 
-    The content of a key never changes: it is a digest, or a part of a revision. Every file begins with the SHA-256 of
-    the rest, so that a damaged or incomplete file is detected and downloaded again.
+    The bytes of a key never change, because a key is a digest, or names a part of a revision. Every file begins with
+    the SHA-256 of the rest, so that a damaged or incomplete file is detected and downloaded again.
     """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:

@@ -45,7 +45,7 @@ _plans: LruCache[tuple[Rig, Rig, float | None], RetargetPlan] = LruCache(max_ent
 def read_rigged(context: Context, rig: Rig) -> Rigged:
     """Return a skeleton with its joint mapping, or a guessed mapping if it has none.
 
-    Raises `MotionError` if the mapping contradicts the skeleton.
+    Raises `MotionError` if the mapping contradicts the skeleton, or maps too few joints to be trusted.
     """
     return _skeletons.get_or_make(rig, lambda: _read(context, rig))
 

@@ -36,7 +36,7 @@ def run(context: Context, params: CutParams) -> dict[str, Any]:
 
 
 class _AnnotatedClip(NamedTuple):
-    """Annotation, its clip, and the segments to cut out with the names of the pieces."""
+    """Annotation, its clip, and each segment to cut out with the name of its piece."""
 
     pin: PinnedInput
     annotation: Annotation

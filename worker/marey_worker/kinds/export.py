@@ -31,7 +31,7 @@ class _File(NamedTuple):
 
 
 def run(context: Context, params: ExportParams) -> dict[str, Any]:
-    """Write the archive; the result names it and lists clips that cannot be written as refusals."""
+    """Write the archive. The result names the archive, and lists as refusals the clips that cannot be written."""
     exporting = _Exporting(context, params)
     archive = context.scratch / "archive.zip"
     refused: list[dict[str, Any]] = []

@@ -126,7 +126,7 @@ def _provenance(
 def write_model_report(
     context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any], params: ModelParams
 ) -> dict[str, Any]:
-    """Draw every figure of a model and of its alignment, write the page, and return the document that names them.
+    """Draw the figures of a model and of its alignment, write the page, and return the document that refers to them.
 
     Parameters
     ----------

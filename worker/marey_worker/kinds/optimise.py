@@ -60,8 +60,8 @@ def _with_candidates(database: MatchingDatabase, candidates: Candidates) -> Matc
     if unusable or strangers:
         raise JobRefused(
             "skeleton-mismatch",
-            f"the clips in {', '.join([*strangers, *unusable])} cannot be combined with those of the "
-            "evaluation; move them to its skeleton first, with `marey retarget`, or leave them out",
+            f"the clips in {', '.join([*strangers, *unusable])} cannot be combined with those of the evaluation; move "
+            "them to the evaluation's skeleton first, with `marey retarget`, or leave them out",
         )
     for other in candidates.databases.values():
         database = joined(database, other)
