@@ -150,7 +150,7 @@ def test_a_tree_stays_low_although_every_key_ends_a_chunk(monkeypatch: pytest.Mo
 
 
 def test_keys_that_do_not_increase_are_refused() -> None:
-    with pytest.raises(ValueError, match="'a' does not follow 'b'"):
+    with pytest.raises(ValueError, match="'a' must be greater than the previous key, 'b'"):
         build(ChunksInMemory(), [("b", {}), ("a", {})])
 
 
