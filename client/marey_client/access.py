@@ -55,7 +55,7 @@ class Users:
         return self.transport.post(User, "/users", user, repeatable=False)
 
     def change(self, name: str, change: UserChange) -> User:
-        """Change a user. Users who change their own password must also send the current one."""
+        """Change a user. Users who change their own password must also send their current password."""
         return read_model(
             User, self.transport.send("PATCH", f"/users/{name}", content=as_json(change), headers=ANY_STATE)
         )
@@ -65,7 +65,7 @@ class Users:
         self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
-        """End all tokens of a user, or only the sessions; the token of this client stays valid."""
+        """Revoke all tokens of a user, or only those of `marey login`; the token of this client stays valid."""
         return self.change(name, UserChange(end_tokens=which))
 
     def quotas(self, name: str) -> QuotasInUse:
@@ -97,8 +97,8 @@ class Tokens:
     ) -> Iterator[Token]:
         """List the tokens, without secrets: yours, or, for administrators, those of a user or of everybody.
 
-        `prefix` selects the token of a secret `marey_<prefix>_...`, `ends_within_s` the tokens that expire within this
-        number of seconds.
+        `prefix` selects the token whose secret begins with `marey_<prefix>_`. `ends_within_s` selects the tokens that
+        expire within this number of seconds.
         """
         params = {"user": user, "everybody": everybody or None, "prefix": prefix, "ends_within_s": ends_within_s}
         return pages(self.transport, Token, "/tokens", params)
@@ -110,8 +110,8 @@ class Tokens:
     def rotate(self, rotation_id: str | None = None, *, grace: timedelta = timedelta(hours=1)) -> NewToken:
         """Replace the token of this client by a successor with the same rights and the same expiry.
 
-        The replaced token, which this client still sends, is valid for the time `grace`. A call with the same
-        `rotation_id`, for example after a crash, gets the same successor; the default is a new random id.
+        This client continues to send the replaced token, which stays valid for the duration `grace`. A call with the
+        same `rotation_id`, for example after a crash, returns the same successor; the default is a new random id.
         """
         transport = self.transport.with_present_token()
         found = transport.get(Me, "/me").token

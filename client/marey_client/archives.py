@@ -40,7 +40,7 @@ OnProgress = Callable[[str, int, int | None], None]
 
 
 class DatasetReader(Protocol):
-    """Methods of `DatasetHandle` that an archive is made with."""
+    """Methods of `DatasetHandle` that are needed to write an archive."""
 
     @property
     def transport(self) -> Transport:
@@ -70,10 +70,10 @@ class DatasetReader(Protocol):
 def write_archive(
     dataset: DatasetReader, version: str, path: Path, on_progress: OnProgress, *, since: Sequence[str] = ()
 ) -> Commit:
-    """Write an archive of a version, and check it. Leave out the versions `since` and all before them.
+    """Write an archive of a version and check it; the versions `since` and all versions before them are left out.
 
-    An attempt that was interrupted leaves a file whose name ends in `.part`; the next attempt continues it. Raises
-    `ArchiveInUse` if another process writes it, and `NothingToArchive`.
+    An interrupted call leaves a file whose name ends in `.part`; the next call continues this file. Raises
+    `ArchiveInUse` if another process is writing the file, and `NothingToArchive` if no version is left.
     """
     head = dataset.at(version)
     bases = [dataset.at(one) for one in since]
@@ -113,7 +113,7 @@ def _lock(file: BinaryIO, path: Path) -> None:
 
 @dataclass
 class _Making:
-    """Archive in progress."""
+    """Archive that is being written."""
 
     dataset: DatasetReader
     writer: ArchiveWriter
@@ -133,7 +133,7 @@ class _Making:
             before = self._history(base, before)
         commits = [one for one in self._history(head, before).values() if one.digest not in before]
         if not commits:
-            raise NothingToArchive(f"there is nothing to archive: {head.digest} is not after the versions to leave out")
+            raise NothingToArchive(f"there is nothing to archive: the versions to leave out include {head.digest}")
         for done, commit in enumerate(commits):
             self.on_progress("reading versions", done, len(commits))
             self._add_commit(commit, unchanged=bool(bases))
@@ -144,7 +144,7 @@ class _Making:
     # -- versions ------------------------------------------------------------------------------------------------------
 
     def _history(self, head: Commit, known: Mapping[str, Commit]) -> dict[str, Commit]:
-        """Return a commit, those before it, and the `known` ones, at which the search ends."""
+        """Return, by digest, the commit `head`, its ancestors, and `known`; ancestors of known commits are not read."""
         found = dict(known)
         waiting = [head.digest]
         while waiting:
@@ -159,9 +159,9 @@ class _Making:
         return found
 
     def _add_commit(self, commit: Commit, *, unchanged: bool) -> None:
-        """Add a commit and its changes, and note the revisions of its entries.
+        """Add a commit and its changes to the archive, and note the revisions of the changed entries.
 
-        With `unchanged`, leave out the documents that an entry had in the first parent already.
+        With `unchanged`, documents that an entry already had in the first parent of the commit are left out.
         """
         at = commit.at.strftime(TIME_OF_COMMIT)
         record = CommitRecord(commit.tree, commit.parents, commit.author, commit.message, at)
@@ -179,7 +179,7 @@ class _Making:
         self.writer.add(ArchiveMember(MemberKind.COMMIT, commit.digest), canonical_json(record.document))
 
     def _note(self, entry: Entry, earlier: Entry | None) -> None:
-        """Note the revision of an entry, and where the server has its documents, except those of `earlier`."""
+        """Note the revision of an entry, and where to fetch its documents, except those that `earlier` has, too."""
         content = _content(entry)
         self.known.add(content)
         for part, digest in entry.parts.items():
@@ -210,7 +210,7 @@ class _Making:
     # -- content -------------------------------------------------------------------------------------------------------
 
     def _add_documents(self, wanted: Mapping[str, PartOfContent]) -> None:
-        """Add documents, given by content digest, each after everything that it refers to."""
+        """Add documents, given by content digest, to the archive; each follows everything that it refers to."""
         digests = [one for one in wanted if ArchiveMember(MemberKind.DOCUMENT, one) not in self.writer]
         total = len(digests)
         while digests:
@@ -239,7 +239,7 @@ class _Making:
             self.writer.add(ArchiveMember(MemberKind.DOCUMENT, digest), data)
 
     def _files(self, digest: str, body: Any) -> set[str]:
-        """Return the digests of the files that a document names, but its earlier version does not."""
+        """Return the digests of the files that a document names and that its earlier version does not name."""
         named = _files_in(body)
         if named and digest in self.earlier:
             (before,) = self._fetch([self.earlier[digest]])
@@ -247,7 +247,7 @@ class _Making:
         return named
 
     def _add_revisions(self, contents: Iterable[str]) -> None:
-        """Add revisions that documents refer to, with their documents; they need not be entries."""
+        """Add revisions to which documents refer, and their documents, also revisions that no entry has."""
         waiting = sorted(contents)
         self.known.update(waiting)
         for start in range(0, len(waiting), MOST_CONTENTS):
@@ -269,7 +269,7 @@ class _Making:
             self.writer.add_stream(member, stream, fetched.stat().st_size)
 
     def _fetch(self, places: Sequence[PartOfContent]) -> list[Any]:
-        """Request documents; return as many of the first ones as one answer contains, at least one."""
+        """Request the documents at `places` in order; return as many as fit into one answer, at least one."""
         found: list[Any] = self._ask(ContentsRequest(documents=tuple(places)))["documents"]
         for place, tree in zip(places, found, strict=False):
             if not isinstance(tree, dict):
@@ -286,14 +286,14 @@ class _Making:
 
 
 class _EntryPair(NamedTuple):
-    """Entry before and after a commit; None if it does not exist."""
+    """State of an entry after and before a commit; None where the entry does not exist."""
 
     after: Entry | None
     before: Entry | None
 
     @property
     def unchanged(self) -> dict[str, str]:
-        """The parts that the commit did not change, with the content digest of the revision before."""
+        """Content digest of the entry's revision before the commit, for each part that the commit did not change."""
         if self.after is None or self.before is None:
             return {}
         parts = self.after.parts.items() & self.before.parts.items()
@@ -313,7 +313,7 @@ def _place(entry: Entry) -> tuple[str, str]:
 
 
 def _line(place: tuple[str, str], entry: Entry | None, unchanged: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the line that describes an entry after its change, for a list of changes."""
+    """Return the JSON object that describes a changed entry in the archive's list of changes."""
     path, kind = place
     if entry is None:
         return {"path": path, "kind": kind, "removed": True}

@@ -60,7 +60,7 @@ class Blobs:
     def put_file(self, path: Path, *, digest: str | None = None) -> str:
         """Stream a file to the server and return its digest; a large file is sent as a resumable upload.
 
-        Raises `FileChanged` if the length of the file changes in the meantime.
+        Raises `FileChanged` if the length of the file changes while it is sent.
         """
         name = digest or digest_of_file(path)
         size_bytes = path.stat().st_size
@@ -125,8 +125,8 @@ def _chunks(path: Path, size_bytes: int) -> Iterator[bytes]:
 def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
     """Send a file as a resumable upload; return the digest of its blob.
 
-    Raises `Unreachable` if the server cannot be reached for long, `FileChanged` if the file becomes shorter, and
-    `Invalid` if the received bytes do not have `digest`.
+    Raises `Unreachable` if all retries fail, `FileChanged` if the file becomes shorter while it is sent, and `Invalid`
+    if the digest of the bytes that the server received is not `digest`.
     """
     announced = UploadCreate(length=path.stat().st_size, digest=digest)
     upload = read_model(Upload, transport.send("POST", "/uploads", content=as_json(announced)))
@@ -145,7 +145,7 @@ def send_in_pieces(transport: Transport, path: Path, digest: str) -> str:
 
 
 def _send_piece(transport: Transport, upload: Upload, file: BinaryIO) -> Upload:
-    """Send the next piece and return the state of the upload; the last piece (maybe empty) completes the blob."""
+    """Send the next piece and return the state of the upload; the last piece, which may be empty, completes it."""
     file.seek(upload.offset)
     piece = file.read(min(PIECE_BYTES, upload.length - upload.offset))
     if not piece and upload.offset < upload.length:

@@ -31,10 +31,10 @@ LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 class TokenFile:
-    """File that contains a token, which is read again when the file has changed.
+    """File that contains a token; the file is read again whenever it has changed.
 
-    So a program continues to work after its token was rotated. If the file cannot be read at that moment, the last
-    token stays in use.
+    So a program continues to work after its token was rotated. If the changed file cannot be read or contains no token,
+    the token that was read last stays in use.
     """
 
     def __init__(self, path: Path) -> None:
@@ -129,7 +129,7 @@ def require_address(url: str) -> None:
 
 
 def as_token(text: str) -> str:
-    """Return `text` without leading and trailing white space. Raises `BadToken`, which does not contain the text."""
+    """Return `text` without leading and trailing white space. Raises `BadToken`, whose message omits the text."""
     token = text.strip()
     if not token or not token.isascii() or not token.isprintable() or " " in token:
         raise BadToken("the text given is not a token: a token is one word of letters, digits and _")
@@ -137,7 +137,7 @@ def as_token(text: str) -> str:
 
 
 def read_secret(path: Path) -> str:
-    """Return the token in a file. Raises `BadCredentialFile` if there is none, or other users may read the file."""
+    """Return the token in a file. Raises `BadCredentialFile` if it contains none, or other users can read it."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii").strip()
@@ -245,7 +245,7 @@ def _keep_owner(handle: int, path: Path) -> None:
 
 
 def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
-    """Return the path of the administrator's token of a local server, if its data folder is known and readable."""
+    """Return the path of the file with the administrator's token of a server on this machine; None if not readable."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
     path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN

@@ -40,7 +40,7 @@ def database(action: str, *, data: Path | None, database_url: str | None, **opti
 
 
 def work(credential: Credential, **options: Any) -> None:
-    """Run jobs until stopped."""
+    """Run jobs of a server until the worker is stopped."""
     room("marey_worker.commands", "worker").work(credential, **options)
 
 
@@ -96,7 +96,7 @@ def server_in_thread(data: Path, *, workers: int) -> Iterator[str]:
 
 @contextmanager
 def _refusals_of(commands: ModuleType) -> Iterator[None]:
-    """Convert errors of a package's commands into errors of the client."""
+    """Convert `CommandFailed` errors of the module `commands`, raised in the `with` block, into `MareyError`."""
     try:
         yield
     except commands.CommandFailed as refusal:
@@ -108,11 +108,10 @@ def _given(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def room(module: str, extra: str) -> ModuleType:
-    """Return a module of another part of Marey. Raises `NotInstalled`, which names the extra to install."""
+    """Import a module of another package of Marey. Raises `NotInstalled`, which names the pip extra to install."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise NotInstalled(
-            f"a server in this process needs the package {error.name}, which is not installed; run: pip "
-            f"install 'marey[{extra}]'"
+            f"this command needs the package {error.name}, which is not installed; run: pip install 'marey[{extra}]'"
         ) from error

@@ -134,7 +134,7 @@ class RequestFailed(MareyError):
 
     @property
     def errors(self) -> tuple[FieldError, ...]:
-        """One entry per wrong field."""
+        """The invalid fields of the request, one entry each."""
         return self.problem.errors
 
     @property
@@ -156,7 +156,7 @@ class Unauthenticated(RequestFailed):
 
 
 class Forbidden(RequestFailed):
-    """The token allows reading this, but not the requested change."""
+    """The token allows reading the resource, but not the requested change."""
 
     status = 403
 
@@ -168,7 +168,7 @@ class NotFound(RequestFailed):
 
 
 class Conflict(RequestFailed):
-    """The state of the resource does not allow this."""
+    """The present state of the resource does not allow the request."""
 
     status = 409
 
@@ -196,7 +196,7 @@ class Invalid(RequestFailed):
 
 
 class TooManyRequests(RequestFailed):
-    """The server asks to wait."""
+    """The client sends too many requests; the server asks it to wait."""
 
     status = 429
 
@@ -242,7 +242,7 @@ _BY_CODE: dict[str, type[RequestFailed]] = {"lease-lost": LeaseLost}
 def error_of(problem: Problem, *, retry_after_s: float | None = None, anonymous: bool = False) -> RequestFailed:
     """Return the exception for a problem document; its class is found by code, then by status.
 
-    `anonymous` says that the request carried no token.
+    `anonymous` states whether the request had no token.
     """
     known = _BY_CODE.get(problem.code) or _BY_STATUS.get(problem.status)
     kind = known or (ServerFailed if problem.status >= 500 else RequestFailed)

@@ -19,10 +19,11 @@ ENTRY_SCHEMA = "marey/entry@1"
 
 
 def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
-    """Write the newest version of an archive to a folder, and return the path of each file.
+    """Write the newest version of an archive to a folder, and yield the path of each written file.
 
-    An entry becomes one JSON document with its parts, and with the revisions that they refer to; a clip also becomes
-    the file that it was imported from. Raises `BadArchive` if the content of a member is not what its name says.
+    For each entry, one JSON document is written, with the parts of the entry and the revisions to which they refer; for
+    a clip, also the file from which it was imported. Raises `BadArchive` if the content of a member of the archive does
+    not have the digest in the member's name.
     """
     entries = list(archive.versions().entries(archive.manifest.commit))
     extraction = _Extraction(archive, folder, {one.content: one for one in entries}, TakenPaths())
@@ -32,7 +33,7 @@ def extract_archive(archive: Archive, folder: Path) -> Iterator[Path]:
 
 @dataclass
 class _Extraction:
-    """Extraction in progress."""
+    """Archive that is being extracted into a folder."""
 
     archive: Archive
     folder: Path

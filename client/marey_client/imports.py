@@ -41,7 +41,7 @@ Notice = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class LocalFile:
-    """File to import and its name: its path below the folder in which it was found."""
+    """File to import. Its name is its path relative to the searched folder in which it was found."""
 
     name: str
     path: Path
@@ -50,17 +50,17 @@ class LocalFile:
 
 @dataclass(frozen=True)
 class FoundFiles:
-    """Files in the given places: those to import, and those that are left out."""
+    """Files in the searched places: those to import, and those that are left out."""
 
     files: tuple[LocalFile, ...]
     left_out: tuple[Path, ...]
 
 
 def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
-    """Find motion files in folders and below, without hidden ones; files that are given directly are always included.
+    """Find the motion files in folders and below, except hidden ones; files among `places` are always included.
 
-    Raises `NothingToUpload` if a place does not exist or no motion file is found, `SameName` if files of two places
-    would get the same name, `OSError` if a folder cannot be read.
+    Raises `NothingToUpload` if a place does not exist or no motion file is found, `SameName` if two files would get the
+    same name, and `OSError` if a folder cannot be read.
     """
     searched = [Path(place) for place in several(places)]
     files: dict[str, LocalFile] = {}
@@ -83,7 +83,7 @@ def find_files(places: str | Path | Iterable[str | Path]) -> FoundFiles:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """Yield the files in a folder and below, sorted, without hidden files and folders."""
+    """Return the files in a folder and below, sorted, without hidden files and folders."""
     found: list[Path] = []
     for parent, folders, names in os.walk(folder, onerror=_raise):
         folders[:] = (name for name in folders if not name.startswith("."))
@@ -107,8 +107,8 @@ def _add(files: dict[str, LocalFile], name: str, path: Path) -> None:
 def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
     """Split files into batches that one request can import.
 
-    A file that needs a companion comes with all companions of its folder, an AMC with every ASF; and files that differ
-    in their ending alone stay together, because the names of clips depend on the other files of a request.
+    An AMC file, which cannot be read without an ASF file, is in one batch with all ASF files of its folder. Files whose
+    names differ only in the ending are in one batch, too, because names of clips depend on the files of a request.
     """
     groups: defaultdict[tuple[str, str], list[LocalFile]] = defaultdict(list)
     for file in files:
@@ -134,7 +134,7 @@ def batches(files: Sequence[LocalFile]) -> Iterator[list[LocalFile]]:
 
 
 def _companions(files: Sequence[LocalFile]) -> dict[str, list[LocalFile]]:
-    """Find, for each folder with files that need a companion, the files that can be one."""
+    """Return, for each folder with AMC files, its ASF files; likewise for other formats that need a second file."""
     wanted: defaultdict[str, set[str]] = defaultdict(set)
     for file in files:
         for row in FORMATS:
@@ -176,7 +176,7 @@ class Imports:
         return list(entries.values())
 
     def run(self, files: tuple[ImportFile, ...], options: ImportOptions | None = None) -> tuple[ImportEntry, ...]:
-        """Import up to 1000 files whose bytes the server has; if the import becomes a job, wait for its end."""
+        """Import up to 1000 files whose bytes the server has; if the server does this in a job, wait for its end."""
         given = options.model_dump(exclude_unset=True) if options else {}
         request = ImportRequest(files=files, **given)
         response = self.transport.send(
@@ -212,7 +212,7 @@ class Imports:
 
 
 def _may_travel(name: str) -> bool:
-    """Return whether a file name can be sent in a request; file systems also allow names that cannot."""
+    """Return whether a file name can be sent in a request; file systems allow names for which this is impossible."""
     try:
         _FILE_NAME.validate_python(name)
     except ValidationError:
@@ -228,7 +228,7 @@ def _refused_name(name: str) -> ImportEntry:
 
 
 def _with_item(entry: ImportEntry, outputs: Mapping[str, JobOutput]) -> ImportEntry:
-    """Return an entry of an import job, completed with the items that were published for its file."""
+    """Return the entry of a file in an import job, completed with the items that the job published for the file."""
     skeleton = outputs.get(skeleton_output(entry.name))
     made = outputs.get(entry.name) or skeleton
     if made is None:
@@ -249,7 +249,7 @@ def refusal_text(entry: ImportEntry) -> str:
 
 
 def left_out_text(paths: Sequence[Path]) -> str:
-    """Return a line about files in folders that are not motion files."""
+    """Return a message about the files that were left out because they are not motion files."""
     others = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
     return f"left out, because not motion files: {paths[0].name}{others}"
 

@@ -158,7 +158,7 @@ class ItemHandle:
     ) -> Path:
         """Write a revision of the item, by default the newest, to `folder` as a file of `format`; return its path.
 
-        Exports of several items with the same `beside` do not replace each other's files.
+        If several items are exported with the same `beside`, files of the same name get numbers.
         """
         return download(
             self.transport,
@@ -208,9 +208,10 @@ class Items(Generic[Handle]):
     ) -> Iterator[Handle]:
         """Yield items in order, requested page by page.
 
-        `collection` selects a folder and everything below it, `directly_in` a folder alone ("" is the root), `path` one
-        item, `query` those that meet conditions, such as `subject = 02 and frames > 120`, `deleted` the deleted items,
-        which `restore` can restore; `filters` are those of the API, such as `{"frames.gte": 120}`.
+        `collection` selects the items in a folder and below it, `directly_in` those in a folder itself ("" is the
+        root), and `path` one item. `query` selects items that meet conditions, such as `subject = 02 and frames > 120`.
+        `deleted` selects deleted items, which `restore` can restore. `filters` are query parameters of the REST API,
+        such as `{"frames.gte": 120}`.
         """
         params = {
             "collection": collection or None, "directly_in": directly_in, "path": path, "sort": sort, "query": query,

@@ -68,8 +68,8 @@ class Jobs:
     ) -> Job:
         """Wait until a job has ended; `on_progress` is called with the job about once a second.
 
-        Raises `JobUnsuccessful` if it failed or was cancelled and success is required, `WaitedTooLong` after
-        `timeout_s`.
+        Raises `JobUnsuccessful` if the job failed or was cancelled, unless `require_success` is false, and
+        `WaitedTooLong` after `timeout_s`.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         pause_s = SHORTEST_PAUSE_S
@@ -94,7 +94,7 @@ class Jobs:
         return self.transport.post(Job, f"/jobs/{job_id}/cancel")
 
     def retry(self, job_id: str) -> Job:
-        """Submit a job that ended without success again; return the new job."""
+        """Submit a failed or cancelled job again; return the new job."""
         return self.transport.post(Job, f"/jobs/{job_id}/retry")
 
     def attempts(self, job_id: str) -> Iterator[Attempt]:
@@ -106,7 +106,7 @@ class Jobs:
         return pages(self.transport, JobOutput, f"/jobs/{job_id}/outputs")
 
     def log(self, job_id: str, *, follow: bool = False) -> Iterator[bytes]:
-        """Yield the log of the job's attempts, piece by piece; with `follow` until the job has ended."""
+        """Yield the log of the job's attempts, piece by piece; with `follow`, wait for more until the job ends."""
         offset = 0
         while True:
             response = self.transport.send(

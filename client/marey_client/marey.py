@@ -29,9 +29,9 @@ class Marey:
         from `marey login`, as on the command line
     token : a personal token, or a `TokenFile`, which is read again when it changes; with a `url` and no token, only
         public projects can be read
-    retries : limits of the retries of requests that are safe to repeat
+    retries : how often, and for how long, requests that are safe to repeat are sent again
     timeout_s : longest time in seconds to wait for the next bytes of an answer
-    http : replaces the network in tests
+    http : HTTP transport that replaces the network in tests
     """
 
     def __init__(

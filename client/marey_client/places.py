@@ -20,12 +20,12 @@ Places: TypeAlias = Place[Handle] | Sequence[Place[Handle]]
 
 
 def as_inputs(places: Places[Handle]) -> tuple[ExistingInput, ...]:
-    """Return one or several folders or items as inputs of jobs; a handle means the revision that was read."""
+    """Return one or several folders or items as inputs of jobs; a handle stands for the revision that it has read."""
     return tuple(map(_as_input, _as_list(places)))
 
 
 def items_at(items: Items[Handle], places: Places[Handle], *, sort: str | None = None) -> Iterator[Item]:
-    """Yield the items for one or several inputs; if an input names no revision, its newest one is used."""
+    """Yield the items in one or several inputs, each at the revision that its input names, or else at its newest."""
     for place in _as_list(places):
         if isinstance(place, ItemHandle):
             yield place.item
@@ -45,7 +45,7 @@ def _as_list(places: Places[Handle]) -> list[Place[Handle]]:
 
 
 def entries_at(items: Items[Handle], place: DatasetInput) -> Iterator[tuple[Entry, Item]]:
-    """Yield the entries of a version, each with its item; entries without an item in the project are left out."""
+    """Yield the entries of a dataset version, each with its item; entries without an item are left out."""
     dataset = Datasets(items.transport, items.project).at(place.dataset)
     folder = dataset.read().collection
     present = {} if folder is None else {one.id: one.item for one in items.list(collection=folder)}

@@ -105,7 +105,7 @@ class ProjectHandle(ProjectItems):
         return Jobs(self.transport).submit(self.name, job)
 
     def pipeline(self, pipeline: PipelineCreate) -> PipelineRun:
-        """Submit jobs that read outputs of others, all or none."""
+        """Submit jobs that read each other's outputs; either all of them are submitted or none."""
         return submit_pipeline(self.transport, self.name, pipeline)
 
     def build_model(
@@ -118,12 +118,12 @@ class ProjectHandle(ProjectItems):
         cache: CacheMode = "use",
         **choices: Any,
     ) -> PipelineRun:
-        """Submit the jobs from takes to a model: import, retarget, annotate, cut, align, model, tree.
+        """Submit the jobs that make a model from takes: import, retarget, annotate, cut, align, model, tree.
 
-        `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are those of
-        `model_building.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
-        `cut={"labels": ["left"]}`. If some of the takes have changed, only results that depend on those are computed
-        again.
+        `takes` are clips and folders of clips, or files that `find_files` found. The `choices` are arguments of
+        `requests.plan_model`, for example `skeleton={"item": id}`, `annotate={"proposal": {"method": "steps"}}`,
+        `cut={"labels": ["left"]}`. If some takes have changed, only the results that depend on these takes are
+        computed again.
         """
         plan = plan_model(self, takes, name=name, **choices)
         return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache))

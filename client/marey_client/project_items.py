@@ -85,7 +85,7 @@ class ProjectItems:
         return Collections(self.transport, self.name)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
-        """Return the clips' skeletons that have several revisions: their joint mapping may have been edited."""
+        """Return those skeletons of clips that have several revisions: their joint mappings may have been edited."""
         used = {str(clip.summary["skeleton"]) for clip in clips}
         skeletons = map(self.skeletons.get, sorted(used))
         return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)
@@ -106,12 +106,12 @@ class Collections:
     def list(
         self, *, path: str | None = None, deleted: bool = False, filters: Params | None = None
     ) -> Iterator[Collection]:
-        """List the folders by path: all of them, those at and below `path`, or with `deleted` the deleted ones."""
+        """List the folders by path: all, or the folder `path` and those below it; with `deleted`, the deleted ones."""
         params = {"path": path or None, "deleted": "true" if deleted else None, **(filters or {})}
         return pages(self.transport, Collection, self.url, params)
 
     def at(self, path: str, *, deleted: bool = False) -> Collection | None:
-        """Return the folder with this path, or None; of several deleted ones, the last deleted."""
+        """Return the folder with this path, or None; if several were deleted, the one that was deleted last."""
         found = [one for one in self.list(path=path, deleted=deleted) if one.path == path]
         return max(found, key=lambda one: one.deleted_at or one.created_at, default=None)
 

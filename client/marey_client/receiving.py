@@ -54,10 +54,10 @@ class ReceivingDataset(Protocol):
 def send_versions(
     dataset: ReceivingDataset, archive: Archive, on_progress: OnProgress, *, begins: str | None = None
 ) -> Commit:
-    """Record the versions of an archive in a dataset, with their digests; return the newest one.
+    """Record the versions of an archive in a dataset, with their digests; return the newest version.
 
-    No branch moves, but the branch `begins`, which must not have commits, begins at the newest version. If an import is
-    interrupted, the next one sends only what is missing.
+    If `begins` names a branch without commits, this branch moves to the newest version; no other branch moves. After an
+    interrupted import, the next one sends only what is missing.
     """
     return _Import(dataset, archive, on_progress).run(begins)
 
@@ -73,7 +73,7 @@ def require_base(archive: Archive, has: Callable[[str], bool]) -> None:
 
 
 class _Revision(NamedTuple):
-    """Revision in an archive, with the path of an entry that has it, if there is one."""
+    """Revision in an archive, with the path of an entry that has this revision; None if no entry has it."""
 
     kind: str
     parts: Mapping[str, str]
@@ -82,7 +82,7 @@ class _Revision(NamedTuple):
 
 @dataclass
 class _Import:
-    """Import in progress."""
+    """Import of an archive into a dataset, while it runs."""
 
     dataset: ReceivingDataset
     archive: Archive
@@ -112,7 +112,7 @@ class _Import:
         return self.dataset.at(head)
 
     def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:
-        """Return the digests of the commits that the dataset has; if it has one, it has all commits before that."""
+        """Return the digests of commits of the archive that the dataset has; it also has all ancestors of these."""
         known: set[str] = set()
         for digest, record in reversed(history):
             if digest not in known and not self.dataset.has(digest):
@@ -121,7 +121,7 @@ class _Import:
         return known
 
     def _put(self, changes: Mapping[str, EntryChange]) -> list[str]:
-        """Return the content digests of the entries that were added or changed, and note their revisions."""
+        """Note the revision of each entry that was added or changed; return the content digests of these revisions."""
         found = []
         for key, (value, unchanged) in changes.items():
             if value is not None:
@@ -134,7 +134,7 @@ class _Import:
     # -- revisions -----------------------------------------------------------------------------------------------------
 
     def _ensure(self, contents: Iterable[str]) -> None:
-        """Send the revisions that the project lacks, each after those that it refers to."""
+        """Send those of the revisions that the project lacks; each is sent after the revisions to which it refers."""
         missing = self._missing(sorted(set(contents) - self.held))
         documents = {digest for one in missing for digest in self._revision(one).parts.values()} - self.homes.keys()
         referred = {content for digest in documents for content in contents_in(self._document(digest))}
@@ -144,7 +144,7 @@ class _Import:
             self._send(together)
 
     def _missing(self, contents: list[str]) -> list[str]:
-        """Return the revisions that the project lacks, and note the others as held."""
+        """Return those of the revisions that the project lacks, and note that it has the others."""
         missing = []
         for start in range(0, len(contents), MOST_CONTENTS):
             some = contents[start : start + MOST_CONTENTS]
@@ -171,7 +171,7 @@ class _Import:
         return self.archive.tree(MemberKind.DOCUMENT, digest)
 
     def _batches(self, contents: list[str]) -> Iterator[list[str]]:
-        """Divide revisions into requests of a moderate size."""
+        """Divide revisions into batches, one for each request, of limited number and size."""
         batch: list[str] = []
         size_bytes = 0
         for content in contents:
@@ -201,7 +201,7 @@ class _Import:
         self._note(contents)
 
     def _part(self, digest: str) -> Any:
-        """Return a document as the server receives it, or the revision from which it can take the document."""
+        """Return a document as it is sent to the server, or, if the project has it, a revision that contains it."""
         if digest in self.homes:
             return {"content": self.homes[digest]}
         tree = self._document(digest)

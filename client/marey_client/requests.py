@@ -59,7 +59,7 @@ def annotate_request(project: ProjectItems, clips: Clips, params: AnnotateParams
 
 
 def cut_request(project: ProjectItems, annotations: Annotations, params: CutParams) -> JobCreate:
-    """Return the job request to cut clips along annotations; the clips are those of the annotations."""
+    """Return the job request to cut along annotations; the clips that are cut are those of the annotations."""
     found = {
         one.id: one
         for one in items_at(project.annotations, annotations, sort="id")
@@ -78,7 +78,8 @@ def align_request(
 ) -> JobCreate:
     """Return the job request to align clips with each other.
 
-    If a layer or labels are given without annotations, it uses the annotations of that layer for these clips.
+    If `params` name a layer or labels and no annotations are given, the annotations of these clips are used; if a layer
+    is named, only those of this layer.
     """
     found = {item.id: item for item in items_at(project.clips, clips)}
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
@@ -92,7 +93,10 @@ def align_request(
 
 
 def edit_request(project: ProjectItems, clips: Clips, commands: Commands, options: Mapping[str, Any]) -> JobCreate:
-    """Return the job request to edit clips; clips named by the commands become inputs. `options`: see `EditParams`."""
+    """Return the job request to edit clips; clips that the commands name are inputs, too.
+
+    `options` are those of `EditParams`.
+    """
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if isinstance(commands, EditHandle):
         edit = commands.document(revision=commands.item.revision)
@@ -111,7 +115,7 @@ def edit_request(project: ProjectItems, clips: Clips, commands: Commands, option
 def evaluate_request(
     project: ProjectItems, clips: Clips, params: EvaluateParams, normaliser: EvaluationHandle | str | None
 ) -> JobCreate:
-    """Return the job request to evaluate clips; those with the tag `loop` are loops."""
+    """Return the job request to evaluate clips; clips with the tag `loop` are treated as loops."""
     found = list(items_at(project.clips, clips))
     inputs: dict[str, Any] = {"clips": as_inputs(clips)}
     if normaliser is not None:
@@ -137,11 +141,11 @@ def plan_model(
     notice: Notice | None = None,
     **choices: Any,
 ) -> ModelPlan:
-    """Plan the jobs that make a model of takes. Files are sent at once; the jobs import them with the given `options`.
+    """Plan the jobs that make a model of takes. Takes that are files are uploaded; the jobs import them with `options`.
 
-    With a `layer`, clips are cut along their annotations of that layer, or aligned by them. The `choices` are fields of
-    `ModelPlan`; by default, results go to a folder with the model's name. Raises `NoAnnotations` if the clips have no
-    annotation of the layer.
+    With a `layer`, clips are cut along their annotations in this layer, or aligned by them. The `choices` are fields of
+    `ModelPlan`; by default, results are stored in a folder with the model's name. Raises `NoAnnotations` if no clip has
+    an annotation in the layer.
     """
     files = [one for one in takes if isinstance(one, LocalFile)] if isinstance(takes, Sequence) else []
     known = _of_files(project, files, options, notice) if files else _of_clips(project, takes, layer)  # type: ignore[arg-type]
@@ -167,7 +171,7 @@ def _of_clips(project: ProjectItems, clips: Clips, layer: str | None) -> dict[st
 
 
 def _annotations_of(project: ProjectItems, clips: Mapping[str, Item], layer: str | None) -> tuple[ItemInput, ...]:
-    """Return the annotations over these clips, by id; those of one layer unless it is None."""
+    """Return the annotations of these clips, given by id; if `layer` is not None, only those of this layer."""
     listed: Iterable[AnnotationHandle] = project.annotations.list(sort="id")
     return tuple(
         one.as_input()

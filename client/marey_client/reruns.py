@@ -30,7 +30,7 @@ class CannotRerun(ValueError):
 
 @dataclass(frozen=True)
 class ComparedOutput:
-    """Output of a job and that of its repetition; one of them is None if it is missing."""
+    """Output of a job and the corresponding output of the repetition; None if only one of the jobs has the output."""
 
     name: str
     agreement: Agreement
@@ -43,8 +43,8 @@ class ComparedOutput:
 def rerun_request(job: Job, kind: JobKind, *, into: str | None = None) -> JobCreate:
     """Return the request that repeats a job with the same revisions, parameters and seed, without cached results.
 
-    The results go to the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for jobs that
-    have not succeeded, tasks of other jobs, and jobs that replace their sources.
+    The results are stored in the folder `into`, by default `reruns/` and the id of the job. Raises `CannotRerun` for a
+    job that has not succeeded, a task of another job, and a job that replaced its sources.
     """
     if job.state is not JobState.SUCCEEDED:
         raise CannotRerun(f"the job {job.id} has no result to repeat; its state is {job.state.value}")
@@ -74,7 +74,7 @@ def _inputs(pins: Sequence[Mapping[str, Any]], *, many: bool) -> Any:
 def compare_outputs(
     project: ProjectHandle, first: Sequence[JobOutput], second: Sequence[JobOutput]
 ) -> Iterator[ComparedOutput]:
-    """Yield the comparison of each output of a job with the output of the same kind and name of its repetition."""
+    """Compare each output of a job with the output of the repetition that has the same kind and name."""
     left: dict[tuple[Kind, str], list[JobOutput]] = {}
     for one in second:
         left.setdefault((one.kind, one.name), []).append(one)

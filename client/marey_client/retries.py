@@ -27,7 +27,7 @@ class Retries:
     tries : greatest number of times that a request is sent
     first_s : longest wait before the second try, in seconds; it doubles with each further try
     longest_s : limit of the doubled wait, in seconds
-    total_s : seconds after the first try after which no try starts
+    total_s : longest time between the first try and the start of the last one, in seconds
     sleep, random_unit : replaceable in tests; `random_unit` draws from [0, 1)
     """
 
@@ -39,7 +39,7 @@ class Retries:
     random_unit: Callable[[], float] = field(default=random.random, repr=False)
 
     def delay_s(self, tried: int, retry_after_s: float | None) -> float:
-        """Return the seconds to wait after `tried` tries, at least as many as the server asked for."""
+        """Return how many seconds to wait after `tried` tries; at least as long as the server requested."""
         backoff = Backoff(self.first_s, self.longest_s, random_unit=self.random_unit)
         return backoff.delay_s(tried) + (retry_after_s or 0.0)
 

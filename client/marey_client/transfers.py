@@ -1,4 +1,4 @@
-"""Copies of versions from one dataset to another: which commits are missing, and the archive in which they travel."""
+"""Copies of versions between datasets: missing commits are found, and transferred in a temporary archive."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ MOST_DAYS_KEPT = 7
 
 
 class MissingCommits(NamedTuple):
-    """Commits that another dataset lacks, and the newest commits before them, which it has."""
+    """Commits that another dataset lacks, and their newest ancestors that it has (`bases`)."""
 
     commits: tuple[str, ...]
     bases: tuple[str, ...]
 
 
 def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]) -> MissingCommits:
-    """Return the commits up to `head` that another dataset lacks; `has` returns whether it has a commit.
+    """Return those of `head` and its ancestors that another dataset lacks; `has` returns whether it has a commit.
 
-    The commits before one that it has are not asked for: it has them, too.
+    `has` is not called for ancestors of a commit that the other dataset has, because it has these, too.
     """
     missing: dict[str, None] = {}
     bases: dict[str, None] = {}
@@ -48,9 +48,9 @@ def find_missing(source: DatasetReader, head: Commit, has: Callable[[str], bool]
 def fetched_versions(
     source: DatasetReader, head: Commit, bases: Sequence[str], on_progress: OnProgress
 ) -> Iterator[Archive]:
-    """Write an archive of the versions up to `head` and after `bases`, open it, and delete it after the `with` block.
+    """Write and open an archive of the versions up to `head` and after `bases`; delete it after the `with` block.
 
-    If writing is interrupted, the next attempt continues it. If the block ends with an error, the archive stays.
+    If writing is interrupted, the next call continues it. If the block ends with an error, the archive stays.
     """
     path = transfers_folder() / f"{short_name([head.digest, *bases])}.tar"
     if not path.exists():
@@ -61,7 +61,7 @@ def fetched_versions(
 
 
 def transfers_folder() -> Path:
-    """Return the folder of copies in progress, below `XDG_CACHE_HOME` or `~/.cache`. Old files in it are deleted."""
+    """Return the folder for archives of running copies, below `XDG_CACHE_HOME` or `~/.cache`; delete its old files."""
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "marey" / "transfers"
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     oldest = time.time() - MOST_DAYS_KEPT * 86_400

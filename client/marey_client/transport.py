@@ -58,7 +58,7 @@ class BearerToken(httpx.Auth):
 
 
 def trusted_authorities() -> ssl.SSLContext:
-    """Trust the public certificate authorities, those of this machine, and those that `SSL_CERT_FILE` names."""
+    """Return a TLS context that trusts public certificate authorities, this machine's, and those in `SSL_CERT_FILE`."""
     context = httpx.create_ssl_context(trust_env=False)
     context.load_default_certs()
     return context
@@ -93,25 +93,25 @@ class Transport:
 
     @property
     def anonymous(self) -> bool:
-        """Whether requests carry no token."""
+        """Whether requests are sent without a token."""
         return self._auth is None
 
     def with_token(self, token: str, *, retries: Retries | None = None) -> Transport:
-        """Return the same connections with another token; closing either closes both."""
+        """Return a transport that sends another token over the same connections; closing either one closes both."""
         other = self.with_retries(retries or self.retries)
         other._auth = BearerToken(token)
         return other
 
     def with_present_token(self) -> Transport:
-        """Return the same connections with the current token, which is not read again if its file changes."""
+        """Return a transport with the same connections and the current token; a later change of its file is ignored."""
         return self if self._auth is None else self.with_token(self._auth.token)
 
     def has_token_of(self, other: Transport) -> bool:
-        """Return whether both send the same token at this moment."""
+        """Return whether this transport and `other` now send the same token."""
         return (self._auth and self._auth.token) == (other._auth and other._auth.token)
 
     def with_retries(self, retries: Retries) -> Transport:
-        """Return the same connections and token with another policy of retries."""
+        """Return a transport with the same connections and token, and with other limits of retries."""
         other = copy(self)
         other.retries = retries
         return other
@@ -150,11 +150,11 @@ class Transport:
     ) -> httpx.Response:
         """Send a request, if necessary several times, and return the complete answer.
 
-        A POST has an idempotency key unless `repeatable` is given. If `repeatable` is False, the request is not sent
-        again after its connection broke; the default is False for PUT, PATCH and DELETE with `If-Match`, else True. A
-        streamed `content` is a function that returns a new stream.
+        If `repeatable` is False, the request is not sent again after its connection broke. The default is False for
+        PUT, PATCH and DELETE with `If-Match`, and True otherwise; a POST then gets an idempotency key. To stream
+        `content`, give a function that returns a new iterable of bytes for each try.
 
-        Raises `RequestFailed` for a problem document, `Unreachable` if there is no answer.
+        Raises `RequestFailed` if the server answers with an error, `Unreachable` if there is no answer.
         """
         sent_headers = {"Accept": JSON, **(headers or {})}
         if content is not None:
@@ -222,7 +222,7 @@ class Transport:
     def stream(
         self, path: str, *, params: Params | None = None, headers: Mapping[str, str] | None = None
     ) -> Iterator[httpx.Response]:
-        """Request bytes by GET and read them while they arrive; not retried, because the caller knows the position."""
+        """Request bytes by GET and yield the answer, to be read while it arrives. Retries are left to the caller."""
         sent_headers = {"Accept": "*/*", **(headers or {})}
         with self._client.stream(
             "GET", _quoted(path), params=_present(params), headers=sent_headers, auth=self._auth
@@ -239,7 +239,7 @@ def _quoted(path: str) -> str:
 
 
 def as_json(model: BaseModel | None) -> bytes | None:
-    """Return the fields of `model` that were set, as JSON; it contains secrets, which pydantic's own JSON hides."""
+    """Return the fields of `model` that were set, as JSON with plain secrets, which pydantic's own JSON would hide."""
     if model is None:
         return None
     return encode_tree(_revealed(model.model_dump(exclude_unset=True, by_alias=True)), JSON)
@@ -254,7 +254,7 @@ def _revealed(value: Any) -> Any:
 
 
 def read_model(answer: type[Model], response: httpx.Response) -> Model:
-    """Return the body of `response` as a model. Raises `UnexpectedAnswer` if it does not fit."""
+    """Parse the body of `response` as a model. Raises `UnexpectedAnswer` if the body is not valid for the model."""
     if response.status_code == 204:
         raise UnexpectedAnswer(
             f"{response.request.method} {response.request.url.path}: the server made the change, but does not show the "
@@ -280,7 +280,7 @@ def read_tree(response: httpx.Response) -> Any:
 
 
 def raise_for_problem(response: httpx.Response) -> None:
-    """Raise the error that an answer describes, if it describes one."""
+    """Raise an error if the status of an answer is 400 or higher."""
     if response.status_code < 400:
         return
     circumstances: dict[str, Any] = {

@@ -224,8 +224,8 @@ class SingleItem:
 def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
     """Return the folder or item at an address; a final `/` means a folder.
 
-    Raises `WrongUsage` if the address has none of these, or several. If several were deleted at this address, returns
-    the one that was deleted last.
+    With `deleted`, return the deleted one; if several with this address were deleted, the last of these. Raises
+    `WrongUsage` if there is none, or if items of several kinds have this address.
     """
     address = Address.parse(text)
     if not address.path:

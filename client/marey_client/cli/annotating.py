@@ -32,7 +32,7 @@ DEFAULT_PROPOSAL = {"method": "steps"}
 annotation = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Edit segments and keyframes of clips.")
 
 Place = Annotated[str, typer.Argument(help="An annotation: project/folder/name, or project/id.")]
-At = Annotated[int, typer.Argument(min=0, help="Any frame of the segment.")]
+At = Annotated[int, typer.Argument(min=0, help="A frame number inside the segment to change.")]
 Label = Annotated[str, typer.Argument(help="Label of the segment or keyframe.")]
 
 
@@ -71,7 +71,7 @@ def show(context: typer.Context, place: Place, as_json: AsJson = False) -> None:
 def create(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
-    layer: Annotated[str, typer.Option(help="Name of the layer.")] = "default",
+    layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "default",
     name: Annotated[
         str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
     ] = None,
@@ -101,7 +101,9 @@ def add(
     place: Place,
     label: Label,
     frames: Annotated[str, typer.Argument(help="Frames as first:end; the frame `end` is not included.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Shorten or remove overlapping segments.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Shorten or remove existing segments that overlap the new one.")
+    ] = False,
 ) -> None:
     """Add a segment: a range of frames with a label."""
     _, start, end = _segment(f"{label}={frames}")
@@ -122,7 +124,7 @@ def split(
 
 
 def merge(context: typer.Context, place: Place, at: At, params: Chosen) -> None:
-    """Merge a segment with its neighbour and the gap between them."""
+    """Merge a segment with a neighbouring segment, including the gap between them."""
     _apply(context, place, command="merge_segment", at=at, **params)
 
 
@@ -133,10 +135,10 @@ def move(
     at: At,
     start: Annotated[int | None, typer.Option(min=0, help="New first frame of the segment.")] = None,
     end: Annotated[
-        int | None, typer.Option(min=0, help="New end of the segment; the frame itself is not included.")
+        int | None, typer.Option(min=0, help="New end of the segment: the frame after its last frame.")
     ] = None,
 ) -> None:
-    """Move the start or the end of a segment. A segment that touches it there is extended or shortened."""
+    """Move the start or the end of a segment. An adjacent segment is extended or shortened accordingly."""
     edges = [(edge, to) for edge, to in (("start", start), ("end", end)) if to is not None]
     if len(edges) != 1:
         raise WrongUsage("give exactly one of --start and --end")
@@ -160,13 +162,13 @@ def mark(
     context: typer.Context,
     place: Place,
     label: Label,
-    frame: Annotated[int, typer.Argument(min=0, help="Frame of the keyframe.")],
+    frame: Annotated[int, typer.Argument(min=0, help="Frame number of the keyframe.")],
     move_to: Annotated[int | None, typer.Option("--move", min=0, help="Move the keyframe to this frame.")] = None,
     remove_it: Annotated[bool, typer.Option("--remove", help="Remove the keyframe.")] = False,
 ) -> None:
     """Add, move or remove a keyframe."""
     if move_to is not None and remove_it:
-        raise WrongUsage("give exactly one of --move and --remove")
+        raise WrongUsage("give only one of --move and --remove")
     if move_to is not None:
         _apply(context, place, command="move_keyframe", label=label, frame=frame, to=move_to)
     else:
@@ -191,7 +193,7 @@ def propose(
     into: Annotated[
         str,
         typer.Option(
-            help="Folder of the annotations, with the same subfolders as the clips; default: the folders of the clips."
+            help="Folder that receives the annotations, in the subfolders of the clips; default: next to each clip."
         ),
     ] = "",
     wait: Wait = True,
@@ -214,15 +216,15 @@ def import_annotation(
     context: typer.Context,
     clip: Annotated[str, typer.Argument(help="The clip: project/folder/name, or project/id.")],
     file: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A JSON file of Marey's predecessor.")],
-    layer: Annotated[str, typer.Option(help="Name of the layer.")] = "imported",
+    layer: Annotated[str, typer.Option(help="Name of the annotation layer, such as steps.")] = "imported",
     name: Annotated[
         str | None, typer.Option(help="Name of the annotation; default: the names of the clip and the layer.")
     ] = None,
     end_index: Annotated[
         EndIndex,
         typer.Option(
-            help="inclusive: end_idx is the last frame of a section, as in the predecessor's editor; "
-            "exclusive: the frame after it."
+            help="inclusive: end_idx in the file is the last frame of a section, as in the predecessor's editor; "
+            "exclusive: end_idx is the frame after the last one."
         ),
     ] = DEFAULT_END_INDEX,
     label: Annotated[list[str] | None, typer.Option(help="Import only this label; may be repeated.")] = None,
@@ -248,10 +250,17 @@ def export_annotation(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     form: Annotated[
         AnnotationForm,
-        typer.Option(help="Form of the file: sections by label, a list of sections, or frames by label."),
+        typer.Option(
+            help="Content of the file: sections by label (labels), a list of sections (list), or frames by label "
+            "(frames)."
+        ),
     ] = DEFAULT_FORM,
     end_index: Annotated[
-        EndIndex, typer.Option(help="inclusive: end_idx is the last frame of a section; exclusive: the frame after it.")
+        EndIndex,
+        typer.Option(
+            help="inclusive: end_idx in the file is the last frame of a section; exclusive: end_idx is the frame after "
+            "the last one."
+        ),
     ] = DEFAULT_END_INDEX,
 ) -> None:
     """Write an annotation to a file for Marey's predecessor."""
@@ -293,7 +302,7 @@ def _keyframe(text: str) -> tuple[str, int]:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Return name and value of an option of a method; a value with commas is a list of texts."""
+    """Parse `name=value`, an option of a method of annotation; a value with commas is a list of texts."""
     name, value = assignment(text)
     read = json_or_text(value)
     return name, value.split(",") if read == value and ("," in value or name == "joints") else read

@@ -113,7 +113,7 @@ def cut(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Cut clips along the segments of annotations; each piece keeps its keyframes."""
+    """Cut clips along the segments of annotations; each piece keeps the keyframes that are inside it."""
     from marey_schemas.kinds import Kind
 
     addresses = addresses_in_one_project(sources)

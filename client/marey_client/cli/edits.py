@@ -207,7 +207,7 @@ def _given(marey: Marey, project: str, do: list[str] | None, file: str | None) -
 
 
 def _with_ids(marey: Marey, project: str, command: Any) -> Any:
-    """Return the command with the address of its source, if it has one, replaced by the source's id."""
+    """Return a command in which the address of a source clip, if it has one, is replaced by the id of this clip."""
     from marey_schemas.kinds import Kind
 
     source = command.get("source") if isinstance(command, dict) else None
@@ -299,7 +299,7 @@ def parameter_rows(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]
 
 
 def _parameters(model: type[BaseModel]) -> dict[str, Schema]:
-    """Return the schemas of a command's parameters, without its name."""
+    """Return the schema of each parameter of a command, by name."""
     return {name: schema for name, schema in parameters_of(model).items() if name != "command"}
 
 

@@ -101,7 +101,7 @@ def evaluate(
 
 
 def _place_beside(path: str) -> tuple[str, str]:
-    """Return the folder for results and the start of their names, such as `gaits-v1-raw` for `gaits@v1/raw`."""
+    """Return the folder beside `path` and a name for results: for `lab/gaits@v1/raw`, `lab` and `gaits-v1-raw`."""
     named, at, version = path.partition("@")
     folder, _, last = named.rpartition("/")
     return folder, f"{last}{at}{version}".replace("@", "-").replace("/", "-")

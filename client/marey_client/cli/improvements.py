@@ -102,7 +102,7 @@ def suggest(
     remove_out: Annotated[
         Path | None,
         typer.Option(
-            help="File for the paths, one per line, of the clips that can be removed without any effect on the trials."
+            help="Write to this file, one per line, the paths of the clips whose removal has no effect on the trials."
         ),
     ] = None,
     wait: Wait = True,
@@ -137,7 +137,7 @@ def optimise(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Remove clips and add others, one step after another, as long as that makes the set better."""
+    """Remove clips from an evaluated set and add others, step by step, as long as the set becomes better."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)

@@ -150,7 +150,7 @@ def list_jobs(
     ] = None,
     author: Annotated[str | None, typer.Option(help="List only jobs that this user submitted.")] = None,
     tasks_of: Annotated[
-        str | None, typer.Option(metavar="JOB", help="List the tasks of this job; absent: jobs that are not tasks.")
+        str | None, typer.Option(metavar="JOB", help="List the tasks of this job; default: jobs that are not tasks.")
     ] = None,
     limit: Annotated[int, typer.Option(min=1, help="Greatest number of jobs to list, newest first.")] = 50,
     as_json: AsJson = False,
@@ -217,7 +217,7 @@ def retry_job(
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job has ended.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Submit a failed or cancelled job again, with the jobs that it needs and those that failed because of it."""
+    """Submit a failed or cancelled job again, with unsuccessful jobs that it needs, and jobs that failed due to it."""
     with connect(context) as marey:
         ended = follow(marey, marey.jobs.retry(job_id), wait=wait, as_json=as_json)
     if ended is not None:

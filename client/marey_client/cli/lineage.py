@@ -68,7 +68,10 @@ _Branch: TypeAlias = "Iterator[str | _Branch]"
 
 
 class _LineageTree:
-    """A graph as text: inputs above results, each further job indented; a group that returns is not unfolded again."""
+    """Lineage graph as indented text: first the inputs of the start, then its results.
+
+    The inputs or results of a group of revisions are listed only the first time that the group occurs.
+    """
 
     def __init__(self, graph: LineageGraph) -> None:
         from marey_schemas.lineage import grouped
@@ -84,7 +87,7 @@ class _LineageTree:
         self._unfolded: set[tuple[int, bool]] = set()
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines; the branches are on a stack of our own, because a graph may be 1,000 jobs deep."""
+        """Yield the lines. An explicit stack replaces recursion, because a graph may be 1,000 jobs deep."""
         branches = [self._whole()]
         while branches:
             step = next(branches[-1], None)

@@ -1,4 +1,4 @@
-"""Commands `pipeline` and `build-model`: jobs that read outputs of others, submitted and followed together."""
+"""Commands `pipeline` and `build-model`: they submit jobs that read each other's outputs, and follow them together."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def build_model(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Make a model from takes: import, retarget, annotate, cut and align them, train the model, make its tree.
+    """Make a model from takes: import, retarget, annotate, cut and align them, train the model, build its search tree.
 
     Existing results are used again: if a take has changed, only the results that depend on it are computed.
     """
@@ -123,7 +123,7 @@ def build_model(
 
 
 def _chosen(choices: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters typed for each step, with nested objects."""
+    """Return the parameters that `--set step.parameter=value` sets, by step; `step.a.b=value` sets a nested object."""
     chosen: dict[str, dict[str, Any]] = {}
     for text in choices:
         path, equals, value = text.partition("=")
@@ -211,7 +211,7 @@ def _refused(job: Job) -> list[Mapping[str, Any]]:
 
 
 def _print_shortfalls(run: PipelineRun) -> None:
-    """Print the inputs that the steps refused, those in which they found nothing, and the notes of the jobs."""
+    """Print for each step the inputs that it refused, those in which it found nothing, and the notes of its job."""
     for step, job in run.steps.items():
         if refused := _refused(job):
             print_message(f"{step} refused {len(refused)}:")
@@ -234,7 +234,7 @@ def print_steps(run: PipelineRun, as_json: bool) -> None:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Mapping[str, Job]], None]]:
-    """Show a table on standard error inside the block, if standard error is a terminal."""
+    """Yield a function that shows a table of jobs on standard error, or nothing if that is not a terminal."""
     if not sys.stderr.isatty():
         yield lambda _steps: None
         return
@@ -264,7 +264,7 @@ def _state(job: Job) -> str:
 
 
 def _done(job: Job) -> str:
-    """Return the number of ended tasks and of all tasks, or the progress of a job without tasks."""
+    """Return how many of a job's tasks have succeeded, as in 3/8, or the progress in percent of a job without tasks."""
     if job.state.terminal and job.size is None:
         return ""
     if job.size is not None:

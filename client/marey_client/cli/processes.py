@@ -156,7 +156,7 @@ def check_database(
 def purge_database(data: DataFolder = None, database_url: DatabaseUrl = None) -> None:
     """Delete data that is older than the settings allow or that nothing refers to, and make an SQLite file smaller.
 
-    A server deletes such data every hour by itself. Stop the server before you make the file smaller.
+    A running server deletes such data every hour by itself. The file can be made smaller only while no server runs.
     """
     _database("purge", data, database_url)
 
@@ -169,7 +169,7 @@ def set_clock(
     yes: Annotated[bool, typer.Option("--yes", help="Set the clock without asking for confirmation.")] = False,
     data: DataFolder = None,
 ) -> None:
-    """Compare the clock that an SQLite database stores with the clock of this machine. The server must be stopped.
+    """Compare the time that an SQLite database stores with the clock of this machine. The server must be stopped.
 
     The stored clock never goes back by itself. If a server has run with a clock that was years ahead, its tokens have
     expired and its leases do not end for a long time. --set corrects this: it sets every stored time that is later than

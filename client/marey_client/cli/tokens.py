@@ -51,8 +51,8 @@ def create_token(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="With the scope work: label, as name=value, that a worker with this token may announce; may be "
-            "repeated. Default: the labels of your own token, or any."
+            help="Only with the scope work: label, as name=value, that a worker with this token may announce; may be "
+            "repeated. Default: the labels of your own token; if it has none, any label."
         ),
     ] = None,
     output: Annotated[
@@ -114,7 +114,8 @@ def list_tokens(
 ) -> None:
     """Show your tokens, without their secrets.
 
-    The scopes of a token show the projects to which it is limited, and its labels show the workers.
+    The column `scopes` shows what a token allows, and in which projects. The column `labels` shows the labels that a
+    worker may announce with this token.
     """
     within_s = None if expiring is None else expiring * SECONDS_PER_DAY
     with connect(context) as marey:
@@ -154,13 +155,13 @@ def rotate_token(
     context: typer.Context,
     grace_minutes: Annotated[
         int,
-        typer.Option(min=1, max=7 * 24 * 60, help="Minutes for which the replaced token remains valid."),
+        typer.Option(min=1, max=7 * 24 * 60, help="Minutes for which the replaced token stays valid."),
     ] = 60,
     as_json: AsJson = False,
 ) -> None:
-    """Replace the token in use by a new one with the same rights and expiry, in the file that contains it.
+    """Replace the token in use by a new one with the same rights and expiry, and store the new one in the same file.
 
-    The new token is not shown. If the command is interrupted, run it again: it gets the same new token.
+    The new token is not shown. If the command is interrupted, run it again: the server returns the same new token.
     """
     found = credential_of(context)
     with connect(context) as marey:
@@ -174,10 +175,11 @@ def rotate_token(
 
 
 def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedelta) -> NewToken:
-    """Replace the token of `marey` by a successor, on the server and in the file that contains it.
+    """Replace the token of `marey` by a successor, on the server and in the file that contains the token.
 
     The id of the rotation is stored beside this file before the request is sent. So if the program ends before it has
-    stored the successor, another call gets the same one. Raises `BadCredentialFile` if no file contains the token.
+    stored the successor, a further call gets the same successor. Raises `BadCredentialFile` if no file contains the
+    token.
     """
     from marey_client.access import Tokens
     from marey_client.credentials import replace_token
@@ -198,7 +200,7 @@ def _rotate_stored_token(marey: Marey, credential: Credential, *, grace: timedel
 
 
 def _rotation_id(begun: Path, token: str) -> str:
-    """Return the id of the rotation of this token that was begun before; if there is none, begin a rotation."""
+    """Return the id of this token's rotation from the file `begun`; if it has none, store a new id there."""
     from marey_client.credentials import write_private
 
     prefix = token.split("_")[1] if token.count("_") > 1 else ""
@@ -216,7 +218,7 @@ def revoke_token(
     context: typer.Context,
     token_id: Annotated[str | None, typer.Argument(help="Id of the token; marey token ls lists the ids.")] = None,
     with_created: Annotated[
-        bool, typer.Option("--with-created", help="Also revoke the tokens that were created with it.")
+        bool, typer.Option("--with-created", help="Also revoke the tokens that were created with this token.")
     ] = False,
     all_of: Annotated[
         str | None,

@@ -23,9 +23,9 @@ class AnnotationHandle(ItemHandle):
     def apply(self, commands: Mapping[str, Any] | Sequence[Mapping[str, Any]], *, message: str = "") -> Item:
         """Apply commands in order, all or none, as one new revision.
 
-        A command is a dict, such as `{"command": "split_segment", "at": 120}`. Raises
-        `PreconditionFailed` if the annotation was changed since it was read, and `RequestFailed`, which names the
-        command, if one cannot be applied.
+        A command is a dict, such as `{"command": "split_segment", "at": 120}`. Raises `PreconditionFailed` if the
+        annotation was changed since it was read, and `RequestFailed` if a command cannot be applied; its text names
+        this command.
         """
         change = AnnotationChange.model_validate({"commands": several(commands), "message": message})
         response = self.transport.send(

@@ -84,7 +84,7 @@ class ClipHandle(ItemHandle):
         )
 
     def preview(self, commands: Commands, *, frames: slice | None = None, **options: Any) -> EditPreview:
-        """Return frames of the result of commands on the clip, without storing it.
+        """Apply commands to the clip without storing the result, and return frames of the result.
 
         `options` are those of `EditPreviewRequest`, such as `piece=1` or `fields=("positions",)`. Raises
         `RequestFailed` if the commands cannot be applied, or would take too long for a preview.
@@ -105,7 +105,9 @@ class ClipHandle(ItemHandle):
 
 
 def frames_text(frames: slice | None) -> str | None:
-    """Return a slice as the query `a:b`; None for all frames. Raises `ValueError` for steps and negative bounds."""
+    """Return a slice as the query parameter `first:end`, or None for None. Raises `ValueError` for steps and negative
+    bounds.
+    """
     if frames is None:
         return None
     if frames.step not in (None, 1):

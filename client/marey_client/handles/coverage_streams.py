@@ -50,13 +50,13 @@ class CoverageStreams:
         return CoverageStreamHandle(self.transport, self.url, self.transport.post(CoverageStream, self.url, request))
 
     def get(self, stream_id: str) -> CoverageStreamHandle:
-        """Return a stream to continue it after its last frame, also from another process."""
+        """Return a handle that continues a stream after its last frame; another process may have created the stream."""
         return CoverageStreamHandle(
             self.transport, self.url, self.transport.get(CoverageStream, f"{self.url}/{stream_id}")
         )
 
     def list(self) -> Iterator[CoverageStream]:
-        """List the streams that received frames within a day, newest first."""
+        """List the streams that received frames within the last day, newest first."""
         return pages(self.transport, CoverageStream, self.url)
 
 
@@ -82,12 +82,12 @@ class CoverageStreamHandle:
         translated_joints: str | Sequence[str] = (),
         ends_take: bool = False,
     ) -> CoverageProgress:
-        """Send the next frames: poses (n, 3 + 4·joints), or roots (n, 3) of x, z in metres and heading in radians.
+        """Send the next n frames, at most 4096; calls usually send 0.1 s to 1 s of motion.
 
-        `translations` (n, k, 3) are local translations of k joints in metres that replace the joints' offsets.
-
-        At most 4096 frames at a time; 0.1 s to 1 s is usual. If an answer is lost, the frames are sent again, but
-        counted only once. Raises `Conflict` if another program sends to the same stream.
+        `frames` are poses (n, 3 + 4·joints): the root position in metres and the local quaternions w, x, y, z; or
+        roots (n, 3): x and z in metres, heading in radians. `translations` (n, k, 3), in metres, replace the offsets
+        of the k `translated_joints`. If an answer is lost, the frames are sent again, but counted only once. Raises
+        `Conflict` if another program sends to the same stream.
         """
         body: dict[str, Any] = {"poses" if frames.shape[-1] != ROOT_COLUMNS else "roots": frames}
         if translations is not None:

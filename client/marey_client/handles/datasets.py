@@ -63,9 +63,9 @@ class Datasets:
     ) -> ImportedVersion:
         """Check an archive, and record its versions in a dataset, which is created if it does not exist.
 
-        The versions keep their digests. The branch `into` moves to the newest version if it has no commits, or only
-        commits that the version follows; it is created if it does not exist. If it has other commits, it does not move:
-        merge the version. No folder changes.
+        The versions keep their digests, and no folder is changed. The branch `into` is created if it does not exist. It
+        moves to the newest imported version unless it has commits that this version does not follow; then merge the
+        version into the branch.
 
         Raises `marey_versions.archive.members.BadArchive`, which names the member that was changed or is missing, and
         `EarlierVersionsMissing` if the archive builds on a version that the dataset does not have.
@@ -96,10 +96,10 @@ class Datasets:
     ) -> ImportedVersion:
         """Copy a version of another dataset, and all versions before it, into the dataset `name` of this project.
 
-        `source` may be on another server. Only what the dataset lacks is copied; an attempt that was interrupted is
-        continued by the next one. The dataset is created if it does not exist. The branch `into` moves as in
-        `import_archive`; by default it is the branch that `version` names, or `main`. If `version` is a tag, the tag is
-        created too, unless a branch or tag of this name exists.
+        `source` may be on another server. Only what the dataset `name` lacks is copied; it is created if it does not
+        exist. An interrupted copy is continued by the next call. The branch `into`, by default the branch that
+        `version` names or `main`, moves as in `import_archive`. If `version` is a tag, the tag is created too, unless a
+        branch or tag of this name exists.
         """
         from marey_client.transfers import fetched_versions, find_missing
 
@@ -148,7 +148,7 @@ class PickOptions(TypedDict, total=False):
 
 
 class ImportedVersion(NamedTuple):
-    """Version that came from an archive or another dataset."""
+    """Version that was imported from an archive or copied from another dataset."""
 
     commit: Commit
     branch: str
@@ -205,8 +205,8 @@ class DatasetHandle:
     ) -> Commit:
         """Record a new version: the content of the dataset's folder, or the newest version with `changes`.
 
-        `expected` is the commit that must be the newest one of the branch. If an answer is lost and the request is sent
-        again, the answer is the commit that was made the first time. Raises `Conflict` if the branch has moved.
+        If the answer is lost, the request is sent again and returns the commit that was made the first time. Raises
+        `Conflict` if `expected` is given and is not the newest commit of the branch.
         """
         request = CommitCreate(
             branch=branch,
@@ -242,7 +242,7 @@ class DatasetHandle:
     def difference(
         self, before: str = f"{MAIN}~1", after: str = MAIN, *, path: str = "", limit: int = 1000
     ) -> DatasetDifference:
-        """Return the entries that differ in two versions; at most `limit` of them are listed.
+        """Return the entries that differ between two versions, at most `limit` of them.
 
         With `path`, only the entry or the folder at this path is compared.
         """
@@ -262,7 +262,7 @@ class DatasetHandle:
         """Merge a version into a branch, entry by entry and part by part; with `preview`, only compute the result.
 
         Raises `Conflict` with the code `merge-conflicts` if both sides have changed the same part of an entry and
-        `resolutions` do not decide it; `context` then has the content of `MergeAnswer`.
+        `resolutions` do not decide it; the `context` of the error then has the fields of `MergeAnswer`.
         """
         request = MergeRequest(
             into=into,
@@ -316,9 +316,9 @@ class DatasetHandle:
     ) -> Commit:
         """Write a version, all versions before it, and everything that they contain to one file.
 
-        The file is complete and checked, or else it does not exist; an attempt that was interrupted is continued by the
-        next one. With `since`, leave out these versions and all before them; such an archive can be imported where
-        these versions are. Return the commit of the version. Raises `NothingToArchive`.
+        Return the commit of the version. The file exists only when it is complete and checked; the next call continues
+        an interrupted one. The versions `since` and all before them are left out; the archive can then be imported only
+        into datasets that have the versions `since`. Raises `NothingToArchive` if no version is left.
         """
         from marey_client.archives import write_archive
 
@@ -326,7 +326,7 @@ class DatasetHandle:
         return write_archive(self, version, Path(path), on_progress, since=bases)
 
     def receive(self, archive: Archive, *, into: str = MAIN, on_progress: OnProgress = _silent) -> ImportedVersion:
-        """Record the versions of an archive that was checked; `Datasets.import_archive` describes the rest."""
+        """Record the versions of an archive without checking it; move the branch `into` as `import_archive` does."""
         from marey_client.receiving import send_versions
 
         ref = self.find_ref(into)
@@ -335,7 +335,7 @@ class DatasetHandle:
         return self.forward(into, made)
 
     def forward(self, branch: str, commit: Commit) -> ImportedVersion:
-        """Move a branch to a commit that follows its newest one; create the branch if it does not exist."""
+        """Move a branch to a commit if the commit follows the branch's newest one; create a branch that is missing."""
         ref = self.find_ref(branch)
         if ref is None:
             self.create_branch(branch, commit.digest)
@@ -346,7 +346,7 @@ class DatasetHandle:
         return ImportedVersion(commit, branch, True)
 
     def _fast_forward(self, branch: str, commit: str) -> bool:
-        """Move a branch to a commit that follows its newest one; return whether the branch is at the commit now."""
+        """Move a branch to a commit if the commit follows the branch's newest one; return whether it is there now."""
         if self.at(branch).digest == commit:
             return True
         try:
@@ -393,12 +393,12 @@ class DatasetHandle:
         return self.transport.get(Ref, f"{self.url}/refs/{name}")
 
     def protect(self, branch: str, rule: ProtectionRule) -> Ref:
-        """Protect a branch, or replace its rule; maintainers may do this."""
+        """Protect a branch by a rule, which replaces an earlier rule. The caller must be a maintainer or owner."""
         body, url = as_json(rule), f"{self.url}/refs/{branch}/protection"
         return read_model(Ref, self.transport.send("PUT", url, content=body, headers=ANY_STATE))
 
     def unprotect(self, branch: str) -> Ref:
-        """Remove the rule of a branch."""
+        """Remove the protection of a branch."""
         url = f"{self.url}/refs/{branch}/protection"
         return read_model(Ref, self.transport.send("DELETE", url, headers=ANY_STATE))
 

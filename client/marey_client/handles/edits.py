@@ -65,7 +65,10 @@ def as_edit(commands: EditDocument | Command | Sequence[Command], *, title: str 
 
 
 def preview_edit(transport: Transport, url: str, commands: Commands, **options: Any) -> EditPreview:
-    """Return frames of the result of commands on the clip at `url`; `options` are those of `EditPreviewRequest`."""
+    """Apply commands to the clip at `url` without storing the result; return frames of the result.
+
+    `options` are those of `EditPreviewRequest`.
+    """
     if isinstance(commands, EditHandle):
         request = EditPreviewRequest.model_validate({"edit": commands.as_input().model_dump(), **options})
     else:

@@ -74,7 +74,7 @@ class EvaluationHandle(ReportedHandle):
     # -- jobs on the evaluation: each method submits one and waits for it, or raises `JobUnsuccessful` --
 
     def compare(self, after: EvaluationHandle, *, on_progress: OnProgress | None = None, **options: Any) -> Findings:
-        """Compare with another evaluation of the same trials, under the same normaliser.
+        """Compare this evaluation with a later one, `after`, of the same trials with the same scaling of features.
 
         `options` are those of `CompareParams`.
         """
@@ -83,7 +83,7 @@ class EvaluationHandle(ReportedHandle):
     def suggest(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Find clips to remove, and candidates, given as folders and clips, that fill gaps.
+        """Find clips that can be removed, and those of `candidates` (clips and folders of clips) that fill gaps.
 
         `options` are those of `SuggestParams`.
         """
@@ -149,7 +149,7 @@ def trial_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Return one row for each clip of an evaluation's document: its frames at the rate of the trials, and its use."""
+    """Return one row for each clip of an evaluation's document: number of frames at the trials' rate, and use."""
     usage = document["usage"]
     columns = zip(*(usage[name].tolist() for name in ("ticks", "share", "entries", "trials")), strict=True)
     for clip, (ticks, share, entries, trials) in zip(document["clips"], columns, strict=True):
@@ -167,11 +167,14 @@ def clip_rows(document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def record_arrays(document: Mapping[str, Any]) -> dict[str, dict[str, NDArray[Any]]]:
-    """Return the ticks of each trial by its name, T of them at `rate_hz` of the document.
+    """Return the arrays of each trial, by the name of the trial; a trial has T ticks, `rate_hz` per second.
 
-    rows (T,): row of the database that is shown; positions (T, 2): root on the ground, metres; headings (T,): radians;
-    status (T,): 0 kept, 1 replacing, 2 replaced, 3 forced; match_cost, continuing_cost, pose_cost (T,): NaN where one
-    is not defined.
+    rows (T,): displayed row of the database
+    positions (T, 2): root on the ground, x and z, in metres
+    headings (T,): in radians
+    status (T,): 0 the clip continues, 1 first row after a switch, 2 last row before a switch, 3 first row of the trial,
+        after the end of a clip, or of a new round of a loop
+    match_cost, continuing_cost, pose_cost (T,): NaN at ticks without this cost
     """
     starts = document["starts"].tolist()
     columns = {name: document[name] for name in ("rows", "positions", "headings", "status")}

@@ -29,7 +29,7 @@ class Findings:
         return dict(decode_tree(Blobs(self.transport).fetch(self._blob("document")), JSON))
 
     def report(self) -> bytes:
-        """Return the report, if there is one: one self-contained page of HTML."""
+        """Return the report, one self-contained page of HTML. Raises `LookupError` if the job made no report."""
         return Blobs(self.transport).fetch(self._blob("report"))
 
     def save_report(self, path: str | Path) -> Path:

@@ -29,7 +29,7 @@ class Samples:
     Parameters
     ----------
     latents : (n, L) latent vectors of the motions
-    log_densities : (n,) natural logarithm of the density of each
+    log_densities : (n,) natural logarithm of the probability density of each motion
     motions : n motions in the canonical frame: the body begins at x = z = 0 and faces +z
     """
 
@@ -51,15 +51,15 @@ class ModelHandle(SearchableHandle):
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Return the whole model: functions, mixture, options, examples and training report, with numpy arrays."""
+        """Return the whole model, with numpy arrays: functions, mixture, options, examples and training report."""
         return self.part("model", revision=revision)
 
     def training(self) -> dict[str, Any]:
-        """Return the quality of the model in numbers: errors, likelihoods, examples, feet, warnings."""
+        """Return the measures of the model's quality: errors, likelihoods, examples, foot contacts, warnings."""
         return dict(self.document()["training"] or {})
 
     def sample(self, n: int = 1, seed: int = 0, *, revision: int | None = None) -> Samples:
-        """Draw `n` motions. The same seed gives the same motions; a greater `n` adds motions at the end."""
+        """Draw `n` motions. The same seed gives the same motions; with a greater `n`, further motions follow them."""
         tree = self._samples(n, seed, revision)
         motions = tuple(MotionArrays.model_validate(motion) for motion in tree["motions"])
         return Samples(tree["latents"], tree["log_densities"], motions)
@@ -92,8 +92,8 @@ class ModelHandle(SearchableHandle):
     ) -> list[ClipHandle]:
         """Draw `n` motions and create clips from them in the folder `into`, on the model's skeleton.
 
-        By default, a clip is named after the model, the seed and its number; `names` gives other names. Raises
-        `Conflict` if a name is taken.
+        A clip is named `<model>_<seed>_<number>`; `names` replaces the model's name. Raises `Conflict` if a name is
+        taken.
         """
         tree = self._samples(n, seed, self.item.revision)
         clips = Items(self.transport, self.project, Kind.CLIP, ClipHandle)

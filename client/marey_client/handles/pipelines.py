@@ -1,4 +1,4 @@
-"""Pipelines: jobs that read outputs of others, submitted and followed together."""
+"""Pipelines: jobs that read each other's outputs and are submitted and followed together."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class PipelineRun:
         return dict(self._look(wait_s=0.0))
 
     def wait(self, *, timeout_s: float | None = None, on_progress: OnProgress | None = None) -> Mapping[str, Job]:
-        """Wait until every job has ended; `on_progress` is called with all of them about once a second.
+        """Wait until every job has ended; `on_progress` is called with all jobs about once a second.
 
-        Raises `JobUnsuccessful` for the first step that failed for a reason of its own, not because of another step,
-        and `WaitedTooLong` after `timeout_s`; the other jobs continue in both cases.
+        Raises `JobUnsuccessful` for the first step that did not succeed, if possible for one that did not fail because
+        of another step. Raises `WaitedTooLong` after `timeout_s`; the jobs then continue on the server.
         """
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
@@ -80,7 +80,7 @@ class PipelineRun:
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:
-        """Request the state of every unfinished job; the server waits up to `wait_s` for the end of the first one."""
+        """Request the state of each unfinished job; wait up to `wait_s` for the first one in the pipeline to end."""
         for name, known in self._steps.items():
             if not known.state.terminal:
                 self._steps[name] = self._jobs.get(known.id, wait_s=wait_s)

@@ -26,11 +26,11 @@ class ProcessedHandle(ItemHandle):
         return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
 
     def info(self, *, revision: int | None = None) -> AlignmentInfo:
-        """Return the alignment: its set, keyframes, cost and options, and the source frame of each canonical frame."""
+        """Return the alignment: its keyframes, cost and options, and the source frame of each canonical frame."""
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """Return the fractional source frame of each canonical frame, (N,), counted at the frame rate of the set."""
+        """Return, for each of N canonical frames, the fractional frame of the source, resampled to `frame_rate_hz`."""
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:

@@ -33,7 +33,7 @@ class Proposals:
     url: str
 
     def open(self, title: str, source: str, *, into: str = MAIN, description: str = "") -> ProposalHandle:
-        """Propose to merge a version into a branch. A proposal of a branch includes the branch's later commits."""
+        """Propose to merge a version into a branch. If the version is a branch, its later commits are included."""
         request = ProposalCreate(title=title, source=source, target=into, description=description)
         return self.at(self.transport.post(Proposal, self.url, request).number)
 
@@ -98,8 +98,8 @@ class ProposalHandle:
     ) -> ProposalCheck:
         """Report the state of a check of the newest commit.
 
-        Raises `Conflict` if `commit` is given and the newest commit is another one, and if `state` is a success and
-        `job` has not succeeded.
+        Raises `Conflict` if `commit` is given and the newest commit is another one, or if `state` is success and `job`
+        has not succeeded.
         """
         request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
         return self.transport.post(ProposalCheck, f"{self.url}/checks", request)
@@ -114,15 +114,15 @@ class ProposalHandle:
     ) -> Proposal:
         """Merge the proposal; with `when_green`, as soon as nothing is missing.
 
-        Raises `Conflict` with the code `proposal-not-green` if something is missing, with the list `missing` in the
-        context; `merge-conflicts` if `resolutions` do not decide all conflicts; and `proposal-moved` if `commit` is
-        given and the newest commit is another one.
+        Raises `Conflict` with one of three codes: `proposal-not-green` if something is missing, which `missing` in the
+        error's context lists; `merge-conflicts` if `resolutions` do not decide all conflicts; `proposal-moved` if
+        `commit` is given and the newest commit is another one.
         """
         request = ProposalMerge(message=message, resolutions=tuple(resolutions), when_green=when_green, commit=commit)
         return self.transport.post(Proposal, f"{self.url}/merge", request)
 
     def withdraw_merge(self) -> Proposal:
-        """Withdraw the request to merge the proposal as soon as nothing is missing."""
+        """Cancel the request of `merge(when_green=True)` to merge the proposal as soon as nothing is missing."""
         return read_model(Proposal, self.transport.send("DELETE", f"{self.url}/merge"))
 
     def close(self) -> Proposal:

@@ -29,9 +29,9 @@ class ReportedHandle(ItemHandle):
         trial: str | None = None,
         table: str | None = None,
     ) -> bytes:
-        """Return a figure as png or svg, its data as json, or one table of its data as csv.
+        """Return a figure as png or svg, the data of the figure as json, or one `table` of this data as csv.
 
-        `trial` names the trial, for figures of single trials.
+        Figures of single trials need the name of the `trial`.
         """
         params = {"format": format, "trial": trial, "table": table}
         return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
@@ -58,7 +58,7 @@ class ReportedHandle(ItemHandle):
 
 
 def saved(path: str | Path, data: bytes) -> Path:
-    """Write bytes to a file that is created completely or not at all."""
+    """Write bytes to a file; if writing fails, no file is created."""
     with saved_atomically(path) as file:
         file.write(data)
     return Path(path)

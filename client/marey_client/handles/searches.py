@@ -27,10 +27,10 @@ class SearchableHandle(ReportedHandle):
     """Handle of an item whose motions can be searched."""
 
     def search(self, constraints: Constraints = (), **options: Any) -> SearchAnswer:
-        """Return the motion that meets constraints best; `options` are those of `SearchRequest`.
+        """Return the motion that meets constraints best, and the error of each constraint.
 
-        `steps` requests a sequence of motions, each with its constraints and, if different, the id of its model. The
-        answer contains the error of each constraint.
+        `options` are those of `SearchRequest`. The option `steps` requests a sequence of motions; each step has its own
+        constraints and, if it needs another model, the id of that model.
         """
         request = search_request(constraints, **options)
         response = self.transport.send(

@@ -45,15 +45,15 @@ def create_archive(
         list[str] | None,
         typer.Option(
             metavar="VERSION",
-            help="Leave out this version and all before it; the archive can be imported where this version is. May be "
-            "given several times.",
+            help="Leave out this version and all versions before it. The archive can be imported only into datasets "
+            "that have this version. May be repeated.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a version, all versions before it, and everything that they contain to one file, and check it.
 
-    If the command is interrupted, repeat it: it continues with the file that ends in .part.
+    If the command is interrupted, repeat it: it continues the file whose name ends in .part.
     """
     at = parse(place, version=True)
     with connect(context) as marey, progress() as advance:
@@ -93,7 +93,7 @@ def extract(
     output: Annotated[Path, typer.Option("--output", "--out", "-o", help="Folder to write to.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """Write the version in an archive to files: each entry as JSON, and clips as the files that they came from.
+    """Write the version in an archive to files: each entry as JSON, each clip also as the file that was imported.
 
     No server is needed. An existing file is replaced.
     """
@@ -111,14 +111,14 @@ def import_archive(
     context: typer.Context,
     file: ArchivePath,
     place: DatasetPlace,
-    branch: Annotated[str, typer.Option(help="Branch that is moved to the version.")] = "main",
+    branch: Annotated[str, typer.Option(help="Branch to move to the imported version.")] = "main",
     as_json: AsJson = False,
 ) -> None:
     """Check an archive, and record its versions in a dataset, which is created if it does not exist.
 
-    The versions keep their digests, authors and times. What the server has is not sent again. No folder changes: check
-    the version out to get its clips. If the branch has versions that the archive does not have, it does not move; merge
-    the imported version into it.
+    The versions keep their digests, authors and times. Only data that the server lacks is sent. The import changes no
+    folder: check out the version to get its clips. If the branch has versions that the archive lacks, the branch does
+    not move; merge the imported version into the branch.
     """
     at = parse(place)
     with connect(context) as marey, _opened(file), progress() as advance:

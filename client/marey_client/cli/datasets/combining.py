@@ -23,22 +23,28 @@ Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
 CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]
 Preview = Annotated[bool, typer.Option("--preview", help="Show the result without recording it.")]
 Ours = Annotated[
-    list[str] | None, typer.Option(metavar="PATH:KIND", help="Conflict in which the branch wins; can be repeated.")
+    list[str] | None,
+    typer.Option(metavar="PATH:KIND", help="Conflict in which the content of the branch is kept; may be repeated."),
 ]
 Theirs = Annotated[
     list[str] | None,
-    typer.Option(metavar="PATH:KIND", help="Conflict in which the other version wins; can be repeated."),
+    typer.Option(
+        metavar="PATH:KIND", help="Conflict in which the content of the other version is taken; may be repeated."
+    ),
 ]
 Base = Annotated[
     list[str] | None,
-    typer.Option(metavar="PATH:KIND", help="Conflict in which the entry stays as before both; can be repeated."),
+    typer.Option(
+        metavar="PATH:KIND", help="Conflict in which the content before both changes is restored; may be repeated."
+    ),
 ]
 Parent = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=2,
-        help="If the commit is a merge: the parent with which it is compared. 1: the branch that the merge changed.",
+        help="For a merge commit: number of the parent with which it is compared to find its changes; 1 is the branch "
+        "that the merge changed, 2 is the merged version.",
     ),
 ]
 
@@ -142,7 +148,7 @@ def _combine(
 
 @contextmanager
 def conflicts_printed(*, into: str, as_json: bool) -> Iterator[None]:
-    """If the server refuses a merge inside the block because of conflicts, print the conflicts and exit with 1."""
+    """Print the conflicts and exit with status 1 if a merge in the `with` block is refused because of conflicts."""
     from marey_client.errors import Conflict
     from marey_schemas.datasets.merges import MergeAnswer
 
@@ -165,7 +171,7 @@ def _print(found: MergeAnswer, into: str, *, as_json: bool) -> None:
 def resolutions_of(
     ours: Sequence[str] | None, theirs: Sequence[str] | None, base: Sequence[str] | None
 ) -> list[Resolution]:
-    """Return the decisions of conflicts that are given by the options --ours, --theirs and --base."""
+    """Return the decision for each conflict that the options --ours, --theirs and --base name."""
     from marey_schemas.datasets.merges import Resolution, Side
 
     found = []

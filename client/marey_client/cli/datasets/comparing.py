@@ -33,7 +33,9 @@ def diff(
         str | None, typer.Argument(help="Later version; default: the given version is compared with the one before it.")
     ] = None,
     path: Annotated[str, typer.Option(help="Entry or folder to compare.")] = "",
-    most: Annotated[int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries.")] = 1000,
+    most: Annotated[
+        int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries to list.")
+    ] = 1000,
     by_folder: Annotated[bool, typer.Option("--folders", help="Count the changes of each folder.")] = False,
     details: Annotated[
         bool,

@@ -19,14 +19,14 @@ TargetPlace = Annotated[
     str | None,
     typer.Argument(
         metavar="[PROJECT/DATASET]",
-        help="Dataset that gets the versions, and is created if it does not exist. Default: the same project and name.",
+        help="Dataset that receives the versions; created if it does not exist. Default: the same project and name.",
     ),
 ]
 TokenFile = Annotated[
     Path | None,
     typer.Option(
         "--other-token-file",
-        help="File with a token for the other server; default: the token that marey login stored for it.",
+        help="File with a token for the other server; default: the token that marey login stored for that server.",
     ),
 ]
 Branch = Annotated[
@@ -47,18 +47,16 @@ def push(
     context: typer.Context,
     place: VersionPlace,
     target: TargetPlace = None,
-    to: Annotated[
-        str | None, typer.Option(metavar="URL", help="Server to copy to. Default: another project of the same server.")
-    ] = None,
+    to: Annotated[str | None, typer.Option(metavar="URL", help="Server to copy to. Default: the same server.")] = None,
     token_file: TokenFile = None,
     branch: Branch = None,
     as_json: AsJson = False,
 ) -> None:
     """Copy a version and all versions before it to a dataset on another server, or in another project.
 
-    Only what the other dataset lacks is sent, and the versions keep their digests, authors and times. A tag is copied
-    with its version. No folder changes: check the version out to get its clips. If the branch has versions that you do
-    not have, it does not move; pull it, merge it, and push again.
+    Only data that the other dataset lacks is sent, and the versions keep their digests, authors and times. A tag is
+    copied with its version. The copy changes no folder: check out the version to get its clips. If the other branch has
+    versions that your dataset lacks, the branch does not move; pull it, merge, and push again.
     """
     with connect(context) as here, connect_other(to, token_file, here) as there:
         _copy(here, there, place, target, branch, as_json)
@@ -70,7 +68,7 @@ def pull(
     target: TargetPlace = None,
     source: Annotated[
         str | None,
-        typer.Option("--from", metavar="URL", help="Server to copy from. Default: another project of the same server."),
+        typer.Option("--from", metavar="URL", help="Server to copy from. Default: the same server."),
     ] = None,
     token_file: TokenFile = None,
     branch: Branch = None,
@@ -78,9 +76,9 @@ def pull(
 ) -> None:
     """Copy a version and all versions before it from a dataset on another server, or in another project.
 
-    Only what your dataset lacks is fetched, and the versions keep their digests, authors and times. A tag is copied
-    with its version. No folder changes: check the version out to get its clips. If your branch has other versions, it
-    does not move, and the command prints how to merge.
+    Only data that your dataset lacks is fetched, and the versions keep their digests, authors and times. A tag is
+    copied with its version. The copy changes no folder: check out the version to get its clips. If your branch has
+    versions that the other dataset lacks, the branch does not move, and the command prints how to merge.
     """
     with connect(context) as here, connect_other(source, token_file, here) as there:
         _copy(there, here, place, target, branch, as_json)

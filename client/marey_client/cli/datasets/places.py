@@ -50,7 +50,7 @@ def parse(text: str, *, version: bool = False) -> NamedVersion:
 
 
 def imported(at: NamedVersion, made: ImportedVersion) -> str:
-    """Return a sentence about an imported version: which branch is at it now, or how to merge it into the branch."""
+    """Return a sentence about an imported version: the branch that is at the version now, or how to merge the two."""
     name, digits = f"{at.project}/{at.dataset}", short(made.commit.digest)
     if not made.moved:
         return (

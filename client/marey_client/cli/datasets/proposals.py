@@ -62,7 +62,7 @@ def open_proposal(
     into: Into = "main",
     as_json: AsJson = False,
 ) -> None:
-    """Propose to merge a version into a branch. A proposal of a branch includes its later commits."""
+    """Propose to merge a version into a branch. If the version is a branch, its later commits are included."""
     at = parse(place, version=True)
     with connect(context) as marey:
         made = at.on(marey).proposals.open(title, at.version, into=into, description=description).read()
@@ -152,7 +152,7 @@ def comment(
         str | None, typer.Option(metavar="PATH:KIND", help="Entry that the comment is about, such as raw/walk:clip.")
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Frames of the entry, up to the one before END.")
+        str | None, typer.Option(metavar="FIRST:END", help="Range of the entry's frames; END is not included.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -180,7 +180,7 @@ def _frames(text: str | None) -> tuple[int, int] | None:
         return None
     first, _, end = text.partition(":")
     if not first.isdecimal() or not end.isdecimal():
-        raise WrongUsage(f"{text!r} names no frames; write the first one and the one after the last, such as 120:180")
+        raise WrongUsage(f"{text!r} is not a range of frames; write FIRST:END, such as 120:180; END is not included")
     return int(first), int(end)
 
 
@@ -212,7 +212,9 @@ def check(
     state: Annotated[CheckState, typer.Argument(help="State of the check.")],
     job: Annotated[
         str | None,
-        typer.Option(help="Job that made the check; the state can be success only if the job has succeeded."),
+        typer.Option(
+            help="Id of the job that made the check; the state can be success only if this job has succeeded."
+        ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
     text: Annotated[str, typer.Option("--message", "-m", help="Result in words.")] = "",
@@ -240,9 +242,11 @@ def merge(
     theirs: Theirs = None,
     base: Base = None,
     when_green: Annotated[
-        bool, typer.Option("--when-green", help="If approvals or checks are missing, merge as soon as they are there.")
+        bool, typer.Option("--when-green", help="If approvals or checks are missing, merge as soon as all are present.")
     ] = False,
-    withdraw: Annotated[bool, typer.Option("--withdraw", help="Withdraw an earlier --when-green.")] = False,
+    withdraw: Annotated[
+        bool, typer.Option("--withdraw", help="Cancel the merge that an earlier --when-green requested.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Merge a proposal into its target. If it cannot be merged yet, the command lists the reasons.
@@ -292,13 +296,14 @@ def protect(
         bool, typer.Option("--direct-commits", help="Allow commits and merges without a proposal.")
     ] = False,
     approvals: Annotated[
-        int, typer.Option(min=0, help="Number of approvals that a proposal needs; the author's does not count.")
+        int, typer.Option(min=0, help="Number of approvals that a proposal needs, not counting its author's.")
     ] = 0,
     checks: Annotated[
-        list[str] | None, typer.Option("--check", metavar="NAME", help="Check that must succeed; can be repeated.")
+        list[str] | None,
+        typer.Option("--check", metavar="NAME", help="Check that must succeed before a merge; may be repeated."),
     ] = None,
     up_to_date: Annotated[
-        bool, typer.Option("--up-to-date", help="A proposal must contain the newest commit of the branch.")
+        bool, typer.Option("--up-to-date", help="Merge a proposal only if it contains the newest commit of the branch.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -39,7 +39,7 @@ def create_dataset(
     folder: Annotated[
         str | None,
         typer.Option(
-            "--folder", help="Folder of the project whose content the commits record; default: the folder of this name."
+            "--folder", help="Folder whose content the commits record; default: the folder with the dataset's name."
         ),
     ] = None,
     description: Annotated[str, typer.Option(help="Purpose of the dataset.")] = "",
@@ -73,7 +73,7 @@ def commit(
     context: typer.Context,
     place: DatasetPlace,
     message: Annotated[str, typer.Option("--message", "-m", help="What has changed, and why.")],
-    branch: Annotated[str, typer.Option(help="Branch that the new version follows.")] = "main",
+    branch: Annotated[str, typer.Option(help="Branch to which the new version is added.")] = "main",
     as_json: AsJson = False,
 ) -> None:
     """Record the present content of the dataset's folder as a new version."""
@@ -187,7 +187,7 @@ def reset(
     place: VersionPlace,
     name: Annotated[str, typer.Argument(help="Branch to move.")],
 ) -> None:
-    """Move a branch to a version, also to an earlier one. No commit is deleted."""
+    """Move a branch to any version, for example to an earlier one. No commit is deleted."""
     at = parse(place, version=True)
     with connect(context) as marey:
         moved = at.on(marey).move_branch(name, at.version)
@@ -202,7 +202,7 @@ def blame(
     kind: Annotated[str, typer.Option(help="Kind of the entry.")] = "clip",
     as_json: AsJson = False,
 ) -> None:
-    """List who last changed each part of an entry, its tags and its path."""
+    """Show which commit changed each part of an entry last, its tags last, and its path last, with author and time."""
     at = parse(place, version=True)
     with connect(context) as marey:
         found = at.on(marey).blame(path.strip("/"), kind_named(kind), at.version)

@@ -47,7 +47,7 @@ class DemoReport:
 
     @property
     def refused(self) -> list[tuple[str, str]]:
-        """Refusals, as step, name and reason."""
+        """Refusals, each as a step and a text with the name and the reason."""
         imports = [("import", refusal_text(entry)) for entry in self.entries if entry.error is not None]
         result = (self.job.result if self.job else None) or {}
         retargets = [
@@ -58,7 +58,7 @@ class DemoReport:
 
     @property
     def warnings(self) -> Counter[str]:
-        """The number of files with a warning, by its code."""
+        """The number of files that have a warning, by the code of the warning."""
         return Counter(code for entry in self.entries for code in {warning.code for warning in entry.warnings})
 
     def as_dict(self) -> dict[str, Any]:

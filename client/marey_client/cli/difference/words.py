@@ -262,7 +262,7 @@ def _shift(change: SegmentChange) -> int | None:
 
 
 def _common_shift(changes: Sequence[SegmentChange]) -> int | None:
-    """Return the shift that at least three segments, and most of the changed ones, have in common."""
+    """Return the shift in frames of more than half of the changed segments, and of at least three; None otherwise."""
     shifts = [shift for one in changes if (shift := _shift(one)) is not None]
     most = max(set(shifts), key=shifts.count, default=None)
     return most if most is not None and shifts.count(most) >= 3 and 2 * shifts.count(most) > len(changes) else None
@@ -315,7 +315,7 @@ def _model(model: ModelDifference) -> Iterator[str]:
 
 
 def _fields(difference: Difference) -> Iterator[str]:
-    """Yield a line for each changed field, but one line for all details of a clip's source, and few for its checks."""
+    """Yield one line per changed field; import warnings of a clip, and details of its source, are only counted."""
     checks = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/checks/")]
     source = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/source/details")]
     for change, verb in (("removed", "no longer listed"), ("added", "added"), ("changed", "changed")):
@@ -329,7 +329,7 @@ def _fields(difference: Difference) -> Iterator[str]:
 
 
 def _check(change: FieldChange) -> str:
-    """Return the code of an added or removed check, or the JSON pointer of a changed value in a check."""
+    """Return the code of an import warning that was added or removed; else the JSON pointer of the changed value."""
     value = change.after if change.before is None else change.before
     return str(value["code"]) if isinstance(value, dict) and "code" in value else change.pointer
 

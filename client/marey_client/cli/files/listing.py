@@ -127,7 +127,7 @@ def ls(
 def _explain(
     context: typer.Context, address: Address, kinds: Sequence[str] | None, query: str | None, as_json: bool
 ) -> None:
-    """Print how many items each condition of a query hides; of clips, unless other kinds are given."""
+    """Print how many items each condition of a query hides, for each of `kinds`; default: for clips."""
     if query is None:
         raise WrongUsage("--explain counts what the conditions of a query hide; add --query")
     with connect(context) as marey:

@@ -95,7 +95,7 @@ def _pairs(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _checked(given: Mapping[str, str], place: str) -> dict[str, Any]:
-    """Return the values of fields, None for those to remove. Raises `WrongUsage` if one is not valid."""
+    """Return the checked value of each field, None for a field to remove. Raises `WrongUsage` for an invalid value."""
     from pydantic import ValidationError
 
     from marey_schemas.documents.clips import TakeRecord
@@ -201,7 +201,7 @@ def _info_of(clip: ClipHandle) -> Any:
 
 
 def _apply(changes: Sequence[_RecordChange]) -> None:
-    """Make the changes, several at a time; clips whose record is the same already get no revision."""
+    """Make the changes, several at a time; a clip that already has the new values gets no new revision."""
     from marey_client.errors import MareyError
 
     def change(one: _RecordChange) -> str | bool:

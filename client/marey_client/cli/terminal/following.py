@@ -33,7 +33,7 @@ Wait = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the job
 
 
 def clips_at(marey: Marey, address: Address) -> ExistingInput:
-    """Return the clip at an address as the input of a job; if there is no such clip, the folder or dataset version."""
+    """Return the clip, the version of a dataset, or the folder at an address as the input of a job."""
     from marey_schemas.kinds import Kind
 
     return input_at(marey, address, Kind.CLIP, pinned=False)
@@ -42,7 +42,8 @@ def clips_at(marey: Marey, address: Address) -> ExistingInput:
 def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True) -> ExistingInput:
     """Return the input of a job at an address: an item, its revision after `@`, a version of a dataset, or a folder.
 
-    `pinned` fixes the revision of an item that is named without one.
+    An item without `@` means its newest revision: with `pinned`, the newest one now; otherwise, the newest one when the
+    job is submitted.
     """
     from marey_schemas.queue.jobs import CollectionInput, ItemInput
 
@@ -58,8 +59,8 @@ def follow(
 ) -> Job | None:
     """Wait until a job has ended, and show a progress bar.
 
-    The progress of a job with tasks is shown as a number of tasks, or of `count` units if that is given. Without
-    `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
+    The progress of a job with tasks is counted in tasks; if `count` is given, it is scaled to `count` units, which
+    `unit` names. Without `wait`, print the job's id and return None. Raises `JobUnsuccessful`.
     """
     if not wait:
         print_json(submitted) if as_json else typer.echo(submitted.id)
@@ -83,7 +84,7 @@ def follow(
 
 
 def show_progress(now: Job, advance: Advance, count: int | None = None, unit: str = "") -> None:
-    """Show the progress of a job: if it has tasks, as a number of tasks, or of `count` units if that is given."""
+    """Show the progress of a job. The progress of a job with tasks is counted in tasks, or scaled to `count` units."""
     what = f"{now.kind} {now.state}"
     if now.progress is None:
         return advance(what, 0, None)
@@ -95,7 +96,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the refused inputs of a job, and its result with the function `show`, or its counts if `show` is None.
+    """Print the refused inputs of a job, and its result by the function `show`; without `show`, the counts in it.
 
     Raises `Refused` if inputs were refused."""
     result = ended.result or {}

@@ -51,7 +51,7 @@ def connect_other(url: str | None, token_file: Path | None, first: Marey) -> Ite
 
     if url is None:
         if token_file is not None:
-            raise WrongUsage("--other-token-file is for another server; name it by its URL")
+            raise WrongUsage("--other-token-file is for another server; name that server with --to or --from")
         yield first
         return
     found = resolve_other(url, token_file)

@@ -19,7 +19,7 @@ COPIED = ("id", "job")
 
 
 def print_json(value: Any) -> None:
-    """Print models, lists of models, or plain trees as JSON."""
+    """Print as JSON: a model, or lists and dicts of models and plain values."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
 
 
@@ -86,7 +86,7 @@ Advance = Callable[[str, float, float | None], None]
 
 @contextmanager
 def progress() -> Iterator[Advance]:
-    """Show a progress bar on standard error inside the block, if standard error is a terminal."""
+    """Show a progress bar during the `with` block if standard error is a terminal; yield a function that moves it."""
     if not sys.stderr.isatty():
         yield lambda _what, _done, _total: None
         return

@@ -51,9 +51,9 @@ class OptionsOf:
     ----------
     model : module and name of the model, as `module:name`
     short : further spellings of an option, by the name of its field
-    without : fields that the command sets itself
-    only : the fields that become options; all fields if empty
-    nulls : further texts for null, by the name of the field
+    without : fields that get no option, because the command sets them
+    only : fields that get an option; all fields if empty
+    nulls : for fields that may be null, by name: a text that means null, in addition to `none`
     """
 
     model: str
@@ -104,7 +104,7 @@ class OptionsOf:
             yield _Option(path, schema, _several(self.short.get(path[-1], ())), self.nulls.get(name))
 
     def _spelled(self, place: tuple[int | str, ...]) -> str:
-        """Return the name of the option for a place in the model."""
+        """Return the spelling of the option for a field, given by its path in the model, for error texts."""
         fitting = (one for one in self.options if place[: len(one.path)] == one.path)
         option = next(fitting, None)
         if option is None:

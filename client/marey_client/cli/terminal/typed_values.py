@@ -135,7 +135,7 @@ def is_frame(text: str) -> bool:
 
 
 def assignment(text: str) -> tuple[str, str]:
-    """Return name and value of `name=value`. Raises `WrongUsage`."""
+    """Parse `name=value`; return the name and the value. Raises `WrongUsage` for other texts."""
     name, equals, value = text.partition("=")
     if not equals or not name:
         raise WrongUsage(f"{text!r} is not a name with a value; write name=value")
@@ -167,7 +167,7 @@ def read_parameter(text: str, schema: Schema | None) -> Any:
 
 
 def read_number(text: str, given: str) -> float:
-    """Return a number. Raises `WrongUsage`, which shows the text."""
+    """Parse a number. Raises `WrongUsage`; its text begins with `given`, the option or argument that was typed."""
     try:
         return float(text)
     except ValueError:
@@ -175,7 +175,7 @@ def read_number(text: str, given: str) -> float:
 
 
 def named_number(text: str, names: Mapping[str, Any] | None = None) -> tuple[str, float]:
-    """Return name and number of `name=number`. Raises `WrongUsage`, also for a name that is not in `names`."""
+    """Parse `name=number`. Raises `WrongUsage` for other texts, and for a name that is not in `names`."""
     name, equals, value = text.rpartition("=")
     if not (name and equals) or (names is not None and name not in names):
         known = "" if names is None else f" with one of {', '.join(names)}"
