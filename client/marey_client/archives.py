@@ -247,7 +247,7 @@ class _Making:
         return named
 
     def _add_revisions(self, contents: Iterable[str]) -> None:
-        """Add revisions to which documents refer, and their documents, also revisions that no entry has."""
+        """Add revisions to which documents refer, given by content digest, and the documents of these revisions."""
         waiting = sorted(contents)
         self.known.update(waiting)
         for start in range(0, len(waiting), MOST_CONTENTS):

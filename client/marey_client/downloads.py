@@ -24,7 +24,7 @@ LONGEST_ENDING = 16
 
 @contextmanager
 def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
-    """Yield a temporary file to write; rename it to `target` after the `with` block, or delete it if that fails."""
+    """Yield a temporary file; rename it to `target` at the end of the `with` block, or delete it if the block fails."""
     target = Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name[:32]}.{uuid.uuid4().hex}")
@@ -82,8 +82,8 @@ def download(
 ) -> Path:
     """Download a file to `folder` under the server's name for it, or `name`; return its path.
 
-    An existing file of that name is replaced. A name that `beside` contains, the paths of files that were written
-    before as part of the same download, gets a number.
+    `beside` contains the paths of files that were written before as part of the same download; if one of them has the
+    same name, a number is added to the name. All other existing files of that name are replaced.
     """
     places = TakenPaths() if beside is None else beside
     target: Path | None = None

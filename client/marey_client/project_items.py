@@ -85,7 +85,7 @@ class ProjectItems:
         return Collections(self.transport, self.name)
 
     def edited_rigs(self, clips: Iterable[Item]) -> tuple[ItemInput, ...]:
-        """Return those skeletons of clips that have several revisions: their joint mappings may have been edited."""
+        """Return the skeletons of `clips` whose joint mapping may have been edited: those with several revisions."""
         used = {str(clip.summary["skeleton"]) for clip in clips}
         skeletons = map(self.skeletons.get, sorted(used))
         return tuple(ItemInput(item=one.id) for one in skeletons if one.item.revision > 1)

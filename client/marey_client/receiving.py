@@ -112,7 +112,7 @@ class _Import:
         return self.dataset.at(head)
 
     def _known(self, history: list[tuple[str, CommitRecord]]) -> set[str]:
-        """Return the digests of commits of the archive that the dataset has; it also has all ancestors of these."""
+        """Return the digests of commits that the dataset has; a dataset with a commit also has all its ancestors."""
         known: set[str] = set()
         for digest, record in reversed(history):
             if digest not in known and not self.dataset.has(digest):

@@ -138,7 +138,7 @@ def change_password(
         ),
     ] = False,
 ) -> None:
-    """Set a new password, and end all other sessions of the user. For your own, the current password is needed, too."""
+    """Set a new password, and end the user's other sessions. To set your own password, also enter the current one."""
     from marey_schemas.access import EndTokens, UserChange
 
     with connect(context) as marey:

@@ -224,8 +224,8 @@ class SingleItem:
 def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = False) -> Thing:
     """Return the folder or item at an address; a final `/` means a folder.
 
-    With `deleted`, return the deleted one; if several with this address were deleted, the last of these. Raises
-    `WrongUsage` if there is none, or if items of several kinds have this address.
+    With `deleted`, look for deleted folders and items; if several are found, return the one that was deleted last.
+    Raises `WrongUsage` if nothing is found, or if items of several kinds have this address.
     """
     address = Address.parse(text)
     if not address.path:

@@ -193,7 +193,7 @@ def propose(
     into: Annotated[
         str,
         typer.Option(
-            help="Folder that receives the annotations, in the subfolders of the clips; default: next to each clip."
+            help="Folder for the annotations, which get the subfolders of the clips; default: the folder of each clip."
         ),
     ] = "",
     wait: Wait = True,

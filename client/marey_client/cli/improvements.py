@@ -137,7 +137,7 @@ def optimise(
     wait: Wait = True,
     as_json: AsJson = False,
 ) -> None:
-    """Remove clips from an evaluated set and add others, step by step, as long as the set becomes better."""
+    """Find removals and additions of clips that make an evaluated set better, step by step. No clip is changed."""
     with connect(context) as marey:
         handle = evaluation_at(marey, evaluation)
         request = handle.optimise_request(_places(marey, handle, candidates), **params)

@@ -124,7 +124,7 @@ def _kind_of_job(marey: Marey, name: str) -> JobKind:
 
 
 def _input_at(marey: Marey, address: Address, spec: InputSpec) -> JobInput:
-    """Return an item, or a folder if the input takes several items, or the output of a job."""
+    """Return the input at an address: an item, a folder if several items are accepted, or the outputs of a job."""
     from marey_schemas.queue.jobs import ItemInput, JobOutputsInput
 
     if address.has_id and address.name.startswith("job_"):

@@ -105,8 +105,9 @@ class ClipHandle(ItemHandle):
 
 
 def frames_text(frames: slice | None) -> str | None:
-    """Return a slice as the query parameter `first:end`, or None for None. Raises `ValueError` for steps and negative
-    bounds.
+    """Return a slice as the query parameter `first:end`; return None for None, which means all frames.
+
+    Raises `ValueError` for a step other than 1, and for negative bounds.
     """
     if frames is None:
         return None

@@ -346,7 +346,10 @@ class DatasetHandle:
         return ImportedVersion(commit, branch, True)
 
     def _fast_forward(self, branch: str, commit: str) -> bool:
-        """Move a branch to a commit if the commit follows the branch's newest one; return whether it is there now."""
+        """Move a branch to a commit if the commit follows the branch's newest one.
+
+        Return whether the branch is at the commit now.
+        """
         if self.at(branch).digest == commit:
             return True
         try:

@@ -34,7 +34,7 @@ class EvaluationHandle(ReportedHandle):
         return dict(self.item.summary)
 
     def document(self, *, revision: int | None = None) -> dict[str, Any]:
-        """Return the evaluation without its ticks: options, provenance, metrics, usage, coverage.
+        """Return the evaluation without the records of single ticks: options, provenance, metrics, usage, coverage.
 
         Arrays are numpy arrays.
         """
@@ -92,7 +92,7 @@ class EvaluationHandle(ReportedHandle):
     def optimise(
         self, candidates: Places[ClipHandle] = (), *, on_progress: OnProgress | None = None, **options: Any
     ) -> Findings:
-        """Remove clips and add candidates step by step, as long as that lowers the objective.
+        """Find removals of clips and additions of candidates, step by step, as long as each lowers the objective.
 
         `options` are those of `OptimiseParams`.
         """

@@ -21,7 +21,7 @@ class Findings:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The numbers shown in lists."""
+        """The main numbers of the result."""
         return {name: value for name, value in (self.job.result or {}).items() if name not in ("document", "report")}
 
     def document(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class ProcessedHandle(ItemHandle):
         return AlignmentInfo.model_validate(self.part("info", revision=revision))
 
     def time_function(self) -> NDArray[np.float64]:
-        """Return, for each of N canonical frames, the fractional frame of the source, resampled to `frame_rate_hz`."""
+        """Return the fractional source frame of each of N canonical frames, counted at the aligned clip's rate."""
         return self.info().time_function
 
     def source(self) -> ClipHandle | None:

@@ -64,7 +64,9 @@ class SearchableHandle(ReportedHandle):
         return target
 
     def make_tree(self, *, seed: int = 0, on_progress: OnProgress | None = None, **options: Any) -> Job:
-        """Build a tree of samples as the model's part `tree`, and wait for its job. Raises `JobUnsuccessful`.
+        """Submit a job that builds the model's part `tree` from samples, and wait for its end.
+
+        Raises `JobUnsuccessful` if the job does not succeed.
 
         `options` are those of `TreeParams`.
         """

@@ -36,7 +36,9 @@ def diff(
     most: Annotated[
         int, typer.Option("--limit", "-n", min=1, max=10_000, help="Greatest number of entries to list.")
     ] = 1000,
-    by_folder: Annotated[bool, typer.Option("--folders", help="Count the changes of each folder.")] = False,
+    by_folder: Annotated[
+        bool, typer.Option("--folders", help="Show only the number of changes in each folder.")
+    ] = False,
     details: Annotated[
         bool,
         typer.Option(

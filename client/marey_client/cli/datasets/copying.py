@@ -47,7 +47,9 @@ def push(
     context: typer.Context,
     place: VersionPlace,
     target: TargetPlace = None,
-    to: Annotated[str | None, typer.Option(metavar="URL", help="Server to copy to. Default: the same server.")] = None,
+    to: Annotated[
+        str | None, typer.Option(metavar="URL", help="Server to copy to. Default: the server that you copy from.")
+    ] = None,
     token_file: TokenFile = None,
     branch: Branch = None,
     as_json: AsJson = False,
@@ -68,7 +70,7 @@ def pull(
     target: TargetPlace = None,
     source: Annotated[
         str | None,
-        typer.Option("--from", metavar="URL", help="Server to copy from. Default: the same server."),
+        typer.Option("--from", metavar="URL", help="Server to copy from. Default: the server that you copy to."),
     ] = None,
     token_file: TokenFile = None,
     branch: Branch = None,

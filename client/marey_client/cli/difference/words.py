@@ -315,7 +315,7 @@ def _model(model: ModelDifference) -> Iterator[str]:
 
 
 def _fields(difference: Difference) -> Iterator[str]:
-    """Yield one line per changed field; import warnings of a clip, and details of its source, are only counted."""
+    """Yield one line per changed field; import warnings of a clip, and details of its source, are summarised."""
     checks = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/checks/")]
     source = [one for one in difference.fields if one.part == "info" and one.pointer.startswith("/source/details")]
     for change, verb in (("removed", "no longer listed"), ("added", "added"), ("changed", "changed")):

@@ -96,7 +96,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 
 
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
-    """Print the refused inputs of a job, and its result by the function `show`; without `show`, the counts in it.
+    """Print the refused inputs of a job, then call `show` with its result; without `show`, print the counts in it.
 
     Raises `Refused` if inputs were refused."""
     result = ended.result or {}
