@@ -98,8 +98,8 @@ class ProposalHandle:
     ) -> ProposalCheck:
         """Report the state of a check of the newest commit.
 
-        Raises `Conflict` if `commit` is given and the newest commit is another one, or if `state` is success and `job`
-        has not succeeded.
+        Raises `Conflict` if `commit` is given and the newest commit is another one, or if `state` is `SUCCEEDED` and
+        `job` has not succeeded.
         """
         request = CheckReport(name=name, state=state, text=text, job=job, link=link, commit=commit)
         return self.transport.post(ProposalCheck, f"{self.url}/checks", request)

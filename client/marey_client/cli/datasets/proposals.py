@@ -213,7 +213,7 @@ def check(
     job: Annotated[
         str | None,
         typer.Option(
-            help="Id of the job that made the check; the state can be success only if this job has succeeded."
+            help="Id of the job that made the check; the state succeeded is refused unless this job has succeeded."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
