@@ -61,8 +61,9 @@ def _new_event_loop() -> asyncio.AbstractEventLoop:
 
 
 def read_settings(**given: Any) -> Settings:
-    """Return settings from flags, variables and `marey.toml`. Raises `CommandFailed` with one line about an invalid
-    one.
+    """Return the settings from flags, environment variables and `marey.toml`.
+
+    Raises `CommandFailed`, with an explanation in one line, if a setting is not valid.
     """
     try:
         return Settings(**given)
@@ -141,8 +142,9 @@ def fsck(*, repair: bool = False, as_json: bool = False, **settings: Any) -> Non
 
 
 def clock(*, set_now: bool = False, **settings: Any) -> None:
-    """Compare the clock that an SQLite database stores with the clock of this machine; with `set_now`, set the stored
-    clock.
+    """Compare the clock that an SQLite database stores with the clock of this machine.
+
+    With `set_now`, set the stored clock to the time of this machine.
     """
     from marey_server.store.clock_setting import read_clock, set_clock
     from marey_server.store.database.opening import alone

@@ -1,5 +1,6 @@
-"""Conversion of pydantic's validation errors to field errors, which consist of a JSON Pointer into the request, a code
-and a text.
+"""Conversion of pydantic's validation errors to field errors.
+
+A field error consists of a JSON Pointer into the request, a code and a text.
 """
 
 from __future__ import annotations

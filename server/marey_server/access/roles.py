@@ -40,8 +40,10 @@ def is_administrator(principal: Principal) -> bool:
 
 
 def require_administrator(principal: Principal, *, hidden: NotFoundProblem | None = None) -> None:
-    """Raise `ForbiddenProblem`, or the error `hidden`, unless the caller is an administrator whose token has the scope
-    `admin`.
+    """Raise an error unless the caller is an administrator whose token has the scope `admin`.
+
+    Raises `UnauthenticatedProblem` for an anonymous caller; other callers get the error `hidden` if it is given, or
+    else `ForbiddenProblem`.
     """
     if is_administrator(principal):
         return

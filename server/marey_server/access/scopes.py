@@ -1,5 +1,6 @@
-"""Scopes of tokens: `read`, `write`, `jobs`, `work` and `admin`, for all projects, or for one as in
-`write!project=walk`.
+"""Scopes of tokens: `read`, `write`, `jobs`, `work` and `admin`.
+
+A scope is valid for all projects, or for one project, as in `write!project=walk`.
 """
 
 from __future__ import annotations

@@ -1,1 +1,4 @@
-"""One module per resource: parse, authorise, call a service, render."""
+"""Handlers of HTTP requests, one module per resource.
+
+A handler parses the request, checks access, calls a function of `store` or `motions`, and renders the answer.
+"""

@@ -71,7 +71,10 @@ class ClipAnnotations(Resource):
         idempotency="key",
     )
     async def post(self, project: str, kind: str, item: str, body: AnnotationImport) -> Rendered:
-        """Create an annotation of a clip (kind `clips`), in the clip's folder, from a document of the predecessor."""
+        """Create an annotation of a clip (kind `clips`) from a document of Marey's predecessor.
+
+        The annotation is created in the clip's folder.
+        """
         if kind_of(kind) is not Kind.CLIP:
             raise NotFoundProblem(f"Only clips can be annotated, not items of the kind {kind}.", code="no-annotations")
         clip = await self.look_up(items.find_annotated_clip, project, item)

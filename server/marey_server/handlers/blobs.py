@@ -79,7 +79,7 @@ class MissingBlobs(Resource):
 
     @writes(access=Access.SIGNED_IN, scope="read", body=BlobsQuery, answer=BlobsMissing)
     async def post(self, body: BlobsQuery) -> Reply:
-        """Return the digests whose bytes the caller must send."""
+        """Return those of the given digests whose bytes the caller must send before referring to them."""
         missing = await self.look_up(blobs.missing, body.digests)
         return Reply(BlobsMissing(missing=tuple(missing)))
 

@@ -96,11 +96,11 @@ class CoverageStreamFrames(Resource):
         answer=CoverageProgress,
     )
     async def post(self, project: str, stream: str, body: CoverageFrames) -> Rendered | Reply:
-        """Send the next frames, as poses of the stream's skeleton or as root positions; the answer lists the speeds and
-        turn rates that are still missing.
+        """Send the next frames of a stream; the answer lists the speeds and turn rates that are still missing.
 
-        If the last frames are sent again at the same offset, the answer is repeated. If the offset is not that of the
-        stream, the answer is 409 with the current offset in the context.
+        Frames are poses of the stream's skeleton, or root positions. If the last frames are sent again at the same
+        offset, the answer is repeated. If the offset is not that of the stream, the answer is 409 with the current
+        offset in the context.
         """
         held = await self.look_up(coverage_streams.read_to_advance, project, stream)
         given = await self.compute(coverage.next_frames, held, body)

@@ -46,7 +46,7 @@ class Events(Resource):
         headers=("Last-Event-ID",),
     )
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
-        """Return events in the order of their commits; as text/event-stream, also future events.
+        """Return events in the order of their commits; as text/event-stream, also events that occur later.
 
         If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and its context
         contains the number after which the remaining events begin.

@@ -40,9 +40,10 @@ class Readyz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health, also=((503, None),), reserved=True)
     async def get(self) -> Reply:
-        """Answer whether the server is ready: the database is reachable and has the current schema, there is space for
-        blobs, and the server is not stopping. If it is not ready, the log gives the reason, and so does the answer to
-        an administrator.
+        """Return whether the server is ready for requests.
+
+        It is ready if the database is reachable and has the current schema, there is space for blobs, and the server is
+        not stopping. If it is not ready, the log gives the reason, and so does the answer to an administrator.
         """
         if self.services.draining.is_set():
             raise UnavailableProblem(

@@ -120,9 +120,9 @@ class ProjectImports(Resource):
     async def post(self, project: str) -> Reply:
         """Import motion files; the answer has one entry for each file, and a faulty file does not affect others.
 
-        Send files as multipart/form-data, with the options as form fields, or name files by digest. Files with known
-        content change nothing. Many files, or many bytes, are imported by a job (202), whose result has the form of
-        the answer.
+        Send files as multipart/form-data, with the options as form fields, or name files by digest. A file whose
+        content the project has already changes nothing. Many files, or many bytes, are imported by a job (202), whose
+        result has the form of the answer.
         """
         if self.parts is not None:
             self.parts.finish()

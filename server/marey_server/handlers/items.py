@@ -256,7 +256,7 @@ class ExplanationResource(Resource):
 
     @reads(access=Access.READER, query=ExplanationQuery, answer=QueryExplanation)
     async def get(self, project: str, kind: str, query: ExplanationQuery) -> Rendered:
-        """Return the number of items that a query selects, and the numbers that each of its conditions hides."""
+        """Return the number of items that a query selects, and how many items each of its conditions excludes."""
         filters = ItemFilters(collection=query.collection)
         return await self.answer(items.explain_query, project, kind_of(kind), filters, query.query)
 

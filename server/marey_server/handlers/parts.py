@@ -48,7 +48,10 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part; its arrays are cut in blocks if `encoded`. A part of a named revision never changes."""
+    """Read a part of an item; if frames or joints are cut out, `encoded` keeps the arrays encoded.
+
+    A part of a named revision never changes.
+    """
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)
     if query.frames is None and query.joints is None:

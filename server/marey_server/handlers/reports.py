@@ -83,9 +83,7 @@ class ItemReport(StoredFileSender):
         headers=("Range", "If-Range"),
     )
     async def get(self, project: str, kind: str, item: str, query: ReportQuery) -> Rendered | None:
-        """Return the report of an evaluation or a model (kinds `evaluations`, `models`) as one self-contained HTML
-        page.
-        """
+        """Return the report of an item (kinds `evaluations`, `models`) as one self-contained HTML page."""
         report = await self.look_up(read_report, project, kind_of(kind), item, query.revision)
         return await self.send_file(report.html, query, "text/html; charset=utf-8", _scripts(report))
 
@@ -172,8 +170,8 @@ class EvaluationWalkGraph(Resource):
     async def get(self, project: str, kind: str, item: str, query: WalkGraphQuery) -> Reply:
         """Return the frames displayed by the trials of an evaluation (kind `evaluations`) and the jumps between them.
 
-        Nodes are frames of clips with the number of ticks for which they were displayed; edges are jumps with their
-        number; walks list the edges of each trial in order.
+        Nodes are frames of clips, with the number of ticks for which each was displayed. Edges are jumps, with the
+        number of times that each was taken. Walks list the edges of each trial in order.
         """
         source = await self.look_up(walk_graphs.read_walks, project, kind_of(kind), item, query.revision)
         order = partial(walk_graphs.walk_order, source, query.trial, query.format)

@@ -47,7 +47,7 @@ class ModelUser(Resource):
     """Base of resources that let a model generate motion."""
 
     async def packed_model(self, project: str, found: FoundSearchable) -> bytes:
-        """Return the documents of a model for a child; the most recently used ones are cached."""
+        """Return the documents of a model as bytes for a child process; the most recently used ones are cached."""
         known = self.services.models.get(found.key)
         if known is None:
             loaded = await self.look_up(searching.load_searchable, project, found)
@@ -56,7 +56,7 @@ class ModelUser(Resource):
         return known
 
     async def found_model(self, project: str, kind: str, item: str, revision: int | None) -> tuple[FoundModel, bytes]:
-        """Return the requested model with its documents for a child."""
+        """Return the requested model, and its documents as bytes for a child process."""
         found = await self.look_up(models.find_model, project, kind_of(kind), item, revision)
         return found, await self.packed_model(project, FoundSearchable(found, tree=None, mapping=None))
 

@@ -30,7 +30,7 @@ class Searcher(ModelUser):
     """Base of resources that search models."""
 
     async def searched_models(self, project: str, kind: str, item: str, request: SearchRequest) -> SearchedModels:
-        """Return the model of each step, with its documents for a child."""
+        """Return the model of each step of a search, with the documents as bytes for a child process."""
         found = await self.look_up(searching.find_searchables, project, kind_of(kind), item, request)
         packed: dict[str, bytes] = {}
         for one in found:

@@ -204,8 +204,9 @@ class Connections:
             del self._by_address[one.address]
 
     def _pause(self, listening: socket.socket, error: OSError) -> None:
-        """Stop accepting connections for a moment: otherwise a failed `accept` would be repeated at once and without
-        end.
+        """Stop accepting connections for a moment.
+
+        Otherwise the event loop would repeat a failed `accept` at once and without end.
         """
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
@@ -237,8 +238,9 @@ class Connections:
                 one.start_count(now_s)
 
     def _log(self, kind: str, text: str, *args: object) -> None:
-        """Count a refused or closed connection, and log a warning: at most one for each reason in `LOG_EVERY_S`
-        seconds.
+        """Count a refused or closed connection, and log a warning.
+
+        For each reason, at most one warning is logged in `LOG_EVERY_S` seconds.
         """
         self._count_closed(kind)
         now_s = time.monotonic()

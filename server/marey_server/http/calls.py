@@ -50,14 +50,17 @@ class Caller:
         tx.required_role = self.operation.required_role
 
     def sees_answer(self, project: str | None) -> bool:
-        """Return whether the credential may read the answer about the project in the address."""
+        """Return whether the scopes of the credential allow showing the answer to a change in the project."""
         held = self.principal.scopes if self.principal is not None else ()
         return not self.operation.shows_project or scopes.allows(held, "read", project)
 
 
 @dataclass(frozen=True, slots=True)
 class BodyTarget:
-    """Target of a request with a body: the project in which the caller needs a role, or the attempt."""
+    """Object that a request with a body is for: a project, by its name, or an attempt, by the job's id and the fence.
+
+    The caller needs a role in the project, or must be the attempt.
+    """
 
     project: str | None = None
     attempt: tuple[str, int] | None = None
@@ -75,7 +78,7 @@ def admission_of(caller: Caller, target: BodyTarget) -> Admission:
 
 
 def require_access(operation: Operation, principal: Principal) -> None:
-    """Refuse callers who may not perform an operation on any object.
+    """Refuse callers who may not perform the operation at all, whatever the object.
 
     Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
     """
@@ -101,8 +104,10 @@ def require_access(operation: Operation, principal: Principal) -> None:
 
 
 def _require_attempt_access(operation: Operation, principal: Principal) -> None:
-    """Refuse all requests of an attempt except those to its own endpoints, for its inputs and for its files; after its
-    end, all except the repetition of its last request.
+    """Refuse requests that an attempt of a job may not send.
+
+    An attempt may use its own endpoints and read its inputs and files. After its end, it may only repeat its last
+    request.
     """
     if operation.access is Access.ANYONE:
         return
@@ -132,8 +137,9 @@ class Call:
 
 
 def run_call(call: Call, tx: Transaction) -> Rendered | Reply:
-    """Run the function of a request, only once for each idempotency key, and encode the answer, unless it is a
-    document.
+    """Run the function of a request, only once for each idempotency key, and encode the answer.
+
+    If the answer is a loaded document, it is returned without being encoded.
     """
     call.caller.identify(tx)
     if call.idempotency_key is not None:
@@ -174,7 +180,7 @@ def run_plain(caller: Caller, function: Callable[[Transaction], T], tx: Transact
 
 
 def idempotency_key(headers: HTTPHeaders) -> str | None:
-    """Return the key by which a repeated request is recognised, if there is one. Raises `BadRequestProblem`."""
+    """Return the header Idempotency-Key, or None if it is missing. Raises `BadRequestProblem` if it is malformed."""
     key = headers.get("Idempotency-Key")
     if key is not None and not _KEY.fullmatch(key):
         raise BadRequestProblem(
@@ -184,7 +190,7 @@ def idempotency_key(headers: HTTPHeaders) -> str | None:
 
 
 def fingerprint_of(request: HTTPServerRequest, body: bytes | bytearray) -> str:
-    """Return a digest of a request, which shows whether an earlier request with the same key was equal."""
+    """Return a digest of a request; two requests with the same idempotency key must have the same digest."""
     digest = hashlib.sha256(f"{request.method} {request.uri}\n".encode())
     digest.update(request.headers.get("Content-Type", "").encode() + b"\n")
     digest.update(body)

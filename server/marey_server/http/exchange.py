@@ -86,8 +86,9 @@ class Exchange(RequestHandler):
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
-        """Discard the part of a refused request's body that was received; if the body is too long, close the
-        connection.
+        """Discard the part of a refused request's body that was received.
+
+        Closes the connection if the body is too long.
         """
         if self.received_bytes > LINGER_BYTES:
             self.request.connection.close()  # type: ignore[union-attr]
@@ -95,8 +96,9 @@ class Exchange(RequestHandler):
     # -- the answer that goes -----------------------------------------------------------------------------------------
 
     def send(self, rendered: Rendered, *, whole_bytes: int | None = None) -> None:
-        """Set status, headers and body of the response; `body` is only the beginning if the whole body has
-        `whole_bytes` bytes.
+        """Set status, headers and body of the response.
+
+        If `whole_bytes` is given, `body` is only the beginning of a body with this number of bytes.
         """
         self.set_status(rendered.status)
         for name, value in rendered.headers.items():
@@ -137,7 +139,7 @@ class Exchange(RequestHandler):
         return self._gone
 
     def is_awaited(self) -> bool:
-        """Return whether the client is still connected and the server has time to answer."""
+        """Return whether the client is still connected and the server is not stopping."""
         return not self._gone and not self.services.draining.is_set()
 
     async def pause(self, seconds: float) -> bool:
@@ -171,8 +173,10 @@ class Exchange(RequestHandler):
         """Return no tag: resources set their own ETags; hashing an answer, as Tornado does, costs more than sending."""
 
     def send_error(self, status_code: int = 500, **kwargs: Any) -> None:
-        """Answer an error; if a part of another answer is sent already, close the connection, which shows the client
-        that the answer is incomplete.
+        """Answer with an error document.
+
+        If a part of another answer is sent already, close the connection instead, so that the client notices that the
+        answer is incomplete.
         """
         if not self._headers_written:
             super().send_error(status_code, **kwargs)
@@ -213,8 +217,9 @@ class Exchange(RequestHandler):
 
 
 def forwarded_address(header: str, hops: int) -> str | None:
-    """Return the address that the outermost of `hops` trusted proxies appended to a header; None if the header has too
-    few addresses.
+    """Return the address that the outermost of `hops` trusted proxies appended to a header.
+
+    Returns None if the header has too few addresses.
     """
     entries = [entry.strip() for entry in header.split(",")]
     try:

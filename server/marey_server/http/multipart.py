@@ -79,7 +79,10 @@ class MultipartReader:
         )
 
     def feed(self, data: bytes) -> list[Piece]:
-        """Return the events completed by the next bytes. Raises `BadRequestProblem` or `TooLargeProblem`."""
+        """Return the heads, pieces and ends of parts that the next bytes complete.
+
+        Raises `BadRequestProblem` or `TooLargeProblem`.
+        """
         if self._preamble is not None:
             data = self._skip_preamble(self._preamble + data)
         try:

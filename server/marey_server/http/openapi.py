@@ -125,7 +125,7 @@ class _Models:
         return dict(self._refs[model, "serialization"])
 
     def partial(self, model: type[BaseModel]) -> Schema:
-        """Return a `$ref` to a new schema: that of the model in answers, but without required fields."""
+        """Return a `$ref` to a new schema: the model's schema in answers, but without required fields."""
         name = f"Some{model.__name__}"
         full = self.components[self.writing(model)["$ref"].rpartition("/")[2]]
         self.components[name] = {key: value for key, value in full.items() if key != "required"} | {"title": name}

@@ -95,8 +95,9 @@ class AnswerForm:
 
 
 def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
-    """Load the content of a reply with a `Lasting` document, unless the client or the cache has it; must be called in
-    the transaction.
+    """Load the content of a reply with a `Lasting` document, unless the client or the cache has it already.
+
+    Must be called in the transaction.
     """
     content = reply.content
     if not isinstance(content, Lasting):
@@ -114,8 +115,9 @@ def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Return the bytes of a settled reply; if the client already has this state in this form, return status 304 without
-    a body.
+    """Return a settled reply with its content as bytes.
+
+    If the client already has this state in this form, the status is 304 and there is no body.
     """
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:

@@ -210,7 +210,7 @@ class Resource(Exchange):
             self._in_children.discard(task)
 
     async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Like `compute_in_child`, but also count the request with `using_children` during the call.
+        """Call a function in a child process as `compute_in_child` does, and count the request during the call.
 
         Raises `UnavailableProblem` if too many requests use child processes or wait for one.
         """

@@ -24,7 +24,10 @@ IMMUTABLE = "private, max-age=31536000, immutable"
 
 @dataclass(frozen=True, slots=True)
 class ByteRange:
-    """Range of bytes: from `first` to `last`; if `first` is None, the final `last` bytes."""
+    """Range of bytes from `first` to `last`, both included.
+
+    If `last` is None, the range ends with the last byte; if `first` is None, it consists of the final `last` bytes.
+    """
 
     first: int | None
     last: int | None

@@ -1,4 +1,4 @@
-"""Commands on annotations, and conversion of the predecessor's documents into annotations."""
+"""Commands on annotations, and conversion of the annotation files of Marey's predecessor."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def _changed(found: FoundAnnotation, change: AnnotationChange) -> PreparedDocume
 
 
 def prepare_annotation(clip: AnnotatedClip, given: AnnotationImport) -> ItemCreate:
-    """Convert a document of the predecessor into an annotation of a clip, in the clip's folder.
+    """Convert a document of Marey's predecessor into an annotation of a clip, to be created in the clip's folder.
 
-    Raises `InvalidProblem`.
+    Raises `InvalidProblem` if the document is not a valid annotation of this clip.
     """
     with LOADING:
         from marey_motion import documents

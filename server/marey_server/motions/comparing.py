@@ -54,7 +54,7 @@ class ComparedSide:
 
 @dataclass(frozen=True, slots=True)
 class DifferenceSource:
-    """The two sides of a difference."""
+    """The two revisions of a comparison, with the documents to compare."""
 
     kind: Kind
     before: ComparedSide
@@ -62,7 +62,7 @@ class DifferenceSource:
 
 
 class SideOrder(Message):
-    """One side of an order: its documents as bytes."""
+    """One of the two revisions of a `DifferenceOrder`, with its documents as bytes."""
 
     place: ComparedRevision
     parts: dict[str, bytes]
@@ -194,7 +194,10 @@ DESCRIBED: dict[str, frozenset[str]] = {
 
 
 def _changed_fields(before: Mapping[str, Tree], after: Mapping[str, Tree]) -> list[FieldChange]:
-    """List changed values in the parts that both revisions have, except the members in `DESCRIBED`."""
+    """List the values that differ between the revisions, in the parts that both have.
+
+    Members in `DESCRIBED` are left out, because `_described` compares them.
+    """
     from marey_motion.difference.fields import changed_values
 
     found: list[FieldChange] = []

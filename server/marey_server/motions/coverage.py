@@ -49,7 +49,7 @@ ADVANCE_COVERAGE = "marey_server.motions.coverage:advance_coverage"
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """Documents that a new stream refers to, with their revisions."""
+    """Documents that a new stream refers to, and the revisions to which they belong."""
 
     skeleton: Tree | None = None
     rig: bytes | None = None
@@ -58,7 +58,10 @@ class Given:
 
 
 class BeginOrder(Message):
-    """Order to start a stream. `measured` is the encoded part `evaluation` of the evaluation to which it refers."""
+    """Order to start a stream.
+
+    If the stream starts from an evaluation, `measured` is the encoded part `evaluation` of this evaluation.
+    """
 
     request: CoverageStreamCreate
     skeleton: Tree | None
@@ -283,8 +286,9 @@ def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrame
 
 
 def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
-    """Convert to single precision, as clips are stored; values that are too large become infinite and are refused
-    later.
+    """Convert numbers to single precision, in which clips are stored.
+
+    Values that are too large become infinite, and are refused later.
     """
     with np.errstate(over="ignore"):
         return None if array is None else array.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Export of annotations, models with their trees, and graphs to the predecessor's file formats."""
+"""Export of annotations, models with their trees, and graphs to the file formats of Marey's predecessor."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PARTS_OF: dict[Kind, tuple[str, ...]] = {Kind.MODEL: ("model", "tree"), Kind.PRO
 
 @dataclass(frozen=True, slots=True)
 class PredecessorOptions:
-    """Options of the predecessor's formats.
+    """Options of the file formats of Marey's predecessor.
 
     `end_index` and `form` apply to annotations, `layout` to models. By default, an unchanged model has the layout of
     its imported file; other models have layout 3. `part` selects a model or its tree, or the alignment of an aligned
@@ -74,7 +74,7 @@ def _if_unchanged(part: str, document: Mapping[str, Any] | None, known: StoredOr
 def write_predecessor(
     kind: Kind, name: str, parts: Parts, hierarchy: Mapping[str, Any] | None, options: PredecessorOptions
 ) -> tuple[str, bytes]:
-    """Return the name and the bytes of a file in a format of the predecessor.
+    """Return the name and the bytes of a file in a format of Marey's predecessor.
 
     Raises `InvalidProblem` if the item has no such file, and `NotFoundProblem` for a model without a tree.
     """
@@ -116,7 +116,7 @@ def _annotation(part: Mapping[str, Any], options: PredecessorOptions) -> bytes:
 
 
 def _alignment(part: Mapping[str, Any]) -> bytes:
-    """Return the predecessor's alignment file: the time function, and the sections between keyframes.
+    """Return the alignment file of Marey's predecessor: the time function, and the sections between keyframes.
 
     Sections are ranges of frames on the canonical timeline.
     """

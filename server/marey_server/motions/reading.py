@@ -97,7 +97,7 @@ class ReadDraft(Message):
 
 
 class ReadGraph(Message):
-    """Graph of models, read from a file of the predecessor.
+    """Graph of models, read from a file of Marey's predecessor.
 
     Each node is the tuple of its action, name, model id, type and transitions.
     """
@@ -147,8 +147,9 @@ class MappingOrder(Message):
 
 
 def load() -> None:
-    """Load the modules and kernels that child processes need; compiling missing kernels takes far longer than reading a
-    file.
+    """Load the modules and kernels that child processes need.
+
+    This is done in advance, because compiling missing kernels takes far longer than reading a file.
     """
     compile_kernels(["files", "editing", "searches", "coverage"])
 

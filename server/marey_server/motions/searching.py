@@ -1,4 +1,4 @@
-"""Models that requests search for motions, with their trees: read in a transaction, parsed and cached in a child."""
+"""Models in which requests search for motions, and their trees: read in a transaction, parsed and cached in a child."""
 
 from __future__ import annotations
 

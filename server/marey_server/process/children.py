@@ -1,8 +1,8 @@
-"""Child processes in which the server reads untrusted files and computes; their number is limited, and users share them
-fairly.
+"""Child processes in which the server reads untrusted files and computes.
 
-Each child has a thread, which starts it, sends it one order after another, and replaces it. When a child is free, it
-gets an order of the caller who uses the fewest children; no caller can use all of them.
+Their number is limited, and users share them fairly. Each child has a thread, which starts it, sends it one order after
+another, and replaces it. When a child is free, it gets an order of the caller who uses the fewest children; no caller
+can use all of them.
 """
 
 from __future__ import annotations
@@ -170,8 +170,9 @@ class Children:
         read: Callable[[bytes], T],
         count_stop: Callable[[str, str], None],
     ) -> ChildTask[T]:
-        """Call `function` (`module:name`) in a child with the result of `make`; `read` converts the answer to the
-        result of the task.
+        """Call `function` (`module:name`) in a child process.
+
+        `make` returns the argument as bytes; `read` converts the answer to the result of the task.
         """
         task = ChildTask(caller, function, make, read, count_stop)
         with self._changed:

@@ -1,7 +1,7 @@
-"""Periodic work of the server: reclaims expired leases, shares cached results with waiting jobs, and deletes old or
-unreferenced data.
+"""Periodic work of the server.
 
-Only the leading process does it, but concurrent housekeeping would be safe, because every statement repeats its
+It reclaims expired leases, shares cached results with waiting jobs, and deletes old or unreferenced data. Only the
+leading process does this work, but concurrent housekeeping would be safe, because every statement repeats its
 conditions. Each kind of work runs in a separate task, so that a failure does not affect the others.
 """
 

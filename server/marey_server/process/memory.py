@@ -1,6 +1,4 @@
-"""Limit on the memory of all requests together: bodies while they are received and decoded, and answers until they are
-sent.
-"""
+"""Limit on the memory of all requests: of bodies until they are decoded, and of answers until they are sent."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class PasswordLane:
 
     @contextmanager
     def place(self, address: str) -> Iterator[None]:
-        """Count a request inside the block.
+        """Count a request of an address while the `with` block runs.
 
         Raises `TooManyRequestsProblem` if the address already has too many requests here, and `UnavailableProblem` if
         there are too many in total.

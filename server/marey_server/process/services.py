@@ -109,7 +109,7 @@ class Services:
         self.metrics.database_connections.set_function(lambda: self.database.connections_in_use)
 
     def note_faults(self, faults: Sequence[str]) -> None:
-        """Log the reasons why the server is not ready, once until they change, and log when it is ready again."""
+        """Log the reasons why the server is not ready, each time that they change, and log when it is ready again."""
         if list(faults) != self._faults:
             self._faults = list(faults)
             if faults:

@@ -59,7 +59,7 @@ class UploadHashes:
         self._lock = threading.Lock()
 
     def add(self, upload_id: str, offset: int, data: bytes) -> None:
-        """Hash a stored piece if it follows the hashed bytes; otherwise `finish` hashes it."""
+        """Hash a stored piece if it directly follows the bytes that are hashed; otherwise leave it to `finish`."""
         running = self._running(upload_id)
         with running.lock:
             if running.offset == offset:

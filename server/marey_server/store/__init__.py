@@ -1,4 +1,5 @@
-"""Store of rows and bytes; all SQL of the server is in this package.
+"""Database and blob storage; all SQL of the server is in this package.
 
-A service function takes a `Transaction` first, authorises the transaction's principal, and does one thing.
+A public function takes a `Transaction` as its first argument, checks that the transaction's principal may do what it
+does, and does one thing.
 """

@@ -35,7 +35,10 @@ class BlobBacking(Protocol):
         ...
 
     def read(self, connection: Connection, digest: str, start: int, stop: int) -> Iterator[bytes]:
-        """Yield bytes `start` to `stop` in pieces of at most `CHUNK_BYTES`; fewer bytes if the backing lost some."""
+        """Yield bytes `start` to `stop` of a blob in pieces of at most `CHUNK_BYTES`.
+
+        If the backing has lost some of the bytes, fewer are yielded.
+        """
         ...
 
     def release(self, connection: Connection, digest: str) -> None:
@@ -43,11 +46,11 @@ class BlobBacking(Protocol):
         ...
 
     def stray_digests(self, *, older_than_s: float) -> Iterator[str]:
-        """Yield digests of bytes that may have no row and were written before a given time."""
+        """Yield digests of stored bytes that may have no row in `blob` and were written before a given time."""
         ...
 
     def remove_stray(self, digest: str) -> None:
-        """Remove bytes that have no row."""
+        """Remove stored bytes that have no row in `blob`."""
         ...
 
     def new_copy(self) -> Path | None:
@@ -55,8 +58,9 @@ class BlobBacking(Protocol):
         ...
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Turn the complete copy of an upload into the stored bytes of a blob, in the transaction that inserts the
-        blob's row.
+        """Turn the complete copy of an upload into the stored bytes of a blob.
+
+        This is called in the transaction that inserts the blob's row.
         """
         ...
 
@@ -144,7 +148,7 @@ class DatabaseBlobs:
 
     def adopt(self, copy: Path, digest: str) -> None:
         """Raise `AssertionError`: this backing makes no copies."""
-        raise AssertionError(f"got the copy {copy} of {digest}, but the database makes blobs of uploaded pieces")
+        raise AssertionError(f"got the copy {copy} of the blob {digest}, but a database needs no copies of uploads")
 
     def check_writable(self) -> None:
         """Do nothing: the server checks the database separately."""
@@ -219,8 +223,9 @@ class DirectoryBlobs:
         return Path(name)
 
     def adopt(self, copy: Path, digest: str) -> None:
-        """Sync a copy and rename it to the file of the blob; do nothing if an earlier try of the same transaction did
-        so.
+        """Sync a copy and rename it to the file of the blob.
+
+        Does nothing if an earlier try of the same transaction has done so.
         """
         path = self._path(digest)
         path.parent.mkdir(exist_ok=True)

@@ -1,6 +1,4 @@
-"""Blobs: bytes named by their SHA-256, stored once, with the rules for access to them
-(docs/decisions/0006, 0021).
-"""
+"""Blobs: bytes named by their SHA-256 and stored once, and the rules for access to them (docs/decisions/0006, 0021)."""
 
 from __future__ import annotations
 
@@ -50,8 +48,9 @@ RENEW_US = GRACE_US // 2
 
 
 class Spool:
-    """Temporary storage of bytes that are being received, with their running hash: 1 MiB in memory, then an unnamed
-    file.
+    """Temporary storage of bytes that are being received, with their running hash.
+
+    The first 1 MiB is kept in memory; a longer body is written to an unnamed file.
     """
 
     def __init__(self, directory: str | None = None) -> None:

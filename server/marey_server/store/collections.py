@@ -27,7 +27,10 @@ _ALIVE = collection.c.deleted_us.is_(None)
 
 
 def ensure(tx: Transaction, project_row: ProjectRow, path: str) -> str:
-    """Return the id of the collection at `path`, created with its parents if missing, and locked against deletion."""
+    """Return the id of the collection at `path`, and lock it against deletion.
+
+    The collection and its parents are created if they are missing.
+    """
     check_length(path)
     found = _lock(tx, project_row.id, path)
     while found is None:

@@ -110,7 +110,7 @@ def prepared(content: Any, *, schema: str | None = None) -> PreparedDocument:
 
 
 def with_body(content: PreparedDocument, body: Tree) -> PreparedDocument:
-    """Return the document with another body and the same arrays and files."""
+    """Return the document with another JSON body and the same arrays and files."""
     return replace(content, digest=digest_of_body(body), body=body)
 
 

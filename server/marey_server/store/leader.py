@@ -9,8 +9,9 @@ from marey_server.store.transaction import Transaction
 
 
 def take_lead(tx: Transaction, name: str, holder: str, ttl_us: int) -> int | None:
-    """Become or stay the leader for the task `name` during `ttl_us`; return the fence, or None if another process is
-    the leader.
+    """Become or stay the leader for the task `name` during `ttl_us`.
+
+    Returns the fence, or None if another process is the leader.
     """
     free = or_(leader.c.holder == holder, leader.c.expires_us <= tx.now_us)
     renewed = tx.execute(

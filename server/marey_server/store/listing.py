@@ -40,7 +40,10 @@ class Order:
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:
-        """Return the condition for rows after the one with these values; its first term is a range of an index."""
+        """Return the condition for the rows after the row with these values.
+
+        Its first term restricts the first column to a range, so that an index can be used.
+        """
         (first, falls), *rest = self.columns
         beyond: ColumnElement[bool] = first < values[0] if falls else first > values[0]
         if not rest:

@@ -159,8 +159,9 @@ def _row(row: Row[Any], role: Role, *, guest: bool) -> ProjectRow:
 
 
 def is_visible(principal: Principal) -> ColumnElement[bool]:
-    """Return the condition for rows of `project` that are not deleted and that the caller may read; attempts may read
-    none.
+    """Return the condition for rows of `project` that are not deleted and that the caller may read.
+
+    Attempts of jobs may read none.
     """
     alive = project.c.deleted_us.is_(None)
     if principal.kind == "attempt":

@@ -52,10 +52,10 @@ _RULES = {
 
 
 def require_room(tx: Transaction, quota: str, more: int = 1) -> None:
-    """Check that the caller can add `more` without exceeding a quota; concurrent checks of one user run one after
-    another.
+    """Check that the caller can add `more` without exceeding a quota.
 
-    `quota` is a field of `Quotas`. The server and attempts of jobs have no quotas. Raises `QuotaExceededProblem`.
+    `quota` is a field of `Quotas`. The server and attempts of jobs have no quotas. Concurrent checks of one user run
+    one after another. Raises `QuotaExceededProblem`.
     """
     user_id = tx.principal.user_id
     if user_id is None or tx.principal.kind != "user":

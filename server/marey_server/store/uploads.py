@@ -1,9 +1,8 @@
-"""Resumable uploads: bytes that are sent in pieces, over several connections if necessary, and become a blob at the
-end.
+"""Resumable uploads: bytes that are sent in pieces, over several connections if necessary, and form a blob at the end.
 
 Pieces are stored in rows. The offset is updated by compare-and-swap, so that two senders cannot interleave. No
-transaction reads, hashes or copies all bytes: `UploadHashes` does so outside, and a finished upload keeps its pieces
-as those of its blob (docs/decisions/0029-large-blobs.md).
+transaction reads, hashes or copies all bytes: `UploadHashes` does this outside of transactions, and the pieces of a
+finished upload are kept as the pieces of its blob (docs/decisions/0029-large-blobs.md).
 """
 
 from __future__ import annotations
@@ -42,8 +41,9 @@ _HAS_BLOB = exists().where(blob.c.upload_id == upload.c.id)
 
 @dataclass(frozen=True, slots=True)
 class StoredUpload:
-    """State of an upload; `digest` is set once the upload is a blob, `actual_digest` if its bytes do not have the
-    announced digest.
+    """State of an upload.
+
+    `digest` is set once the upload is a blob; `actual_digest` is set if its bytes do not have the announced digest.
     """
 
     id: str

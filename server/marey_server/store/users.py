@@ -66,7 +66,10 @@ def find_user(tx: Transaction, name: str) -> User:
 def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
     """Return a user's number of items and bytes, with the limits; only administrators and this user may read them."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
-        raise ForbiddenProblem("The token does not allow reading in all projects.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            "This needs a token with the scope 'read' for all projects, because quotas count items of every project.",
+            code="insufficient-scope",
+        )
     return quotas.show_quotas(tx, "user", find_user(tx, name).id)
 
 

@@ -206,7 +206,10 @@ class JobOutputs(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=JobOutput, paged=True)
     async def get(self, job: str, query: PageQuery) -> Rendered:
-        """List the revisions created by a job or its tasks; for tasks, a page contains the outputs of `limit` tasks."""
+        """List the revisions created by a job or its tasks.
+
+        If the job has tasks, a page contains the outputs of `limit` tasks.
+        """
         return await self.answer(reading.list_outputs, job, query.cursor, query.limit)
 
 

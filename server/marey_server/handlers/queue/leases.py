@@ -115,8 +115,9 @@ class AttemptLog(Resource):
         headers=("Upload-Offset",),
     )
     async def post(self, job: str, fence: int, body: bytes | None) -> Rendered:
-        """Append to the attempt's log at the offset `Upload-Offset`; if this is not the end of the log, the answer is
-        409 with the right offset.
+        """Append to the attempt's log at the offset `Upload-Offset`.
+
+        If this is not the end of the log, the answer is 409 with the right offset.
         """
         text = self.request.headers.get("Upload-Offset", "")
         if not (text.isascii() and text.isdigit() and len(text) <= 15):
@@ -140,8 +141,9 @@ class AttemptOutputs(Resource):
         answer=StageAnswer,
     )
     async def post(self, job: str, fence: int, body: StageRequest) -> Rendered:
-        """Upload outputs, which become visible when the attempt completes; an output replaces an earlier one of the
-        same name.
+        """Upload outputs, which become visible when the attempt completes.
+
+        An output replaces an earlier one of the same name.
         """
         prepared = await self.compute(partial(_prepare, body))
         return await self.answer_with(

@@ -45,11 +45,12 @@ class ReceivedContents(Resource):
         answer=StoredRevisions,
     )
     async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
-        """Store revisions, so that commits from elsewhere can refer to them.
+        """Store revisions from an archive or another server, so that received commits can refer to them.
 
-        A revision must come after those that it refers to, which are named by their content digests. The revision of
-        an entry gets an item that is deleted at once; a checkout of a version with the entry restores the item. Other
-        revisions get items in the folder `imported`. Deleted items count in no quota, so the role is maintainer.
+        A revision must come after those that it refers to, which are named by their content digests. The revision of an
+        entry gets an item that is deleted at once; a checkout of a version with the entry restores the item. Other
+        revisions get items in the folder `imported`. Because quotas do not count deleted items, only maintainers may do
+        this.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)
@@ -69,10 +70,11 @@ class ReceivedCommits(Resource):
         status=201,
     )
     async def post(self, project: str, dataset: str, body: ReceivedCommit) -> Rendered:
-        """Record a commit from elsewhere, with its author and time, so that it keeps its digest.
+        """Record a commit from an archive or another server, with its author and time, so that it keeps its digest.
 
         The server applies the changes to the first parent, and refuses the commit if its tree differs from the result.
-        No branch moves, except one without commits that is to begin at the commit. Merge the commit to move another.
+        A branch without commits can be set to the commit; no other branch moves. To add the commit to another branch,
+        merge it.
         """
         prepared = await self.look_up(datasets.prepare_receipt, project, dataset, body)
         return await self.answer(datasets.record_receipt, project, dataset, body, prepared)

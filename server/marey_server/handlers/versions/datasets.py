@@ -104,20 +104,20 @@ class DatasetRef(Resource):
 
 
 class BranchProtection(Resource):
-    """Rule of a branch."""
+    """Protection rule of a branch."""
 
     path = "/projects/{project}/datasets/{dataset}/refs/{ref}/protection"
     tag = "ProjectDatasets"
 
     @writes(access=Access.MAINTAINER, body=ProtectionRule, answer=Ref, etag=True, precondition="required")
     async def put(self, project: str, dataset: str, ref: str, body: ProtectionRule) -> Rendered:
-        """Protect a branch, or replace its rule. A protected branch can be neither deleted nor reset."""
+        """Protect a branch, or replace its protection rule. A protected branch can be neither deleted nor reset."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.protect_branch, project, dataset, ref, body, expected_rev=expected_rev)
 
     @writes(access=Access.MAINTAINER, answer=Ref, etag=True, precondition="required")
     async def delete(self, project: str, dataset: str, ref: str) -> Rendered:
-        """Remove the rule of a branch."""
+        """Remove the protection rule of a branch."""
         expected_rev = self.precondition.expected_rev
         return await self.answer(datasets.protect_branch, project, dataset, ref, None, expected_rev=expected_rev)
 

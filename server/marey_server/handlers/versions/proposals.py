@@ -106,7 +106,10 @@ class WaitingProposal(Resource):
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Run `function` with the merge that is prepared if the proposal waits; if branches move, prepare it again."""
+        """Run `function` with the prepared merge of a waiting proposal.
+
+        If a branch has moved since the merge was prepared, prepare it and run `function` again.
+        """
         for _ in range(TRIES - 1):
             try:
                 return await self._try(function, project, dataset, proposal, body)

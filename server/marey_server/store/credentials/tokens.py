@@ -277,9 +277,9 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
-    any of these, and so on. Without `with_created`, only this token is revoked. The tokens created with it are then
-    recorded as created with the token that created it, and its successor as the successor of its predecessor. A token
-    may always revoke itself.
+    any of these, and so on. Without `with_created`, only this token is revoked, and the records that refer to it are
+    corrected: the tokens created with it are recorded as created with its own creator, and its successor becomes the
+    successor of its predecessor. A token may always revoke itself.
     """
     principal = tx.principal
     if principal.kind != "user" or token_id != principal.token_id:

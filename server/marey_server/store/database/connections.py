@@ -216,9 +216,10 @@ class Database:
     def queue_write(
         self, client: Client, principal: Principal, function: Callable[[Transaction], T], *, reserved: bool = False
     ) -> Future[T]:
-        """Run `write` for a client in a thread; on SQLite, reserved writes come before those that wait.
+        """Run `write` for a client in a thread; on SQLite, a reserved write runs before the other waiting writes.
 
-        It runs even if the client has closed the connection. Raises `UnavailableProblem` if too many wait.
+        The write runs even if the client has closed the connection. Raises `UnavailableProblem` if too many writes
+        wait.
         """
         client = Client(client.key, client.known)
         if self._write_lane is not None:
@@ -332,8 +333,9 @@ _TRY_AGAIN = ("40001", "40P01")
 
 
 def _translated(error: Exception) -> Exception:
-    """Return an error of the server for failures of the database to which the caller can react; return other failures
-    unchanged.
+    """Convert a failure of the database to which the caller can react to an error of the server.
+
+    Other failures are returned unchanged.
     """
     if isinstance(error, OSError):
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)

@@ -105,7 +105,7 @@ class FairLine(Generic[T]):
         self._lengths[client.known] += 1
 
     def take(self, may_run: Callable[[Client], bool] = lambda _client: True) -> T | None:
-        """Remove and return the next element of a client that may run, or None if there is none."""
+        """Remove and return the next element of any client that may run one more; None if there is none."""
         for group in (self._next_group, not self._next_group):
             for key, line in self._groups[group].items():
                 client, one = line[0]

@@ -70,7 +70,10 @@ class Prepared:
 
 
 def padded(values: Iterable[T]) -> list[T]:
-    """Repeat the last value of a list for `IN` up to a power of two, so that few list lengths are compiled."""
+    """Extend a list for `IN` to a length that is a power of two, by repeating its last value.
+
+    So statements are compiled for few lengths only.
+    """
     known = list(values)
     return known + known[-1:] * ((1 << max(len(known) - 1, 0).bit_length()) - len(known))
 
@@ -174,8 +177,9 @@ def _run(connection: Connection, text: str, values: Any, *, gives_rows: bool = F
 
 
 def _failure(connection: Connection, text: str, error: Exception) -> Exception:
-    """Convert an error of the driver to one of SQLAlchemy; if the connection broke, also discard the idle connections
-    of the pool.
+    """Convert an error of the driver to one of SQLAlchemy.
+
+    If the connection broke, also discard the idle connections of the pool.
     """
     dialect = connection.dialect
     lost = dialect.is_disconnect(error, connection.connection, None)  # type: ignore[arg-type]

@@ -107,7 +107,7 @@ class _Checkout:
             self._add(one, documents)
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """For each content digest, return an item with the documents of its revision that has this content."""
+        """Return, for each content digest, an item and the documents of its revision with this content."""
         held = revisions_with(self.tx, self.project.id, {entry.content for entry in entries})
         parts = read_part_digests(self.tx, set(held.values()))
         return {content: (key[0], parts[key]) for content, key in held.items()}

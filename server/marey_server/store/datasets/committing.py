@@ -129,7 +129,10 @@ def record_commit(
 
 
 def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
-    """Move a branch to a commit that follows the newest one that the branch had when the move was prepared."""
+    """Move a branch from the commit that it had when the move was prepared to a commit that follows.
+
+    Raises `ConflictProblem` if the branch has moved meanwhile, and the errors of `require_move`.
+    """
     moved = (
         update(dataset_ref)
         .where(
@@ -148,7 +151,10 @@ def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover
 
 
 def recorded_as(tx: Transaction, dataset_id: str, write_id: str | None) -> str | None:
-    """Return the commit that a request with this `write_id` has recorded or moved a branch to, or None."""
+    """Return the commit that an earlier request with this `write_id` recorded, or to which it moved a branch.
+
+    Returns None if there is no such request.
+    """
     if write_id is None:
         return None
     for table in (dataset_commit, fast_forward):
@@ -176,7 +182,7 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
 
 
 def branch_moved(branch: str, head: str | None) -> ConflictProblem:
-    """Return the error for a branch that has another newest commit than expected; `context.commit` is its digest."""
+    """Return the error for a branch whose newest commit is not the expected one; `context.commit` is its digest."""
     return ConflictProblem(
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
         code=BRANCH_MOVED,

@@ -43,7 +43,10 @@ def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents
 
 
 def _in_order(waiting: Mapping[RevisionKey, _Waiting]) -> list[RevisionKey]:
-    """Sort revisions so that each comes after those that it refers to; a circle of references may begin anywhere."""
+    """Sort revisions so that each comes after those that it refers to.
+
+    If references form a circle, the order inside the circle is arbitrary.
+    """
     ordered: dict[RevisionKey, None] = {}
     entered: set[RevisionKey] = set()
     path = list(waiting)

@@ -80,7 +80,7 @@ def list_commits(
     """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
 
     With `path`, list only the commits that changed the entries at this path or below it, compared with their first
-    parent. A page ends after `MOST_EXAMINED` commits, so it may be shorter than `limit` although others follow.
+    parent. A page ends after `MOST_EXAMINED` commits, so it may have fewer than `limit` commits although more follow.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
     order = listing.parse_order("place", {"place": literal(0)}, unique="place")
@@ -182,7 +182,7 @@ class CommitReader:
         self._known: dict[str, _ReadCommit] = {}
 
     def read(self, digest: str) -> _ReadCommit:
-        """Return a commit that exists."""
+        """Return a commit, which must exist."""
         if digest not in self._known:
             of_dataset = (dataset_commit.c.dataset_id == self._dataset_id, dataset_commit.c.digest == digest)
             row = self._tx.execute(select(dataset_commit).where(*of_dataset)).one()
@@ -197,7 +197,7 @@ class CommitReader:
 def list_entries(
     tx: Transaction, project: str, name: str, version: str, *, path: str, cursor: str | None, limit: int
 ) -> Page:
-    """List the entries of a version by path: all, or those at a path and below it."""
+    """List the entries of a version in the order of their paths; with `path`, only those at this path and below it."""
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     commit = _commit(tx, row.id, resolve(tx, row.id, version))
@@ -265,7 +265,10 @@ def shown_entry(entry: DatasetEntry, held: Mapping[str, tuple[str, int]]) -> Ent
 
 
 def revisions_with(tx: Transaction, project_id: str, contents: Iterable[str]) -> dict[str, tuple[str, int]]:
-    """Find a revision of the project for each content digest, of a deleted item only if there is no other."""
+    """Find, for each content digest, a revision of the project that has this content.
+
+    A revision of a deleted item is used only if no other item has the content.
+    """
     wanted = sorted(set(contents))
     found: dict[str, tuple[str, int]] = {}
     for start in range(0, len(wanted), IN_LIST):

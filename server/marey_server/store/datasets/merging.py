@@ -141,7 +141,9 @@ def _combine(
     merged = merge_entries(mine, their, resolutions)
     if unknown := sorted(resolutions.keys() - merged.decided):
         path, kind = path_and_kind(unknown[0])
-        raise InvalidProblem(f"There is no conflict at {path!r} of the kind {kind} to decide.", code="no-conflict")
+        raise InvalidProblem(
+            f"The {kind} at {path!r} is not in conflict; remove its resolution from the request.", code="no-conflict"
+        )
     tree = change(store, ours, merged.changes)
     held = revisions_with(tx, project_id, _contents(merged.conflicts))
     conflicts = sorted(merged.conflicts, key=lambda one: one.key)
@@ -206,7 +208,7 @@ def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConf
 
 
 def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | None:
-    """Return the merge base: the nearest common commit of two commits, None if they have none in common.
+    """Return the merge base of two commits: their nearest common ancestor, or None if they have none.
 
     Raises `ConflictProblem` if there are several merge bases, none of which is an ancestor of another.
     """

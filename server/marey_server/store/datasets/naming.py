@@ -146,13 +146,16 @@ def list_refs(tx: Transaction, project: str, name: str, *, cursor: str | None, l
 
 
 def find_ref(tx: Transaction, dataset_id: str, name: str, *, lock: bool = False) -> Row[Any] | None:
-    """Return the row of a branch or tag, or None; with `lock`, it stays as it is until the transaction ends."""
+    """Return the row of a branch or tag, or None; with `lock`, lock the row until the transaction ends."""
     statement = select(dataset_ref).where(dataset_ref.c.dataset_id == dataset_id, dataset_ref.c.name == name)
     return tx.execute(statement.with_for_update() if lock else statement).first()
 
 
 def lock_refs(tx: Transaction, dataset_id: str) -> None:
-    """Let no other transaction delete or protect a branch of the dataset, or open a proposal, until this one ends."""
+    """Let no other transaction delete or protect a branch of the dataset, or open a proposal.
+
+    The lock ends with this transaction.
+    """
     tx.lock(f"refs of {dataset_id}")
 
 
@@ -228,7 +231,7 @@ def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_r
 def protect_branch(
     tx: Transaction, project: str, name: str, branch: str, rule: ProtectionRule | None, *, expected_rev: ExpectedRev
 ) -> Ref:
-    """Set the rule of a branch; None removes it.
+    """Set the protection rule of a branch; None removes it.
 
     Raises `InvalidProblem` for a tag, and for a branch without commits, into which nothing can be merged.
     """

@@ -88,15 +88,17 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
     digest = local.documents.get(content, {}).get(part)
     if digest is None:
         raise InvalidProblem(
-            f"The revision {content} has no part {part!r} that {one.path!r} could use.", code="no-part"
+            f"The request takes the part {part!r} of {one.path!r} from the revision {content}, which has no such part.",
+            code="no-part",
         )
     return digest
 
 
 def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
-    """Store revisions, given by content digest; items of entries are deleted at once.
+    """Store received revisions; `drafts` maps the content digest of each to its draft.
 
-    Raises `InvalidProblem` if the documents of a revision have another content digest.
+    The items of revisions that are the content of entries are deleted at once (see the module). Raises `InvalidProblem`
+    if the content digest of a stored revision is not the one that the request gives.
     """
     project_row = projects.require(tx, project)
     folder = find_dataset(tx, project_row, name).path or ""
@@ -113,7 +115,8 @@ def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[st
     for content, key in keys.items():
         if contents.revisions[key] != content:
             raise InvalidProblem(
-                f"The documents of the revision {content} have the content digest {contents.revisions[key]}.",
+                f"The request gives a revision the content digest {content}, but its documents have the content digest "
+                f"{contents.revisions[key]}.",
                 code="other-content",
             )
     store_contents(tx, contents)
@@ -133,7 +136,7 @@ class PreparedReceipt:
 
 
 def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedCommit) -> PreparedReceipt:
-    """Compute the tree of a commit from elsewhere.
+    """Compute the tree of a commit from an archive or another server.
 
     Raises `ConflictProblem` if the dataset lacks a parent or the project a revision, and `InvalidProblem` if the
     changes do not give the tree that the commit names.
@@ -164,7 +167,7 @@ def _value(parts: Mapping[str, str] | None, tags: Iterable[str]) -> Value | None
 def record_receipt(
     tx: Transaction, project: str, name: str, request: ReceivedCommit, prepared: PreparedReceipt
 ) -> Commit:
-    """Record a commit from elsewhere; recording it again has no effect.
+    """Record a commit from an archive or another server; recording it again has no effect.
 
     If the request names a branch without commits, the branch is set to this commit. Raises `ConflictProblem` if the
     branch has other commits, and the errors of `require_move`.

@@ -1,4 +1,4 @@
-"""Reads annotations and their clips for editing commands, and writes the changed annotations."""
+"""Database access of the commands that edit annotations: reads the annotation and its clip, writes the new revision."""
 
 from __future__ import annotations
 
@@ -27,23 +27,27 @@ class FoundAnnotation:
 
 @dataclass(frozen=True, slots=True)
 class ChangedAnnotation:
-    """Result of commands on an annotation that was at `rev`: its new document, or the error of the command."""
+    """Result of editing an annotation whose item had the number `rev`: the new document, or the error of the edit."""
 
     rev: int
     made: PreparedDocument | ApiProblem
 
 
 def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotation:
-    """Read the annotation to change. Raises `NotFoundProblem`, and `InvalidProblem` if its clip does not exist."""
+    """Read an annotation in order to change it.
+
+    Raises `NotFoundProblem` if the annotation does not exist, and `InvalidProblem` if its clip does not exist.
+    """
     projects.require(tx, project)
     found = read_part(tx, project, Kind.ANNOTATION, item_id, "annotation")
     return FoundAnnotation(found.tree, found.rev, _frame_count(tx, project, found.tree["clip"]))
 
 
 def put_changed(tx: Transaction, project: str, item_id: str, changed: ChangedAnnotation, message: str) -> Item:
-    """Store the new revision of the annotation.
+    """Store the changed document as a new revision of the annotation.
 
-    Raises the error of the commands, if any, and `PreconditionFailedProblem` if the annotation was changed meanwhile.
+    Raises the error of the edit, if there was one, and `PreconditionFailedProblem` if another request has changed the
+    annotation meanwhile.
     """
     if isinstance(changed.made, ApiProblem):
         raise changed.made
@@ -61,7 +65,7 @@ class AnnotatedClip:
 
 
 def find_annotated_clip(tx: Transaction, project: str, item_id: str) -> AnnotatedClip:
-    """Read the clip to annotate. Raises `NotFoundProblem`."""
+    """Read the clip that is to be annotated. Raises `NotFoundProblem` if it does not exist."""
     item = read_item(tx, project, Kind.CLIP, item_id)
     return AnnotatedClip(item, int(item.summary["frames"]))
 

@@ -34,16 +34,16 @@ from marey_server.store.transaction import Transaction
 
 
 def prepare_parts(kind: Kind, parts: dict[str, Any]) -> dict[str, PreparedDocument]:
-    """Check and encode the documents of a request; `create_item` and `put_part` take the result instead of trees.
+    """Check and encode the documents of an item's parts, as `create_item` and `put_part` require.
 
-    This is the slow part of a write and needs no database. Raises `InvalidProblem` with pointers that start with the
-    part.
+    This is the slow part of a write and needs no database. Raises `InvalidProblem`; its JSON Pointers start with the
+    name of the part.
     """
     return {part: prepare_part(kind, part, tree) for part, tree in parts.items()}
 
 
 def prepare_part(kind: Kind, part: str, tree: Any) -> PreparedDocument:
-    """Check and encode the document of one part."""
+    """Check and encode the document of one part of an item."""
     spec = PARTS[kind].get(part)
     if spec is None:
         detail = f"A {kind} has no part {part!r}; it has {', '.join(PARTS[kind])}."
@@ -109,10 +109,10 @@ def put_part(
 def set_parts(
     tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, parts: Mapping[str, str], message: str
 ) -> None:
-    """Create a revision whose parts are exactly the given stored documents, unless the newest revision has these parts.
+    """Create a revision whose parts are exactly the given documents, unless the newest revision has them already.
 
-    The documents must come from the server itself, because the caller's access to them is not checked. Raises
-    `PreconditionFailedProblem` if another request changes the item.
+    The documents are stored already. They must come from the server itself, because the caller's access to them is not
+    checked. Raises `PreconditionFailedProblem` if another request changes the item.
     """
     found = find_item(tx, project_row, kind, item_id)
     before = read_part_digests(tx, [(item_id, found.head)])[item_id, found.head]
@@ -184,7 +184,7 @@ def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expe
 def restore_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None) -> Item:
     """Restore a deleted item, and its collection if that was deleted.
 
-    Raises `ConflictProblem` if another item has its name now.
+    Raises `ConflictProblem` if another item of the collection has the same name now.
     """
     project_row = projects.require(tx, project)
     gone = find_item(tx, project_row, kind, item_id, deleted=True)

@@ -12,7 +12,10 @@ from marey_server.store.documents import PreparedDocument
 
 @dataclass(frozen=True, slots=True)
 class StoredDocument:
-    """Digest of a stored document. It must come from the server itself, because the caller's access is not checked."""
+    """Digest of a stored document.
+
+    The digest must come from the server itself, because the caller's access to the document is not checked.
+    """
 
     digest: str
 
@@ -24,8 +27,9 @@ PartContent = PreparedDocument | StoredDocument | dict[str, Any]
 class Draft:
     """Content of an item or revision that is to be published.
 
-    `reuse`: `new` creates an item and refuses a name that is taken; `by_name` adds a revision to the item of that name,
-    or creates it; `by_content` uses any item of the project whose required parts are equal, or else creates one.
+    `reuse`: `new` creates an item and refuses a name that is taken; `by_name` adds a revision to the item that has the
+    name, or else creates an item; `by_content` uses any item of the project whose required parts are equal, or else
+    creates an item.
     """
 
     name_in_batch: str

@@ -72,7 +72,10 @@ def _shown(tx: Transaction, rows: Collection[Row[Any]]) -> list[Revision]:
 def read_lineage(
     tx: Transaction, project_name: str, kind: Kind, item_id: str, *, revision_number: int | None = None
 ) -> Lineage:
-    """Return the inputs, job and uses of a revision (default: the newest), as far as the caller may see them."""
+    """Return the inputs of a revision, the job that created it, and the revisions that were made from it.
+
+    Without `revision_number`, this is the newest revision. Items that the caller may not see are left out.
+    """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     number = revision_number or found.head
     made = find_revision(tx, item_id, number)
@@ -89,7 +92,10 @@ def read_lineage(
 
 
 def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[LineageEdge, ...]:
-    """Return the items and revisions at the other end of the lineage rows that meet `condition`."""
+    """Return the revisions that lineage rows refer to, for the rows that meet `condition`.
+
+    `other` and `number` are the columns of `lineage` that contain the item and the number of these revisions.
+    """
     statement = (
         select(other.label("item"), number.label("revision"), item.c.kind, item.c.name)
         .add_columns(lineage.c.job_id.label("job"), lineage.c.role)
@@ -103,10 +109,10 @@ def _edges(tx: Transaction, other: Any, number: Any, condition: Any) -> tuple[Li
 
 
 def read_staleness(tx: Transaction, project_name: str, kind: Kind, item_id: str) -> Staleness:
-    """Return whether an input of the newest revision, direct or indirect, has a newer revision.
+    """Return whether a direct or indirect input of the newest revision has a newer revision.
 
-    An input from the item itself, such as the model that its tree was computed from, does not count as outdated; the
-    search continues with the inputs of that revision.
+    An earlier revision of an item can be an input of the same item: the tree of a model is computed from its previous
+    revision. Such an input does not count as outdated, but its own inputs are examined.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     ancestry = (

@@ -31,7 +31,11 @@ Place = tuple[str, int]
 
 
 class _Ends(NamedTuple):
-    """The columns of `lineage` that name the known end of a link, and those that name its other end."""
+    """Columns of `lineage` for one direction of the search.
+
+    `item` and `number` contain the revision from which a step starts, the other two columns the revision that it
+    reaches.
+    """
 
     item: Column[Any]
     number: Column[Any]
@@ -49,10 +53,10 @@ _AT_ONCE = 500
 def read_lineage_graph(
     tx: Transaction, project_name: str, kind: Kind, item_id: str, request: LineageRequest
 ) -> LineageGraph:
-    """Return what a revision was made from, and what was made from it.
+    """Return the graph of the revisions that a revision was made from, and of those that were made from it.
 
-    Revisions that the caller may not read are left out, with all that only they lead to. The graph holds at most
-    `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
+    Revisions that the caller may not read are left out; so are the revisions that are linked only through them. The
+    graph holds at most `MOST_REVISIONS` revisions and `MOST_LINKS` links in each direction.
     """
     found = find_item(tx, projects.require(tx, project_name), kind, item_id)
     start = (item_id, request.revision or found.head)
@@ -98,7 +102,7 @@ class _LineageWalk:
                 return
 
     def _linked(self, places: Collection[Place], ends: _Ends) -> Iterator[Row[Any]]:
-        """Yield the links of revisions in one direction, of which the caller may read the other end."""
+        """Yield the links from the given revisions in one direction, if the caller may read the linked revision."""
         statement = (
             select(
                 ends.item.label("item_id"), ends.number.label("number"), ends.other_item.label("other_item"),
@@ -119,7 +123,7 @@ class _LineageWalk:
             yield from sorted(row for row in rows if (row.item_id, row.number) in wanted)
 
     def graph(self) -> LineageGraph:
-        """Return what was found, with the jobs."""
+        """Return the graph: the revisions that were found, the links between them, and the jobs that created them."""
         rows = dict(self._described())
         makers = self._makers({row.job_id for row in rows.values() if row.job_id is not None})
         parents = {name: row.parent_id or name for name, row in makers.items()}
@@ -155,7 +159,7 @@ class _LineageWalk:
                     yield (row.item_id, row.number), row
 
     def _makers(self, ids: Collection[str]) -> dict[str, Row[Any]]:
-        """Return the rows of the jobs and tasks with these ids by id."""
+        """Return the rows of the jobs and tasks that have the given ids, as a mapping from id to row."""
         columns = (job.c.id, job.c.parent_id, job.c.kind, job.c.seed, job.c.code_version, job.c.finished_us)
         found: dict[str, Row[Any]] = {}
         for some in _batches(sorted(ids)):
@@ -163,7 +167,10 @@ class _LineageWalk:
         return found
 
     def _jobs(self, makers: Mapping[str, Row[Any]], parents: Mapping[str, str]) -> Iterator[LineageJob]:
-        """Yield the jobs; the versions of code are those of the tasks that created revisions of the graph."""
+        """Yield the jobs of the graph.
+
+        The code versions of a parent job are those of its tasks that created revisions of the graph.
+        """
         whole = {**makers, **self._makers(set(parents.values()) - makers.keys())}
         commits = self._commits(set(parents.values()))
         versions: dict[str, set[str]] = defaultdict(set)
@@ -179,7 +186,10 @@ class _LineageWalk:
             )  # fmt: skip
 
     def _commits(self, ids: Collection[str]) -> dict[str, set[str]]:
-        """Return the commits that jobs and their tasks took inputs from by job, which may have 100,000 inputs."""
+        """Return, for each job, the commits of datasets from which the job or its tasks took inputs.
+
+        The database selects them, because a job may have 100,000 inputs.
+        """
         if self._tx.connection.dialect.name == "postgresql":
             named = func.jsonb_each(job.c.inputs).table_valued(column("key"), column("value", JSONB)).render_derived()
             listed = case((func.jsonb_typeof(named.c.value) == "array", named.c.value), else_=literal([], JSONB))

@@ -1,4 +1,4 @@
-"""Lists of items: filters, order, pages, and choice of fields."""
+"""Lists of items: filters, order, pages, and selection of fields."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SORT_KEYS: dict[str, ColumnElement[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class ItemFilters:
-    """Filters of a list of items; None matches every item."""
+    """Filters of a list of items; a filter that is None matches every item."""
 
     collection: str | None = None
     """Path of a folder; items in folders below it match, too."""
@@ -57,7 +57,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether the filters match only one name, or only names that begin with a text which itself ends in `*`."""
+        """Whether only one name can match, or only names that begin with a text that ends in `*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 
@@ -73,9 +73,9 @@ def list_items(
     fields: Collection[str] | None = None,
     count: bool = False,
 ) -> Page:
-    """Return one page of a project's items of a kind; with `fields`, only these members of each item.
+    """Return one page of a project's items of a kind; with `fields`, each item has only the members named there.
 
-    Raises `ForbiddenProblem` if an attempt of a job lists items without looking up a name.
+    Raises `ForbiddenProblem` if the caller is an attempt of a job and the filters do not look up a name.
     """
     if tx.principal.kind == "attempt" and not filters.looks_up_name:
         raise ForbiddenProblem(
@@ -137,7 +137,7 @@ def _conditions(project_id: str, kind: Kind, filters: ItemFilters) -> list[Colum
 
 
 def read_query(text: str) -> Query:
-    """Return the query in a text. Raises `BadRequestProblem`, which names the place of the fault."""
+    """Parse the text of a query. Raises `BadRequestProblem`, which gives the column of the first fault."""
     try:
         return parse(text)
     except QueryError as error:
@@ -145,9 +145,9 @@ def read_query(text: str) -> Query:
 
 
 def explain_query(tx: Transaction, project: str, kind: Kind, filters: ItemFilters, query: str) -> QueryExplanation:
-    """Count the items that a query selects among those that match `filters`, and those that each of its parts hides.
+    """Count the items that match `filters`, how many of them the query selects, and how many each condition excludes.
 
-    A part is a condition that must be true for every selected item: the query itself, or what `and` joins.
+    The conditions are the operands of the outermost `and` of the query, or else the whole query.
     """
     project_row = projects.require(tx, project)
     parts = parts_of(read_query(query))

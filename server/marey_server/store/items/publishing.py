@@ -45,10 +45,10 @@ def publish(
 ) -> list[Published]:
     """Create items and revisions from drafts, all or none; return them in the order of the drafts.
 
-    `{"output": name}` in a document refers to another draft and is replaced by its item and revision; the
-    `model_digest` of a tree may name the model of its own draft. With `refer_to_deleted`, documents may refer to items
-    that are deleted. Content that is stored already creates no new
-    revision. The caller has authorised the write.
+    In a document, `{"output": name}` refers to another draft and is replaced by the item and revision published from
+    it. The `model_digest` of a tree may refer to the model of the same draft. With `refer_to_deleted`, documents may
+    refer to items that are deleted. If an item already has the content of a draft, no new revision is created. The
+    caller must have checked that the user may write.
 
     Raises `InvalidProblem` for a draft that is not valid, `ConflictProblem` for a name that is taken.
     """
@@ -66,7 +66,10 @@ def publish(
 
 @dataclass(frozen=True)
 class _Loaded:
-    """A draft with the bodies of its parts, in the order that its kind declares, and the drafts to which they refer."""
+    """Draft with the documents of its parts, in the order that its kind declares.
+
+    `refers` lists the drafts that these documents refer to.
+    """
 
     draft: Draft
     bodies: Mapping[str, Tree]
@@ -161,7 +164,7 @@ class _Head:
 
 @dataclass
 class _Publication:
-    """Publication of groups of drafts, one group after another, each with the same few statements."""
+    """Publication of groups of drafts, one group after another, each with a fixed small number of statements."""
 
     tx: Transaction
     project: ProjectRow
@@ -235,7 +238,11 @@ class _Publication:
     # -- finding -------------------------------------------------------------------------------------------------------
 
     def _find(self, waiting: Sequence[_Ready], kind: Kind, reuse: str) -> dict[str, _Head]:
-        """Return existing items by the names of drafts that add a revision to the item or have its content."""
+        """Return the existing items that drafts will use or revise, by the names of the drafts.
+
+        With `by_name`, an item is found by its place; with `by_content`, by its required parts; with `new`, none is
+        found.
+        """
         if reuse == "new":
             return {}
         found = self._find_places(waiting, kind) if reuse == "by_name" else self._find_contents(waiting, kind)
@@ -256,7 +263,7 @@ class _Publication:
         return found
 
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
-        """For each draft, find the first item whose required parts are equal."""
+        """Find, for each draft, the first item of the project that has the same required parts."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
         statement = select(item.c.id, item.c.head, item.c.creator_id).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)
@@ -275,7 +282,10 @@ class _Publication:
 
     @staticmethod
     def _first_of_equals(new: Sequence[_Ready]) -> list[_Ready]:
-        """Return the first of the drafts with equal content; the others reuse the item that it creates."""
+        """Return the first draft of each content.
+
+        The other drafts with this content use the item that the first one creates.
+        """
         firsts: dict[tuple[str | None, ...], _Ready] = {}
         for one in new:
             firsts.setdefault(one.required, one)
@@ -289,7 +299,10 @@ class _Publication:
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def _create(self, new: Sequence[_Ready], kind: Kind) -> None:
-        """Create the items whose names are free. Raises `ConflictProblem` for a taken name with the `reuse` `new`."""
+        """Create items for the drafts, if their names are free.
+
+        Raises `ConflictProblem` if the name of a draft with `reuse="new"` is taken.
+        """
         if not new:
             return
         for one in new:
@@ -328,7 +341,7 @@ class _Publication:
         }  # fmt: skip
 
     def _reuse(self, one: _Ready, head: _Head) -> None:
-        """Use the existing items for drafts with the same content; add a revision to the other items."""
+        """Use the existing item if it has the content of the draft; otherwise add a revision to it."""
         if one.draft.reuse == "by_content" or one.digests.items() <= head.parts.items():
             self.done[one.draft.name_in_batch] = one.published(head.id, head.number, created=False)
             return

@@ -57,7 +57,10 @@ def _is_true(condition: ColumnElement[bool]) -> ColumnElement[bool]:
 
 
 class _LowerAscii(FunctionElement[str]):
-    """A text with the letters A to Z in lower case; others depend on the database and its collation."""
+    """SQL expression that converts the letters A to Z of a text to lower case.
+
+    Whether it converts other letters depends on the database and its collation.
+    """
 
     type = Text()
     inherit_cache = True
@@ -74,7 +77,10 @@ def _lower_on_postgres(element: _LowerAscii, compiler: SQLCompiler, **options: A
 
 
 class _NumberIn(FunctionElement[float]):
-    """A number in the summary; null if there is another value, which a cast to a number would refuse with an error."""
+    """SQL expression for a number in the summary of an item.
+
+    It is null if the summary has another value there; a plain cast to a number would fail.
+    """
 
     type = Float()
     inherit_cache = True
@@ -101,12 +107,12 @@ _TO_LOWER = str.maketrans(ascii_uppercase, ascii_lowercase)
 
 
 def _contains(value: ColumnElement[Any], part: object) -> ColumnElement[bool]:
-    """Return whether a text contains another, without regard to the case of A to Z."""
+    """Return the SQL condition that a text contains another; the case of the letters A to Z is ignored."""
     return _LowerAscii(value).contains(str(part).translate(_TO_LOWER), autoescape=True)
 
 
 def _texts(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL of a condition about a text that may be null."""
+    """Return the SQL of a condition on a text that may be null."""
     if condition.operator == "has":
         return value.is_not(None)
     if condition.operator == "~":
@@ -115,7 +121,7 @@ def _texts(value: ColumnElement[Any], condition: Condition) -> ColumnElement[boo
 
 
 def _numbers(value: ColumnElement[Any], condition: Condition) -> ColumnElement[bool]:
-    """Return the SQL of a condition about a number that may be null."""
+    """Return the SQL of a condition on a number that may be null."""
     if condition.operator == "has":
         return value.is_not(None)
     if condition.operator == "=":
@@ -137,7 +143,10 @@ def _number_of(name: str) -> Comparison:
 
 
 def _day_of(name: str) -> Comparison:
-    """Compare a day, which is stored as in `2026-11-23`; of a time, only the day counts."""
+    """Return the comparison for a field that stores a day, such as `2026-11-23`.
+
+    If a condition gives a time, only its day is compared.
+    """
 
     def compare(condition: Condition, _: str) -> ColumnElement[bool]:
         stored: ColumnElement[Any] = item.c.summary[name].as_string()
@@ -152,7 +161,10 @@ def _day_of(name: str) -> Comparison:
 
 
 def _time_of(column: ColumnElement[Any]) -> Comparison:
-    """Compare a time in microseconds; a day stands for all its times in UTC."""
+    """Return the comparison for a column that stores a time in microseconds.
+
+    If a condition gives a day, the day is compared as a whole, from midnight to midnight UTC.
+    """
 
     def compare(condition: Condition, _: str) -> ColumnElement[bool]:
         if condition.operator == "has":
@@ -175,7 +187,7 @@ def _time_of(column: ColumnElement[Any]) -> Comparison:
 
 
 def _span(one: object) -> tuple[int, int]:
-    """Return the first microsecond of a day or time, and the number of its microseconds."""
+    """Return the first microsecond of a day (in UTC) or of a time, and its length in microseconds (1 for a time)."""
     if isinstance(one, datetime):
         return micros_of(one), 1
     assert isinstance(one, date)
@@ -198,7 +210,10 @@ def _path(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _folder(condition: Condition, project_id: str) -> ColumnElement[bool]:
-    """Compare the folder: with `=` also the folders above, with `~` the path of the folder itself."""
+    """Return the condition on the folder of an item.
+
+    `=` matches items in the given folder and in folders below it; `~` matches a part of the folder's path.
+    """
     own = collection.c.project_id == project_id
     if condition.operator == "has":
         chosen = collection.c.path != ""
@@ -215,7 +230,10 @@ def _tag(condition: Condition, _: str) -> ColumnElement[bool]:
 
 
 def _warning(condition: Condition, _: str) -> ColumnElement[bool]:
-    """Compare codes in a stored list, as in `["foot-slide", "gap"]`; codes have no quotation marks or commas."""
+    """Return the condition on the codes of warnings, which are stored as the text of a list: `["foot-slide", "gap"]`.
+
+    Codes contain no quotation marks or commas.
+    """
     stored: ColumnElement[Any] = item.c.summary["warnings"].as_string()
     if condition.operator == "has":
         return _is_true(and_(stored.is_not(None), stored != "[]"))

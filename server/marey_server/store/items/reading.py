@@ -183,10 +183,10 @@ def load_part(
 def cut_part(
     tree: dict[str, Any], frames: slice | None, joints: Sequence[str] | None, *, encoded: bool
 ) -> dict[str, Any]:
-    """Cut a motion, loaded with encoded arrays, to `frames` and `joints`; `encoded` also leaves the result encoded.
+    """Cut a motion to the given frames and joints; its arrays must be encoded, and stay encoded if `encoded` is true.
 
     `frames` is half-open and clipped to the motion; `joints` are names, in the order of the result. Raises
-    `InvalidProblem` if they do not fit the document.
+    `InvalidProblem` if the document is not a motion or has no such frames or joints.
     """
     if tree["schema"] != "marey/motion@1":
         raise InvalidProblem(

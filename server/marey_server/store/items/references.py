@@ -33,7 +33,7 @@ def outputs_in(tree: Any) -> Iterator[str]:
 
 
 def with_model_digest(tree: Tree, digest: str | None) -> Tree:
-    """Return `tree` with the digest of the model of the same draft, if it refers to the model as `PartDigestRef`."""
+    """Return the tree with `digest` as its `model_digest`, if it referred to the model of its own draft."""
     if digest is None or isinstance(tree["model_digest"], str):
         return tree
     return {**tree, "model_digest": digest}
@@ -91,7 +91,10 @@ class ReferenceCheck:
             self._seen[published.item, published.revision, published.kind, part] = body
 
     def require(self, kind: Kind, bodies: Mapping[str, Tree]) -> None:
-        """Raise `InvalidProblem` if a reference in the new parts of an item has no target or does not fit it."""
+        """Check the references in the new parts of an item.
+
+        Raises `InvalidProblem` if a part refers to something that does not exist or does not fit the part.
+        """
         if kind in (Kind.CLIP, Kind.PROCESSED) and "motion" in bodies:
             self._require_joints(bodies["motion"], "/motion")
         elif kind is Kind.MODEL:
@@ -132,7 +135,7 @@ class ReferenceCheck:
                 self._referred(node["model"], Kind.MODEL, "model", pointer)
 
     def _referred(self, ref: Tree, kind: Kind, part: str, pointer: str) -> Tree:
-        """Return the body of a part of the revision that `ref` names."""
+        """Return the document of the part `part` of the revision that `ref` names."""
         if "output" in ref:
             raise _invalid(
                 pointer,

@@ -1,4 +1,4 @@
-"""Writing of revisions, and of the reference from an item to its newest revision."""
+"""Writes revisions, and updates which revision is the newest of its item."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from marey_server.store.transaction import Transaction
 
 
 def read_part_digests(tx: Transaction, revisions: Collection[tuple[str, int]]) -> dict[tuple[str, int], dict[str, str]]:
-    """Return the digest of the document of each part of revisions, which are given by item id and number."""
+    """Return the digest of each part of the given revisions (pairs of item id and number)."""
     found: dict[tuple[str, int], dict[str, str]] = {one: {} for one in revisions}
     ids, numbers = {item_id for item_id, _ in found}, {number for _, number in found}
     # Not pairs: SQLite would scan the table for them. What this finds beyond them is one row here and there.
@@ -38,9 +38,10 @@ def write_head(
     *conditions: ColumnElement[bool],
     added_bytes: int,
 ) -> bool:
-    """Set the item's newest revision to the next one; return false if the item does not meet `conditions`.
+    """Increase the number of the item's newest revision by one; return false if the item does not meet `conditions`.
 
-    `bodies` may omit parts that do not change. `added_bytes` is the size of the changed parts for quotas.
+    `parts` are the digests of the new revision's parts. `bodies` are their documents; those of unchanged parts may be
+    omitted. `added_bytes` is the size of the changed parts, which counts towards quotas.
     """
     known = dict(bodies)
     for part, digest in parts.items():
@@ -61,7 +62,7 @@ def write_head(
 
 @dataclass(frozen=True, slots=True)
 class NewRevision:
-    """A revision to insert, with its parts by digest of the document."""
+    """Revision to insert; `parts` maps the name of each part to the digest of its document."""
 
     item_id: str
     number: int

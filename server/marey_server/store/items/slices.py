@@ -24,7 +24,7 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     ----------
     motion : document of schema marey/motion@1 with `EncodedArray` leaves
     frames : half-open range, clipped to the motion
-    joints : names in the order wanted
+    joints : names in the order of the result
     encoded : whether the arrays of the result are `EncodedArray`, too
     """
     cut = dict(motion)

@@ -1,1 +1,1 @@
-"""Job queue: submission, claims, fences, results, and propagation of ends, with all SQL for them."""
+"""Job queue: submission, claims, fences, results, and propagation of job ends; all SQL for jobs is in this package."""

@@ -209,7 +209,7 @@ def _claimed_by_caller(tx: Transaction, places: Iterable[_Place]) -> set[_Place]
 
 
 def _staged(tx: Transaction, places: Collection[_Place]) -> set[_Place]:
-    """Return the attempts that have staged outputs."""
+    """Return those of the given attempts for which outputs are staged."""
     columns = (staged_output.c.job_id, staged_output.c.fence)
     of_jobs = staged_output.c.job_id.in_([job_id for job_id, _ in places])
     rows = tx.execute(select(*columns).where(of_jobs, tuple_(*columns).in_(list(places))).distinct())
@@ -273,7 +273,10 @@ def fail(
 
 
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
-    """Return whether an earlier attempt ended in the same way, so that a retry would only stop another worker."""
+    """Return whether an earlier attempt of the job failed with the same signature.
+
+    A retry would then fail in the same way, and perhaps stop another worker.
+    """
     if signature is None:
         return False
     seen = exists().where(attempt.c.job_id == job_id, attempt.c.signature == signature)

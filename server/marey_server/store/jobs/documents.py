@@ -43,14 +43,14 @@ _UNSAID = {column.key: None if column.default is None else column.default.arg fo
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
     """Return the document of a job that this transaction inserted for the caller, without reading its row.
 
-    The result equals that of `job_documents`. The row must be unchanged, and must not belong to a parent job.
+    The result equals that of `job_documents`. `row` must be the row as it was inserted, of a job without tasks.
     """
     names = {"project_name": project_name, "author_name": tx.principal.user_name}
     return _document(SimpleNamespace(**{**_UNSAID, **row, **names}), tuple(sorted(after)), {}, None)
 
 
 def as_documents(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Job]:
-    """Return documents for rows of `select_jobs`; that of a parent job contains the states of its tasks."""
+    """Return documents for rows of `select_jobs`; the document of a parent job contains the states of its tasks."""
     gathering = [row for row in rows if row.size is not None]
     children = _children(tx, [row.id for row in gathering])
     at_work = [row for row in gathering if row.state == JobState.RUNNING and row.lease_expires_us is None]
@@ -67,7 +67,7 @@ _DEPENDENCIES = Prepared(
 
 
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
-    """Return the dependencies of each job, except a job whose result it shares."""
+    """Return, for each job, the ids of the jobs that it depends on, but not of the job whose result it shares."""
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}
     for row in tx.run(_DEPENDENCIES, {"ids": list(shared)}):

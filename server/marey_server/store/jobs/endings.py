@@ -52,7 +52,7 @@ def dependency_failure(cause: str, state: str) -> dict[str, Any]:
 
 
 def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
-    """Set the final `state` of the jobs that meet `condition`, which includes their fences."""
+    """Set the final `state` of the jobs that meet `condition`; the condition must include the check of the fence."""
     statement = (
         update(job)
         .where(condition)

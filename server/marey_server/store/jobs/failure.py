@@ -75,9 +75,9 @@ def decide_outcome(row: Row[Any], request: FailRequest, policy: QueuePolicy, *, 
 def decide_expired_outcome(row: Row[Any], policy: QueuePolicy) -> AttemptOutcome:
     """Return the outcome of an attempt whose lease expired. A retry is queued without delay.
 
-    An attempt that has written nothing does not count; perhaps the answer to its claim was lost.
-    If the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If it expired
-    earlier, the worker is lost, even if the server notices it after the deadline.
+    An attempt that has written nothing does not count as a try, because the answer to its claim may have been lost. If
+    the lease was renewed until the deadline of the job, the worker was alive and did not stop in time. If the lease
+    expired earlier, the worker is lost, even if the server notices this only after the deadline.
     """
     if row.cancel_requested_us is not None:
         return AttemptOutcome("cancelled", "cancelled")

@@ -21,8 +21,8 @@ MOST_GATHERED = 1000
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     """End a parent job whose tasks have all ended, or queue it if its kind combines the results in a worker.
 
-    It succeeds or is queued if all tasks succeeded; otherwise it is cancelled if cancellation was requested, and failed
-    if a task failed.
+    If all tasks succeeded, the parent job succeeds or is queued. Otherwise it is cancelled if cancellation was
+    requested, and failed if a task failed.
     """
     head = tx.execute(select(job.c.kind, job.c.gathers, job.c.cancel_requested_us).where(job.c.id == parent_id)).one()
     rows = tx.execute(

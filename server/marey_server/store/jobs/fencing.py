@@ -90,9 +90,10 @@ def require_attempt(principal: Principal, job_id: str, fence: int) -> None:
 
 
 def hold(tx: Transaction, job_id: str, fence: int, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Lock the job for this transaction, count the attempt at its first write, and return `columns` of the job.
+    """Lock the job for this transaction and return `columns` of its row.
 
-    Raises `LeaseLostProblem` if the attempt no longer holds the job.
+    If this is the first write of the attempt, the attempt is counted as a try of the job. Raises `LeaseLostProblem` if
+    the attempt no longer holds the job.
     """
     holding = held(job_id, fence)
     statement = select(job.c.project_id, UNCOUNTED.label("uncounted"), *columns).where(holding).with_for_update()

@@ -53,7 +53,7 @@ _ITEMS_BY_ID = Prepared(_ITEMS.where(item.c.id.in_(bindparam("ids", expanding=Tr
 
 
 def find_items(tx: Transaction, project: ProjectRow, requests: Iterable[JobCreate]) -> dict[str, FoundItem]:
-    """Return the items that the requests name individually, by id."""
+    """Return, by id, the items that the requests name by their ids, and not through a collection or a dataset."""
     choices = (choice for request in requests for many in request.inputs.values() for choice in _as_many(many))
     return items_by_id(tx, project.id, (choice.item for choice in choices if isinstance(choice, ItemInput)))
 
@@ -194,7 +194,7 @@ def _items_below(tx: Transaction, project: ProjectRow, spec: InputSpec, path: st
 def _entries_of(
     tx: Transaction, project: ProjectRow, spec: InputSpec, choice: DatasetInput, place: str, errors: list[FieldError]
 ) -> Iterator[Pin]:
-    """Pin the entries of a version, with the names and folders that they have in it."""
+    """Pin the entries of a version of a dataset; each pin has the name and the folder of the entry in this version."""
     try:
         version = datasets.entries_of_kind(
             tx, project, choice.dataset, choice.version, spec.kind, path=choice.path, most=MOST_INPUTS + 1

@@ -38,7 +38,8 @@ class LateInputError(Exception):
 def pin_late_inputs(tx: Transaction, ids: Sequence[str]) -> list[Ended]:
     """Pin the outputs of succeeded dependencies as inputs of the waiting jobs, and queue these jobs.
 
-    Returns the jobs that end here: those without outputs to read, and those with an existing result to share.
+    Returns the jobs that ended because of this: those for which there are no outputs to read, and those that share an
+    existing result.
     """
     if not ids:
         return []
@@ -118,7 +119,7 @@ def _write(tx: Transaction, heads: Sequence[NewJob], tasks: Sequence[NewJob]) ->
 
 
 class _Made(NamedTuple):
-    """Outputs of a job, and the collection to which they were written."""
+    """Outputs of a succeeded job, and the collection to which the job wrote them."""
 
     into: str
     pins: list[Pin]

@@ -98,7 +98,10 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 
 
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
-    """Set the cache keys of jobs, and let those wait whose results exist or are being computed."""
+    """Set the cache keys of jobs, and find jobs with the same results, finished or in progress.
+
+    A job for which one is found changes to the state `waiting`.
+    """
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])
     for one in jobs:
@@ -161,7 +164,10 @@ def _has_key(submission: Submission) -> bool:
 
 
 def _newest_revisions(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, int]:
-    """Return the newest revisions of items that parameters name; items that are not in the project are omitted."""
+    """Return the newest revisions of the items that parameters of jobs name.
+
+    Items that are not in the project are omitted.
+    """
     wanted: dict[str, set[str]] = {}
     for one in jobs:
         named = result_cache.named_items(one.submission.kind, one.submission.params)
@@ -201,7 +207,7 @@ def new_row(tx: Transaction, one: NewJob) -> dict[str, Any]:
 
 
 def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
-    """Return the columns of a row that depend on its inputs."""
+    """Return the columns of a job's row that depend on the inputs of the job."""
     return {
         "state": one.state,
         "inputs": one.pins,

@@ -79,7 +79,7 @@ class _Span(NamedTuple):
 
 
 def read_log(tx: Transaction, job_row: Row[tuple[str, str]], offset: int, limit: int = MOST_READ_BYTES) -> LogPage:
-    """Return up to `limit` bytes of the log of a job (`id, state`) from `offset` on.
+    """Return up to `limit` bytes of the log of a job from `offset` on; `job_row` has the columns `id` and `state`.
 
     The log of an attempt does not grow after the next attempt has begun, so offsets into the joined log stay valid.
     """

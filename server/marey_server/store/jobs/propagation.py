@@ -1,7 +1,7 @@
-"""Propagates the end of a job to dependants, fan-out parent and jobs waiting on its cached result, in the same
-transaction.
+"""Propagates the end of a job, in the same transaction.
 
-Rows are locked downstream: a job before its parent job and before its dependants.
+The end of a job affects the jobs that depend on it, its parent job, and the jobs that wait to share its result. Rows
+are locked downstream: a job before its parent job and before its dependants.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def propagate_ends(tx: Transaction, ended: Iterable[Ended]) -> None:
 def make_ready(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
     """Queue waiting jobs whose dependencies have succeeded, start their tasks, or give them a cached result.
 
-    Late inputs of the jobs are pinned first. The rows hold `READY_COLUMNS`. Returns the jobs that end here.
+    Late inputs of the jobs are pinned first. The rows hold `READY_COLUMNS`. Returns the jobs that ended because of
+    this.
     """
     ended = late_inputs.pin_late_inputs(tx, [row.id for row in rows if row.unbound])
     for row in rows:
@@ -121,8 +122,9 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 
 
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job and its tasks because the job `cause` did not succeed: as failed, or as cancelled if the job
-    should be skipped.
+    """End a waiting job because the job `cause`, on which it depends, did not succeed; cancel its tasks.
+
+    The job fails, or is cancelled if its `on_failure` is `skip`.
     """
     waits = and_(job.c.id == row.id, job.c.state == WAITING)
     tasks = end_jobs(tx, and_(job.c.parent_id == row.id, job.c.state == WAITING), "cancelled")
@@ -165,7 +167,10 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """After a task has failed, cancel the tasks that have not started, if a worker would combine the results."""
+    """Cancel the tasks that have not started, of parent jobs of which a task has failed.
+
+    This applies only to parent jobs whose results a worker would combine.
+    """
     if not parents:
         return []
     gathered = select(job.c.id).where(job.c.id.in_(parents), job.c.gathers)
@@ -192,8 +197,9 @@ def _admit(tx: Transaction, rows: Sequence[Row[Any]]) -> list[Ended]:
 
 
 def _stop_sharing(tx: Transaction, rows: Sequence[Row[Any]]) -> None:
-    """Queue one of the jobs that waited to share the result of an unsuccessful job; the others then wait for its
-    result.
+    """Remove the link from waiting jobs to an unsuccessful job whose result they would have shared.
+
+    `make_ready` then queues one of them, and the others wait for its result.
     """
     if rows:
         ids = [row.id for row in rows]

@@ -63,8 +63,8 @@ def claim(tx: Transaction, request: ClaimRequest, policy: QueuePolicy = DEFAULT_
     """Claim up to `request.max` queued jobs for the caller, in order of priority, each under a new fence.
 
     A repeated `claim_id` gets the leases of the earlier claim that are still held. Raises `ForbiddenProblem` if the
-    caller may not claim jobs or announce such labels, `InvalidProblem` for another protocol version, and
-    `LeaseLostProblem` if no lease of the earlier claim is held any more.
+    caller may not claim jobs or may not announce these labels, `InvalidProblem` if the worker uses another version of
+    the protocol, and `LeaseLostProblem` if no lease of the earlier claim is held any more.
     """
     if request.protocol != PROTOCOL_VERSION:
         detail = f"The worker uses version {request.protocol} of the protocol, but the server uses {PROTOCOL_VERSION}."
@@ -125,7 +125,11 @@ def _claimed_before(tx: Transaction, claim_id: str, policy: QueuePolicy) -> list
 
 
 def _issue_token(tx: Transaction, claim_id: str | None, row: Row[Any]) -> IssuedToken:
-    """Return the token of an attempt, derived if the claim can be repeated, so that no secret needs to be stored."""
+    """Return a token for the attempt.
+
+    If the claim has a `claim_id`, it may be repeated. Then the token is derived from the caller's token, the claim and
+    the attempt, so that a repetition gets the same token although no secret is stored.
+    """
     if claim_id is None:
         return issue_attempt_token()
     return derive_attempt_token(tx.principal.token_key, claim_id, row.id, row.fence)
@@ -204,7 +208,10 @@ def _claim_statement(restriction: _Restriction) -> ReturningUpdate[Any]:
 
 
 def _pick(restriction: _Restriction) -> CTE:
-    """Return the query for ids to claim: at most one job of each concurrency key, and none if one is running."""
+    """Return the query for the ids of the jobs to claim.
+
+    Of the jobs with the same concurrency key, it selects at most one, and none while one of them is running.
+    """
 
     def claimable(candidate: FromClause) -> ColumnElement[bool]:
         conditions = [

@@ -107,7 +107,7 @@ def _take_back(tx: Transaction, row: Row[Any], policy: QueuePolicy) -> bool:
 def claim_after_reaping(
     tx: Transaction, request: ClaimRequest, grace: StartGrace, policy: QueuePolicy = DEFAULT_POLICY
 ) -> list[Lease]:
-    """Claim jobs; if there are none, reclaim overdue jobs and claim once more."""
+    """Claim jobs; if there are none, reclaim the jobs whose leases have expired, and try to claim once more."""
     leases = claim(tx, request, policy)
     if not leases and grace.over(tx.now_us) and reap_page(tx, policy).taken:
         leases = claim(tx, request, policy)

@@ -71,7 +71,10 @@ def cache_key(
 
 
 def has_key(kind: KindDeclaration, params: Mapping[str, Any], inputs: Collection[str]) -> bool:
-    """Return whether the result of a job with these parameters and inputs depends on its key alone."""
+    """Return whether jobs of the kind with these parameters and inputs have a cache key.
+
+    They have one if the result depends on nothing but what the key contains.
+    """
     in_place = kind.in_place is not None and params.get(kind.in_place)
     by_names = not set(kind.never_cached_without) <= set(inputs)
     if kind.never_cached_for is not None:
@@ -114,11 +117,12 @@ def _content(pin: Pin, read: Collection[str], parts: Mapping[str, str]) -> list[
 
 
 def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult]:
-    """Find, for each of `candidates` (`id, project_id, cache_key, cache_mode`), the job whose result it can share.
+    """Find, for each of `candidates`, the job whose result it can share.
 
-    Candidates without such a job are omitted. Of several identical candidates, the first computes the result and the
-    others share it. Submissions to one project that use the cache decide one after another; the jobs with the results
-    are locked, so that their end is not missed.
+    A candidate is a row with `id`, `project_id`, `cache_key` and `cache_mode`. Candidates without such a job are
+    omitted. Of several identical candidates, the first computes the result and the others share it. Submissions to one
+    project that use the cache decide one after another. The jobs with the results are locked, so that their end is not
+    missed.
     """
     asking = [one for one in candidates if one.cache_key is not None and one.cache_mode in ("use", "refresh")]
     if not asking:
@@ -138,7 +142,7 @@ def decide(tx: Transaction, candidates: Sequence[Any]) -> dict[str, SharedResult
 
 
 def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, str], SharedResult]:
-    """Return the newest finished job of each key, or else the oldest unfinished one."""
+    """Return, for each cache key, the newest succeeded job, or else the oldest one that has not ended."""
     keys = sorted({one.cache_key for one in asking if one.cache_mode == "use"})
     projects = sorted({one.project_id for one in asking})
     active = or_(job.c.state == QUEUED, job.c.state == RUNNING)
@@ -169,7 +173,10 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 
 
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
-    """Let waiting jobs (`id`) share the results of their sources, now or when the sources finish."""
+    """Let waiting jobs share the results of other jobs, now or as soon as those finish.
+
+    `joining` pairs the row of each waiting job, of which only `id` is read, with the job that has the result.
+    """
     if not joining:
         return []
     for row, source in joining:
@@ -185,10 +192,10 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[E
 
 
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
-    """Give waiting jobs (`id`) the results of the finished jobs in their `cached_from`, up to a limit of outputs.
+    """Give waiting jobs the results of the finished jobs that their `cached_from` names, up to a limit of outputs.
 
-    The leading process serves the remaining jobs later. A job whose result is no longer stored, or cannot be published
-    for it, is queued instead.
+    Only the `id` of the rows is read. The leading server process serves the remaining jobs later. A job whose result is
+    no longer stored, or cannot be published for it, is queued instead.
     """
     ended: list[Ended] = []
     for row in rows[:SHARED_AT_ONCE]:

@@ -106,8 +106,9 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that ended only because one of these did not succeed, that have no retry, and that the caller
-        may retry.
+        """Return the jobs that ended only because one of these did not succeed.
+
+        Jobs that have a retry already, or that the caller may not retry, are left out.
         """
         later = job.alias("later")
         statement = (
@@ -197,7 +198,10 @@ def _states(tx: Transaction, ids: Collection[str]) -> dict[str, str]:
 
 
 def _needs(tx: Transaction, rows: Mapping[str, Row[Any]]) -> dict[str, dict[str, str]]:
-    """Return, for each job, its dependencies with their newest retries, but not the job whose result it shares."""
+    """Return the dependencies of each job, each with its newest retry.
+
+    The job whose result a job shares is left out.
+    """
     needs: dict[str, dict[str, str]] = {one: {} for one in rows}
     statement = select(job_dependency).order_by(job_dependency.c.on_job_id)
     for row in _select_in(tx, statement, job_dependency.c.job_id, rows):

@@ -54,7 +54,7 @@ def prepare_output(output: StagedOutput) -> PreparedOutput:
 
 
 def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOutput]) -> int:
-    """Store outputs until the attempt completes, replacing those of the same names; return their number.
+    """Store outputs until the attempt completes; they replace staged outputs of the same names. Return their number.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job, `InvalidProblem` for sources that are not inputs of
     the job.
@@ -151,7 +151,10 @@ def staged_drafts(
 
 
 def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> bool:
-    """Reset the age of documents that an earlier job staged, so that they are kept; return whether all exist."""
+    """Reset the age of documents that an earlier job staged, so that garbage collection keeps them.
+
+    Returns whether all of them are still stored.
+    """
     wanted = sorted({digest for draft in drafts.values() for digest in draft["parts"].values()})
     kept = 0
     for start in range(0, len(wanted), IN_LIST):
@@ -161,7 +164,10 @@ def take_up_documents(tx: Transaction, drafts: Mapping[str, StagedDraft]) -> boo
 
 
 def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
-    """Delete the drafts of attempts (job id and fence) that failed or whose results no other job can share."""
+    """Delete the drafts of the given attempts (job id and fence).
+
+    These are attempts that failed, or whose results no other job can share.
+    """
     tx.run(_DROP_STAGED, _of_attempts(attempts))
 
 
@@ -190,7 +196,10 @@ def with_inputs(drafts: Mapping[str, StagedDraft], theirs: PinnedInputs, ours: P
 
 
 def publish_drafts(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
-    """Publish the drafts of a job (`id, project_id, into_path, author_id, message`); return the published outputs."""
+    """Publish the drafts of a job; return the published outputs.
+
+    `row` has the columns `id`, `project_id`, `into_path`, `author_id` and `message` of the job.
+    """
     if not drafts:
         return []
     published = publish(
@@ -230,7 +239,7 @@ def _draft(name: str, draft: StagedDraft, row: Any) -> Draft:
 
 
 def named_blobs(tree: Any) -> Iterator[str]:
-    """Return the digests under members named `blob`, anywhere in parameters or in a result."""
+    """Yield the digest in each member named `blob`, at any depth of parameters or of a result."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
             if name == "blob" and isinstance(value, str) and is_digest(value):

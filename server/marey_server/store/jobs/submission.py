@@ -265,7 +265,10 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 
 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
-    """Return the job of a step, without the pipeline's collection if its results have a fixed place, as trees have."""
+    """Return the job request of a step, without the collection that the pipeline gave it if the kind cannot use one.
+
+    Results such as trees have a fixed place.
+    """
     if step.into is not None:
         return request
     try:

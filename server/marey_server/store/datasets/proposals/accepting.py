@@ -93,7 +93,10 @@ def _missing(
 
 
 def _target(tx: Transaction, row: Row[Any], *, lock: bool = False) -> Row[Any]:
-    """Return the row of the branch into which an open proposal is merged; with `lock`, its rule stays as it is."""
+    """Return the row of the branch into which an open proposal is merged.
+
+    With `lock`, the row is locked until the transaction ends.
+    """
     ref = find_ref(tx, row.dataset_id, row.target, lock=lock)
     assert ref is not None, "branches of open proposals are not deleted"
     return ref

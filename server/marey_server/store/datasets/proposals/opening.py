@@ -31,8 +31,9 @@ _AUTHOR, _WAITING, _ENDING = user.alias("author"), user.alias("waiting"), user.a
 
 
 def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
-    """Return a proposal's row with the names of its users, and the commits of its source and target as `head_now` and
-    `target_now`.
+    """Return the row of a proposal, with the names of the users in it.
+
+    The columns `head_now` and `target_now` are the newest commits of its source and its target.
     """
     row = tx.execute(_rows(dataset_id).where(proposal.c.number == number)).first()
     if row is None:
@@ -43,7 +44,7 @@ def find_proposal(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
 def lock_open(tx: Transaction, dataset_id: str, number: int) -> Row[Any]:
     """Lock the row of an open proposal until the end of the transaction, and return it.
 
-    Raises `NotFoundProblem`, and `ConflictProblem` if the proposal is merged or closed.
+    Raises `NotFoundProblem` if there is no such proposal, and `ConflictProblem` if it is merged or closed.
     """
     tx.execute(select(proposal.c.number).where(*is_proposal(dataset_id, number)).with_for_update())
     row = find_proposal(tx, dataset_id, number)

@@ -35,8 +35,9 @@ def shown_review(one: Row[Any], head: str) -> Review:
 
 
 def verdicts_of(tx: Transaction, project_id: str, row: Row[Any]) -> list[Row[Any]]:
-    """Return the newest approval or request for changes of each reviewer; `counts` is whether the reviewer may write
-    in the project.
+    """Return the newest approval or request for changes of each reviewer.
+
+    The column `counts` is true if the reviewer may still write in the project.
     """
     mine = and_(member.c.project_id == project_id, member.c.user_id == proposal_review.c.author_id)
     may_write = and_(
@@ -72,7 +73,7 @@ def checks_of(tx: Transaction, row: Row[Any]) -> dict[str, ProposalCheck]:
 
 
 def find_missing(tx: Transaction, project_id: str, row: Row[Any], rule: Protection | None) -> Iterator[Missing]:
-    """Return the approvals and checks that a proposal still needs, and the requests for changes that hold it up."""
+    """Return the approvals and checks that a proposal still needs, and the requests for changes that block it."""
     verdicts = [one for one in verdicts_of(tx, project_id, row) if one.counts]
     for one in verdicts:
         if one.verdict == Verdict.REQUEST_CHANGES:
