@@ -33,7 +33,7 @@ def hash_password(password: str) -> str:
 
 
 def password_matches(password: str, stored: str | None) -> bool:
-    """Return whether `password` matches the hash `stored`; without a hash, it takes the same time."""
+    """Return whether `password` matches the hash `stored`; if `stored` is None, return False after the same time."""
     parsed = _parse(stored or _nobody())
     key = _derive(password, parsed.salt, parsed.log2_n, parsed.block, parsed.parallel, len(parsed.key))
     return hmac.compare_digest(key, parsed.key) and stored is not None

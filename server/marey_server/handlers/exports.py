@@ -77,9 +77,10 @@ class Export(BlobSender):
     async def get(self, project: str, kind: str, item: str, query: ExportQuery) -> Rendered | Reply | None:
         """Return an item as a file; if it was imported from a file, the original can be returned.
 
-        Formats are bvh, npz, predecessor and json for clips and aligned clips, predecessor and json for annotations,
-        models with their trees, and graphs, and json for other kinds. An item that was imported from a file of the
-        predecessor and is unchanged is returned as that file.
+        Clips and aligned clips can be returned as bvh, npz, predecessor and json. Annotations, models with their trees,
+        and graphs can be returned as predecessor and json; items of other kinds only as json. The formats called
+        predecessor are those of Marey's predecessor: an unchanged item that was imported from such a file is returned
+        as that file.
         """
         place = (project, kind_of(kind), item, query.revision)
         options = PredecessorOptions(query.end_index, query.form, query.part, query.layout)

@@ -48,7 +48,7 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part of an item; if frames or joints are cut out, `encoded` keeps the arrays encoded.
+    """Read a part of an item; if only some frames or joints are requested, `encoded` keeps its arrays encoded.
 
     A part of a named revision never changes.
     """

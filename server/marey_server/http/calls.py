@@ -50,7 +50,10 @@ class Caller:
         tx.required_role = self.operation.required_role
 
     def sees_answer(self, project: str | None) -> bool:
-        """Return whether the scopes of the credential allow showing the answer to a change in the project."""
+        """Return whether the caller may read the answer, which may show content of the project.
+
+        An answer to a change needs the scope `read` in the project, too.
+        """
         held = self.principal.scopes if self.principal is not None else ()
         return not self.operation.shows_project or scopes.allows(held, "read", project)
 

@@ -67,8 +67,8 @@ Content = type[BaseModel] | type[Document] | type[Bytes]
 class RequestBody:
     """Body of a request: a model, a document, bytes or files.
 
-    `streamed` bodies are passed to the resource piece by piece while they are received. `results`: the body contains
-    results of a job, whose arrays may have up to `max_bytes` when decoded; they are stored as they arrive.
+    `streamed` bodies are passed to the resource piece by piece while they are received. If `results` is true, the body
+    contains results of a job; their arrays may have up to `max_bytes` when decoded, and are stored as they arrive.
     """
 
     content: Content | type[Files]
@@ -150,11 +150,17 @@ def reads(
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes nothing.
 
-    `answer` is the type of the answer, or, with `paged`, of one element of a page; `answer_types` are its media types,
-    if they differ from those of models and documents. `stream`: the answer is also available as server-sent events.
-    `public=False`: guests of a public project are refused. `also` lists further statuses, `headers` further request
-    headers. A `body` is for queries that are too long for an address. `reserved`: it runs in threads that no other
-    requests occupy. `attempts`: running attempts of jobs may do this.
+    Parameters
+    ----------
+    body : query that is too long for an address
+    answer : type of the answer, or, with `paged`, of one element of a page
+    answer_types : media types of the answer, if they differ from those of models and documents
+    also : further statuses, each with the type of its answer
+    public : whether guests of a public project may use the method
+    headers : request headers that the method reads
+    stream : whether the answer is also available as server-sent events
+    reserved : whether the method runs in threads that no other requests occupy
+    attempts : whether running attempts of jobs may use the method
     """
     return _declare(
         access=access, scope=scope, query=query, body=body, answer=answer, paged=paged, etag=etag, status=status,
@@ -182,10 +188,13 @@ def writes(
 ) -> Callable[[Method], Declared]:
     """Declare a method that changes something.
 
-    `precondition`: `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts
-    either or none. `idempotency`: `key` accepts Idempotency-Key; `nature` means that repeating the request has no
-    further effect. `reserved` and `attempts` are those of `reads`; `replays`: ended attempts may repeat it. `access`
-    cannot be that of readers, because readers and guests of a project may not change it.
+    Parameters
+    ----------
+    access : not that of readers, because readers and guests of a project may not change it
+    precondition : `required` demands If-Match; `create` demands If-Match or `If-None-Match: *`; `optional` accepts both
+    idempotency : `key` accepts Idempotency-Key; `nature` means that repeating the request has no further effect
+    reserved, attempts : as for `reads`
+    replays : whether an ended attempt may repeat the request
     """
     if access is Access.READER:
         raise TypeError("A method that changes a project requires at least the role contributor.")

@@ -37,7 +37,7 @@ def boundary_of(content_type: str) -> bytes:
     media_type, parameters = parse_options_header(content_type)
     if media_type != b"multipart/form-data":
         raise UnsupportedMediaTypeProblem(
-            f"Files must be sent with the Content-Type multipart/form-data, not {content_type or 'without a type'}."
+            f"Files must be sent with the Content-Type multipart/form-data; this request has {content_type or 'none'}."
         )
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:

@@ -1,4 +1,4 @@
-"""Commands on annotations, and conversion of the annotation files of Marey's predecessor."""
+"""Commands on annotations, and conversion of annotations of Marey's predecessor."""
 
 from __future__ import annotations
 

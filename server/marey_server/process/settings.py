@@ -182,7 +182,7 @@ class Settings(BaseSettings):
     user_projects: int = Field(
         Quotas.user_projects,
         ge=0,
-        description="Number of owned projects; a user who owns as many cannot create or restore one.",
+        description="A user who owns this number of projects, or more, cannot create or restore another one.",
     )
     user_jobs: int = Field(
         Quotas.user_jobs,

@@ -58,7 +58,7 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
     bare = [name.removeprefix("-") for name in names]
     if unknown := [name for name in bare if name not in keys]:
         raise BadRequestProblem(
-            f"This list cannot be sorted by {unknown[0]!r}, but by {', '.join(keys)}.", code="bad-sort"
+            f"This list cannot be sorted by {unknown[0]!r}; it can be sorted by {', '.join(keys)}.", code="bad-sort"
         )
     if len(set(bare)) != len(bare):
         raise BadRequestProblem("The parameter sort contains a key twice.", code="bad-sort")

@@ -115,7 +115,7 @@ class ProjectJobs(Resource):
     async def post(self, project: str, body: JobCreate) -> Rendered | Reply:
         """Submit a job. Inputs are pinned to their newest revisions; a job with many inputs is divided into tasks.
 
-        An input `{"job": id}` means all outputs of that job that have the input's kind; the new job waits for it.
+        An input `{"job": id}` means all outputs of that job that have the input's kind; the new job waits for that job.
         With `Prefer: wait=n`, the answer is sent when the job has ended, at the latest after n seconds.
         """
         submitted = await self.answer_with(lambda made: _accepted(made[0]), submission.submit, project, (body,))

@@ -106,7 +106,7 @@ class WaitingProposal(Resource):
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Run `function` with the prepared merge of a waiting proposal.
+        """Run `function`, which may merge the proposal, with the merge that was prepared for this.
 
         If a branch has moved since the merge was prepared, prepare it and run `function` again.
         """
@@ -176,15 +176,16 @@ class ProposalMerges(Resource):
     async def post(self, project: str, dataset: str, proposal: int, body: ProposalMerge) -> Rendered:
         """Merge a proposal into its target.
 
-        If something is missing, the request is refused with 409 and `context.missing` lists it; with `when_green`, the
-        proposal is merged as soon as a review or a check adds the last missing thing.
+        If something is missing, the request is refused with 409, and `context.missing` lists what is missing. With
+        `when_green`, it is accepted, and the proposal is merged as soon as a review or a check adds the last missing
+        thing.
         """
         prepared = await self.look_up(proposals.prepare_acceptance, project, dataset, proposal, body)
         return await self.answer(proposals.merge_proposal, project, dataset, proposal, body, prepared)
 
     @writes(access=Access.CONTRIBUTOR, answer=Proposal, etag=True)
     async def delete(self, project: str, dataset: str, proposal: int) -> Rendered:
-        """Withdraw the request to merge a proposal as soon as nothing is missing."""
+        """Withdraw a merge request that waits because of `when_green`; the proposal stays open."""
         return await self.answer(proposals.withdraw_merge, project, dataset, proposal)
 
 

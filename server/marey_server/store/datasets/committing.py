@@ -129,9 +129,9 @@ def record_commit(
 
 
 def move_branch_to(tx: Transaction, prepared: PreparedCommit, digest: str, mover: Mover) -> None:
-    """Move a branch from the commit that it had when the move was prepared to a commit that follows.
+    """Move a branch to a commit that follows its newest commit.
 
-    Raises `ConflictProblem` if the branch has moved meanwhile, and the errors of `require_move`.
+    Raises `ConflictProblem` if the branch has moved since the move was prepared, and the errors of `require_move`.
     """
     moved = (
         update(dataset_ref)
@@ -182,7 +182,10 @@ def head_of(tx: Transaction, dataset_id: str, branch: str, expected: str | None)
 
 
 def branch_moved(branch: str, head: str | None) -> ConflictProblem:
-    """Return the error for a branch whose newest commit is not the expected one; `context.commit` is its digest."""
+    """Return the error for a branch whose newest commit is not the expected one.
+
+    `head` is the digest of its newest commit; the client finds it in `context.commit`.
+    """
     return ConflictProblem(
         f"The branch {branch!r} has moved. Read it again, then repeat the commit.",
         code=BRANCH_MOVED,

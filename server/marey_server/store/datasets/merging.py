@@ -215,8 +215,8 @@ def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | N
     nearest = nearest_common(CommitReader(tx, dataset_id).read, ours, theirs)
     if len(nearest) > 1:
         raise ConflictProblem(
-            "The two versions have several nearest common commits, because earlier merges crossed. Merge one side into "
-            "a new branch at the other first.",
+            "The two versions have several nearest common commits, because earlier merges crossed. Cherry-pick the "
+            "commits that the branch lacks instead.",
             code="several-bases",
             context={"commits": nearest},
         )

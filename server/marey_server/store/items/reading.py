@@ -108,7 +108,7 @@ def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str
 
 def no_item(kind: Kind, item_id: str) -> NotFoundProblem:
     """Return the error for an item that does not exist."""
-    return NotFoundProblem(f"There is no {kind} {item_id!r} here.", code="no-item")
+    return NotFoundProblem(f"There is no {kind} {item_id!r} in this project.", code="no-item")
 
 
 def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:

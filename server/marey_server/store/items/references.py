@@ -117,7 +117,9 @@ class ReferenceCheck:
             detail = f"The joints of the {what} and of its skeleton differ: {', '.join(odd) or 'a name occurs twice'}."
             raise _invalid(f"{pointer}/joints", "wrong-joints", detail)
         if known[0] in motion.get("translated_joints", ()):
-            detail = f"The poses already contain the translation of the root {known[0]!r}."
+            detail = (
+                f"Remove the root {known[0]!r} from `translated_joints`: the poses already contain its translation."
+            )
             raise _invalid(f"{pointer}/translated_joints", "root-translated", detail)
 
     def _require_frames(self, annotation: Tree) -> None:

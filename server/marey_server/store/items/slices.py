@@ -38,7 +38,7 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     if unknown := [name for name in wanted if name not in names]:
         raise _invalid("joints", "no-joint", f"The motion has no joint {unknown[0]!r}.")
     if len(set(wanted)) != len(wanted) or not wanted:
-        raise _invalid("joints", "bad-joints", "Give at least one joint, and each joint once.")
+        raise _invalid("joints", "bad-joints", "Give at least one joint, and no joint twice.")
     cut["joints"] = wanted
     cut["poses"] = _cut(poses, chosen, None if joints is None else _pose_columns(names, wanted), encoded=encoded)
     stored: EncodedArray | None = motion.get("translations")

@@ -273,7 +273,7 @@ def fail(
 
 
 def _is_poisoned(tx: Transaction, job_id: str, signature: str | None) -> bool:
-    """Return whether an earlier attempt of the job failed with the same signature.
+    """Return whether an earlier attempt of the job ended with the same failure signature.
 
     A retry would then fail in the same way, and perhaps stop another worker.
     """

@@ -41,7 +41,7 @@ _UNSAID = {column.key: None if column.default is None else column.default.arg fo
 
 
 def document_of_new(tx: Transaction, project_name: str, row: Mapping[str, Any], after: Collection[str]) -> Job:
-    """Return the document of a job that this transaction inserted for the caller, without reading its row.
+    """Return the document of a job that this transaction inserted for the caller, without reading the row back.
 
     The result equals that of `job_documents`. `row` must be the row as it was inserted, of a job without tasks.
     """

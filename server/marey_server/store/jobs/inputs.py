@@ -226,7 +226,7 @@ def _within(path: str) -> ColumnElement[bool]:
 
 
 def _missing_revisions(request: JobCreate, known: dict[str, FoundItem], at: str) -> list[FieldError]:
-    """Return the revisions that are named by number and do not exist."""
+    """Return an error for each input of the request that names a revision which does not exist."""
     asked: list[tuple[str, ItemInput]] = []
     for name, choices in request.inputs.items():
         for index, choice in enumerate(_as_many(choices)):

@@ -100,7 +100,7 @@ def lay_out(tx: Transaction, heads: Sequence[NewJob]) -> tuple[list[NewJob], dic
 def _find_results(tx: Transaction, jobs: Sequence[NewJob]) -> dict[str, result_cache.SharedResult]:
     """Set the cache keys of jobs, and find jobs with the same results, finished or in progress.
 
-    A job for which one is found changes to the state `waiting`.
+    Each job for which such a job is found changes to the state `waiting`.
     """
     _set_cache_keys(tx, jobs)
     sources = result_cache.decide(tx, [one for one in jobs if one.state == "queued"])

@@ -167,7 +167,7 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel the tasks that have not started, of parent jobs of which a task has failed.
+    """Cancel the tasks that have not started, if another task of the same parent job has failed.
 
     This applies only to parent jobs whose results a worker would combine.
     """

@@ -265,7 +265,7 @@ def _is_workable(candidate: FromClause, restriction: _Restriction) -> ColumnElem
 
 
 class _Restriction(NamedTuple):
-    """Limits of a claim, apart from kinds and labels."""
+    """Limits of a claim, apart from the kinds and labels of jobs."""
 
     one_job: bool
     named_projects: bool

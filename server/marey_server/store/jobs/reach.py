@@ -135,7 +135,7 @@ def _follow(tx: Transaction, pins: Pins) -> set[str]:
 
 
 def _texts(tx: Transaction, items: Collection[str]) -> Iterator[Any]:
-    """Yield the texts of the documents of items, with item and revision."""
+    """Yield the JSON text of each document of items, with the item and the revision."""
     statement = (
         select(revision_part.c.item_id, revision_part.c.number, cast(document.c.body, Text).label("text"))
         .join(document, document.c.digest == revision_part.c.document_digest)

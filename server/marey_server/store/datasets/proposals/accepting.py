@@ -221,7 +221,7 @@ def _record(
 
 
 def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Proposal:
-    """Cancel the request to merge a proposal as soon as nothing is missing (`when_green`); the proposal stays open."""
+    """Withdraw a merge request that waits because of `when_green`; the proposal stays open."""
     found = find_dataset(tx, projects.require(tx, project), name)
     row = lock_open(tx, found.id, number)
     if is_waiting(row):
@@ -232,9 +232,9 @@ def withdraw_merge(tx: Transaction, project: str, name: str, number: int) -> Pro
 def merge_if_green(
     tx: Transaction, project: str, name: str, row: Row[Any], prepared: PreparedAcceptance | None
 ) -> None:
-    """Merge a locked proposal if it was to be merged as soon as nothing is missing, and nothing is missing now.
+    """Merge a locked proposal if its merge was requested with `when_green` and nothing is missing any more.
 
-    Nothing happens if the user who asked for the merge may no longer move the branch. Raises `ConflictProblem` if a
+    Nothing happens if the user who requested the merge may no longer move the branch. Raises `ConflictProblem` if a
     branch has moved since the merge was prepared.
     """
     if not is_waiting(row):

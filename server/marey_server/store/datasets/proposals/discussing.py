@@ -56,7 +56,7 @@ def next_number(tx: Transaction, table: Table, row: Row[Any], things: str) -> in
     count: int = tx.execute(held).scalar_one()
     if count >= MOST_OF_EACH:
         raise ConflictProblem(
-            f"A proposal has at most {MOST_OF_EACH:,} {things}; close it and open another one.",
+            f"A proposal has at most {MOST_OF_EACH:,} {things}; close this one and open another.",
             code="long-proposal",
         )
     return count + 1
