@@ -134,7 +134,10 @@ class Running:
 
 @asynccontextmanager
 async def listening(app: Application) -> AsyncIterator[Running]:
-    """Accept requests inside the block; then refuse new ones, finish those in progress, and close."""
+    """Accept requests while the `async with` block runs.
+
+    At its end, new requests are refused, those in progress are finished, and everything is closed.
+    """
     settings = app.services.settings
     try:
         sockets = bind_sockets(settings.port, settings.host)
@@ -262,7 +265,7 @@ async def warming(children: Children) -> AsyncIterator[None]:
 
 @asynccontextmanager
 async def serving(settings: Settings) -> AsyncIterator[Running]:
-    """Run a server with its database and local workers inside the block; at its end the workers stop first."""
+    """Run a server with its database and local workers while the `async with` block runs; the workers stop first."""
     database = open_database(settings)
     async with (
         listening(create_app(settings, database)) as running,
@@ -279,7 +282,7 @@ async def serving(settings: Settings) -> AsyncIterator[Running]:
 
 
 def make_worker_token(database: Database, settings: Settings) -> str:
-    """Create a token for the workers that this process starts, which can claim jobs and do nothing else.
+    """Create a token for the workers that this process starts; a worker can claim jobs with it and do nothing else.
 
     Tokens of earlier starts at this address are revoked; servers at other addresses with the same database keep theirs.
     """

@@ -99,7 +99,7 @@ def backup(*, target: Path, **settings: Any) -> None:
 
 
 def restore(*, source: Path, **settings: Any) -> None:
-    """Restore a database from a backup; refused if a database exists at that place."""
+    """Restore a database from a backup; fail if a database exists already at the place in the settings."""
     chosen = read_settings(**settings)
     target = _sqlite_file(chosen, must_exist=False)
     # A log that stays behind would be played into the backup.
@@ -211,7 +211,7 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
 
 @contextmanager
 def _database_of(settings: Settings) -> Iterator[str]:
-    """Yield the URL of the database; report an error inside the block in one sentence."""
+    """Yield the URL of the database; if it cannot be used, convert the error in the `with` block to `CommandFailed`."""
     from marey_server.store.database.opening import DatabaseUnusable, opening
 
     try:

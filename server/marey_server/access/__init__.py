@@ -1,1 +1,1 @@
-"""Access control: principals, roles, scopes, passwords and token secrets. The database is only used in `store`."""
+"""Access control: principals, roles, scopes, passwords and token secrets. Only `store` uses the database."""

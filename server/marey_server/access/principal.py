@@ -1,4 +1,4 @@
-"""Principal: the user, worker or anonymous client on whose behalf a service function runs."""
+"""Principal: the user, worker or anonymous client on whose behalf a transaction runs."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def issue_prefix() -> str:
 
 
 def issue_attempt_token() -> IssuedToken:
-    """Create the token of an attempt; its row is found by the hash."""
+    """Create the token of an attempt; the hash of its secret identifies the attempt in the database."""
     return _attempt_token(secrets.token_hex(32))
 
 

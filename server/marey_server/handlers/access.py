@@ -84,7 +84,7 @@ class PasswordResource(Resource):
     """Base class of resources that check passwords."""
 
     async def check_password(self, name: str, password: str) -> tuple[SignInTry, str | None]:
-        """Count a try and check its password; return the stored hash that it matches, or None.
+        """Count a try to sign in and check its password; return the stored hash if the password matches, or else None.
 
         The check takes the same time for a user who does not exist. Raises `TooManyRequestsProblem` or
         `UnavailableProblem`.
@@ -256,7 +256,7 @@ class UserResource(PasswordResource):
 
     @reads(access=Access.USER, answer=User, etag=True)
     async def get(self, user: str) -> Rendered:
-        """Return a user; only administrators and this user may read it."""
+        """Return a user; only administrators and the user may do this."""
         return await self.answer(users.find_user, user)
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
@@ -302,7 +302,7 @@ class UserQuotas(Resource):
 
     @reads(access=Access.USER, answer=QuotasInUse)
     async def get(self, user: str) -> Rendered:
-        """Return a user's number of items and bytes, and the limits; only administrators and this user may do so."""
+        """Return a user's numbers of items and bytes, with the limits; only administrators and the user may do this."""
         return await self.answer(users.read_quotas, user)
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)

@@ -27,7 +27,7 @@ class ProjectCollections(Resource):
 
     @reads(access=Access.READER, query=CollectionsQuery, answer=Collection, paged=True)
     async def get(self, project: str, query: CollectionsQuery) -> Rendered:
-        """List folders by path."""
+        """List the folders of a project in the order of their paths."""
         return await self.answer(
             collections.list_collections,
             project,

@@ -22,7 +22,7 @@ MAX_DOCUMENT_BYTES = 128 * MIB
 
 
 class ItemsQuery(CountedPageQuery):
-    """Filters, order and detail of a list of items."""
+    """Query parameters of a list of items: filters, order, and the members of each item to return."""
 
     collection: str | None = Field(None, max_length=1024, description="Return items in this folder or below it.")
     directly_in: str | None = Field(
@@ -223,7 +223,7 @@ class LineageGraphResource(Resource):
 
     @reads(access=Access.READER, query=LineageRequest, answer=LineageGraph)
     async def get(self, project: str, kind: str, item: str, query: LineageRequest) -> Rendered:
-        """Return the revisions that a revision was made from and that were made from it, and the jobs between them."""
+        """Return the revisions that a revision was made from, those made from it, and the jobs between them."""
         return await self.answer(items.read_lineage_graph, project, kind_of(kind), item, query)
 
 

@@ -113,7 +113,7 @@ class ProjectMembers(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=Member, paged=True, public=False)
     async def get(self, project: str, query: PageQuery) -> Rendered:
-        """List the members and their roles."""
+        """List the members of a project and their roles."""
         return await self.answer(members.list_members, project, cursor=query.cursor, limit=query.limit)
 
 

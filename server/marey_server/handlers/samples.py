@@ -92,7 +92,7 @@ class SampleFiles(ModelUser):
         answer_types=(*MOTION_MEDIA_TYPES, "application/zip"),
     )
     async def get(self, project: str, kind: str, item: str, query: SampleFileQuery) -> Reply:
-        """Return motions drawn from a model (kind `models`) as files: one alone, several as a ZIP archive."""
+        """Return motions drawn from a model (kind `models`): one as a file, several as a ZIP archive of files."""
         found, model = await self.found_model(project, kind, item, query.revision)
         order = SampleFileOrder(
             found=found, model=model, count=query.n, seed=query.seed, format=query.format, unit=query.unit

@@ -40,7 +40,7 @@ class Caller:
     principal: Principal | None = None
 
     def identify(self, tx: Transaction) -> None:
-        """Resolve the credential and set the transaction's principal, within the limits of the operation.
+        """Find the principal of the credential, check its access to the operation, and give it to the transaction.
 
         The store enforces the role that the operation declares. Raises `UnauthenticatedProblem` or `ForbiddenProblem`.
         """

@@ -180,7 +180,7 @@ class Resource(Exchange):
 
     @asynccontextmanager
     async def using_children(self) -> AsyncIterator[None]:
-        """Count this request, inside the block, among those that use child processes.
+        """Count this request among those that use child processes, while the `async with` block runs.
 
         Raises `UnavailableProblem` if too many requests use child processes or wait for one.
         """

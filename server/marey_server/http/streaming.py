@@ -82,7 +82,7 @@ def _open_blob(tx: Transaction, digest: str, wanted: ByteRange | None, *, head: 
 
 
 def attachment(file_name: str) -> str:
-    """Return the Content-Disposition of a file (RFC 6266), with a name of any characters."""
+    """Return the header Content-Disposition (RFC 6266) for a file name with any characters."""
     plain = "".join(sign if " " <= sign <= "~" and sign not in '"\\%' else "_" for sign in file_name)
     return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(file_name, safe='')}"
 

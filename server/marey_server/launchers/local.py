@@ -33,7 +33,7 @@ STOP_S = 20.0
 async def local_workers(
     count: int, *, url: str, token: str, cache: Path, log_form: LogForm, log_level: str
 ) -> AsyncIterator[None]:
-    """Keep `count` workers running inside the block; at its end, ask them to stop.
+    """Keep `count` workers running while the `async with` block runs; at its end, ask them to stop.
 
     Parameters
     ----------

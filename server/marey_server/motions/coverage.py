@@ -260,7 +260,7 @@ def _online(state: bytes) -> OnlineCoverage:
 
 
 def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrames) -> int:
-    """Add the poses of a request to the stream, and return the number of windows that they complete."""
+    """Add the poses of a request to the stream, and return the number of time windows that they complete."""
     from marey_motion.documents import clip_from_document
 
     if order.rig is None:
@@ -327,7 +327,7 @@ def _load_kernels(body: MatchingBody | None) -> None:
 
 @contextmanager
 def refusing(field: str) -> Iterator[None]:
-    """Convert motion errors inside the block to errors that point at a field of the request."""
+    """Convert motion errors in the `with` block to errors that point at the field `field` of the request."""
     from marey_motion.errors import MotionError
 
     try:

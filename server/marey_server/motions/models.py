@@ -217,7 +217,7 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def _draw(primitive: MotionPrimitive, count: int, seed: int) -> tuple[Floats, list[Clip]]:
-    """Return latent vectors (count, L) drawn from the model, and their motions."""
+    """Return latent vectors, of shape (count, L), drawn from the model, and their motions."""
     latents = primitive.sample(count, seed)
     frames = float((primitive.time_functions(latents)[:, -1] + 1.5).sum())
     size = frames * primitive.spatial.mean.shape[1] * 4

@@ -54,7 +54,7 @@ class DiskSpace:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free space of a folder's disk, after removing the reserve if hardly any is left."""
+    """Return the free space of a folder's disk; if hardly any is left, remove the reserve file first."""
     free, file = shutil.disk_usage(folder).free, folder / RESERVE_FILE
     if free >= RESERVE_BYTES or not file.exists():
         return free

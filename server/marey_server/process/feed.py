@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 @asynccontextmanager
 async def following_feed(services: Services) -> AsyncIterator[None]:
-    """Wake this process's waiting requests after changes of any server process, inside the block."""
+    """Wake waiting requests of this process after changes by any server process, while the `async with` block runs."""
     tasks = [asyncio.create_task(_follow(services))]
     if not services.database.is_sqlite:
         tasks.append(asyncio.create_task(_listen(services)))
@@ -74,7 +74,10 @@ class _FeedPosition:
         self._look_for_due_at_s = 0.0
 
     async def announce_news(self) -> None:
-        """Wake the requests that wait for an event since the last call, and the workers that wait for a due retry."""
+        """Wake the requests that wait for an event which has occurred since the last call.
+
+        Also wake workers that wait for jobs of a kind if a retry of such a job has become due.
+        """
         await self._services.number_events()
         if self._last is None:
             self._last = await self._read(events.newest_number)

@@ -42,7 +42,7 @@ FIRST_GARBAGE_S = 60.0
 
 @asynccontextmanager
 async def keeping_house(services: Services) -> AsyncIterator[None]:
-    """Run the periodic work inside the block; at its end, give up the leadership."""
+    """Run the periodic work while the `async with` block runs; at its end, give up the leadership."""
     holder = secrets.token_hex(8)
     tick_s = min(LONGEST_TICK_S, services.queue_policy.lease_ttl_s / 4)
     chores = (
@@ -97,7 +97,7 @@ async def _reap(services: Services, holder: str) -> None:
 
 
 def _look_round(tx: Transaction, holder: str, grace: StartGrace) -> tuple[bool, bool]:
-    """Return whether this process leads, and whether the `grace` period is over.
+    """Return whether this process is the leader, and whether the `grace` period is over.
 
     In this period after a start or an interruption, workers can renew leases that expired in the meantime.
     """
@@ -117,14 +117,14 @@ async def _reap_pages(services: Services) -> None:
 
 
 async def _share_results(services: Services, holder: str) -> None:
-    """Give each job that waits for the result of an identical job this result, if the identical job has succeeded."""
+    """Give waiting jobs the results of identical jobs that have succeeded."""
     if await _write(services, _leads, holder):
         while await _write(services, reaper.share_waiting) > 0:
             pass
 
 
 def _leads(tx: Transaction, holder: str) -> bool:
-    """Return whether this process leads."""
+    """Return whether this process is the leader."""
     return leader.take_lead(tx, LEAD, holder, LEAD_TTL_US) is not None
 
 

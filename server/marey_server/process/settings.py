@@ -24,7 +24,7 @@ PREFIX = "MAREY_"
 
 
 class Settings(BaseSettings):
-    """Settings of a server. The variable of `data` is MAREY_DATA, and so on."""
+    """Settings of a server. The environment variable of the setting `data` is MAREY_DATA, and so on."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, toml_file="marey.toml", extra="forbid", frozen=True)
 

@@ -1,4 +1,4 @@
-"""Backings that store the bytes of blobs; the rows of `blob` say which blobs exist.
+"""Backings that store the bytes of blobs; the rows of the table `blob` say which blobs exist.
 
 A backing is called inside the transaction that inserts or deletes the blob's row. That row is the lock: nobody else can
 write or remove the same bytes before the transaction ends.

@@ -85,7 +85,10 @@ def list_collections(
     cursor: str | None = None,
     limit: int = listing.DEFAULT_LIMIT,
 ) -> Page:
-    """List the collections at and below `path`, sorted by path, without the root; or, with `deleted`, deleted ones."""
+    """List the collections at and below `path`, without the root, in the order of their paths.
+
+    With `deleted`, deleted collections are listed instead.
+    """
     project_row = projects.require(tx, project, at_least=Role.CONTRIBUTOR if deleted else Role.READER)
     order = listing.parse_order("path", {"path": collection.c.path, "id": collection.c.id})
     statement = select(collection).where(

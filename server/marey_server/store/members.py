@@ -20,7 +20,7 @@ from marey_server.store.transaction import Transaction
 def list_members(
     tx: Transaction, project_name: str, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """List the members by name. Guests of a public project may not see them."""
+    """List the members of a project in the order of their names. Guests of a public project may not see them."""
     project_row = projects.require(tx, project_name)
     statement = select(user.c.name, member).join(user, user.c.id == member.c.user_id)
     statement = statement.where(member.c.project_id == project_row.id)

@@ -308,7 +308,7 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
 
 
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
-    """Change the limits of a project; for administrators."""
+    """Change the limits of a project. Only administrators may do this."""
     require_administrator(tx.principal)
     found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
     if found is None:

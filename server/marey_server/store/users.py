@@ -54,7 +54,7 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user; only administrators and this user may read it. Raises `NotFoundProblem`."""
+    """Return a user; only administrators and the user may do this. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -64,7 +64,7 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
-    """Return a user's number of items and bytes, with the limits; only administrators and this user may read them."""
+    """Return a user's numbers of items and bytes, with the limits; only administrators and the user may do this."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
         raise ForbiddenProblem(
             "This needs a token with the scope 'read' for all projects, because quotas count items of every project.",
@@ -74,13 +74,13 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
 
 
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
-    """Change the limits of a user; for administrators."""
+    """Change the limits of a user. Only administrators may do this."""
     require_administrator(tx.principal)
     return quotas.change_limits(tx, "user", find_user(tx, name).id, change)
 
 
 def list_users(tx: Transaction, *, cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT) -> Page:
-    """Return all users by name; for administrators."""
+    """List all users in the order of their names. Only administrators may do this."""
     require_administrator(tx.principal)
     order = listing.parse_order("name", {"name": user.c.name}, unique="name")
     rows, next_cursor = listing.read_page(tx, select(user), order, ["users"], cursor, limit)
@@ -197,7 +197,7 @@ def _principal(row: Row[Any]) -> Principal:
 
 
 def ensure_first_administrator(tx: Transaction) -> User | None:
-    """Create the user `admin` if the database has no users; otherwise return None."""
+    """Create and return the user `admin` if the database has no users; otherwise return None."""
     tx.lock(_ADMINISTRATORS)
     if tx.execute(select(user.c.id).limit(1)).first() is not None:
         return None

@@ -30,7 +30,7 @@ class ProjectDatasets(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=Dataset, paged=True)
     async def get(self, project: str, query: PageQuery) -> Rendered:
-        """List the datasets by name."""
+        """List the datasets of a project in the order of their names."""
         return await self.answer(datasets.list_datasets, project, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.CONTRIBUTOR, body=DatasetCreate, answer=Dataset, status=201, etag=True, idempotency="key")
@@ -70,7 +70,7 @@ class DatasetRefs(Resource):
 
     @reads(access=Access.READER, query=PageQuery, answer=Ref, paged=True)
     async def get(self, project: str, dataset: str, query: PageQuery) -> Rendered:
-        """List the branches and tags by name."""
+        """List the branches and tags of a dataset in the order of their names."""
         return await self.answer(datasets.list_refs, project, dataset, cursor=query.cursor, limit=query.limit)
 
     @writes(access=Access.CONTRIBUTOR, body=RefCreate, answer=Ref, status=201, etag=True, idempotency="key")
@@ -271,7 +271,7 @@ class DatasetEntries(Resource):
 
     @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True)
     async def get(self, project: str, dataset: str, query: EntriesQuery) -> Rendered:
-        """List the entries of a version by path."""
+        """List the entries of a version in the order of their paths."""
         return await self.answer(
             datasets.list_entries,
             project,

@@ -313,9 +313,9 @@ def _connected_with(which: ColumnElement[bool]) -> Select[Any]:
 
 
 def lock_own(tx: Transaction) -> Row[Any]:
-    """Return the row of the token of the request, which no other transaction can revoke or rotate before this one ends.
+    """Lock the row of the request's token until the transaction ends, and return it.
 
-    Raises `UnauthenticatedProblem` if it was revoked after the request was authenticated.
+    Raises `UnauthenticatedProblem` if the token was revoked after the request was authenticated.
     """
     _lock_tokens(tx, tx.principal.user_id)
     row = tx.execute(select(token).where(token.c.id == tx.principal.token_id)).one_or_none()

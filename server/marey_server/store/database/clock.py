@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class ClockFarAhead(Exception):
-    """Error of a machine whose clock is far ahead of the time at which the database was last used."""
+    """Error for a machine clock that is far ahead of the time at which the database was last used."""
 
 
 class Clock(Protocol):

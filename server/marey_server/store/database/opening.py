@@ -19,7 +19,7 @@ class DatabaseUnusable(Exception):
 
 @contextmanager
 def opening(url: str) -> Iterator[None]:
-    """Raise `DatabaseUnusable` for errors inside the block, which opens the database at `url`."""
+    """Convert errors in the `with` block, which opens the database at `url`, to `DatabaseUnusable`."""
     try:
         yield
     except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
@@ -57,9 +57,9 @@ def sqlite_file(url: str | URL) -> Path | None:
 
 @contextmanager
 def alone(file: Path) -> Iterator[Connection]:
-    """Open an SQLite file exclusively, and run the block in one transaction.
+    """Open an SQLite file exclusively, and run the `with` block in one transaction.
 
-    Raises `DatabaseUnusable` if another process has it open.
+    Raises `DatabaseUnusable` if another process has the file open.
     """
     engine = create_engine(f"sqlite:///{file}", poolclass=NullPool, connect_args={"timeout": 1.0})
     with engine.connect() as connection:

@@ -20,7 +20,10 @@ def is_unique_violation(error: exc.IntegrityError) -> bool:
 
 @contextmanager
 def taken(error: ApiProblem) -> Iterator[None]:
-    """Raise `error` if a statement in the block violates a unique index; the transaction cannot be used afterwards."""
+    """Raise `error` if a statement in the `with` block violates a unique index.
+
+    The transaction cannot be used afterwards.
+    """
     try:
         yield
     except exc.IntegrityError as violation:

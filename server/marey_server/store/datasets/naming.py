@@ -95,7 +95,7 @@ def read_dataset(tx: Transaction, project: str, name: str) -> Dataset:
 
 
 def list_datasets(tx: Transaction, project: str, *, cursor: str | None, limit: int) -> Page:
-    """List the datasets of a project by name."""
+    """List the datasets of a project in the order of their names."""
     project_row = projects.require(tx, project)
     order = listing.parse_order("name", {"name": dataset.c.name, "id": dataset.c.id})
     rows, following = listing.read_page(
@@ -137,7 +137,7 @@ def _shown_ref(row: Row[Any]) -> Ref:
 
 
 def list_refs(tx: Transaction, project: str, name: str, *, cursor: str | None, limit: int) -> Page:
-    """List the branches and tags of a dataset by name."""
+    """List the branches and tags of a dataset in the order of their names."""
     row = find_dataset(tx, projects.require(tx, project), name)
     order = listing.parse_order("name", {"name": dataset_ref.c.name}, unique="name")
     statement = select(dataset_ref).where(dataset_ref.c.dataset_id == row.id)

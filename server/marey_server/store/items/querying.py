@@ -38,7 +38,7 @@ Comparison = Callable[[Condition, str], ColumnElement[bool]]
 
 
 def sql_of(query: Query, project_id: str) -> ColumnElement[bool]:
-    """Return the SQL that is true for the items of a project that a query selects."""
+    """Return the SQL condition that is true for the items of a project that a query selects."""
     if isinstance(query, Condition):
         return COMPARISONS[query.field](query, project_id)
     if isinstance(query, Negation):
@@ -52,7 +52,7 @@ def _any(made: list[ColumnElement[bool]]) -> ColumnElement[bool]:
 
 
 def _is_true(condition: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return a condition that is false instead of null."""
+    """Return the condition with null replaced by false."""
     return func.coalesce(condition, false())
 
 

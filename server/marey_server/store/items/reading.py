@@ -137,7 +137,7 @@ def read_tags(tx: Transaction, item_ids: Collection[str]) -> dict[str, tuple[str
 def read_parts(
     tx: Transaction, revisions: Collection[tuple[str, int]]
 ) -> dict[tuple[str, int], dict[str, PartSummary]]:
-    """Return the parts by item and revision number."""
+    """Return the parts of the given revisions, by item id and revision number."""
     keys = {"items": list({item_id for item_id, _ in revisions}), "numbers": list({number for _, number in revisions})}
     found: dict[tuple[str, int], dict[str, PartSummary]] = {}
     for row in tx.run(_PARTS, keys):

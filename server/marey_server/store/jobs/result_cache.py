@@ -206,7 +206,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give up to `SHARED_AT_ONCE` waiting jobs the results that now exist."""
+    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist."""
     source = job.alias("source")
     rows = tx.execute(
         select(job.c.id)

@@ -109,7 +109,7 @@ def _staged_draft(prepared: PreparedOutput, pins: PinnedInputs) -> StagedDraft:
 
 
 def _pinned_sources(output: StagedOutput, pins: PinnedInputs) -> dict[str, list[list[Any]]]:
-    """Return the inputs that an output names as sources, or all of them, as (item, revision)."""
+    """Return the inputs that an output names as sources, as pairs of item and revision; all inputs if it names none."""
     if not output.sources:
         return {role: [[pin["item"], pin["revision"]] for pin in many] for role, many in pins.items()}
     return {role: [_pinned_source(role, source, pins) for source in named] for role, named in output.sources.items()}
