@@ -315,7 +315,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
 
 
 def next_command(settings: Settings, address: str) -> str:
-    """Return the first command that a user should run, with the options for server and token if it needs them."""
+    """Return the first command that a user should run, with the options for server and token if they are needed."""
     reachable = address.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     defaults = Settings.model_fields
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"

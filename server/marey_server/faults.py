@@ -1,7 +1,7 @@
 """Fault injection for tests: named points in the code where a test can kill or stop the process, or raise an error.
 
 `MAREY_FAULT=name:kill` kills the process (SIGKILL) when it passes the point `name`; `name:stop` stops it (SIGSTOP);
-`name:error` raises ENOSPC; `name@3:kill` acts on the third pass only. Several are separated by commas.
+`name:error` raises ENOSPC; `name@3:kill` acts on the third pass only. Several faults are separated by commas.
 """
 
 from __future__ import annotations

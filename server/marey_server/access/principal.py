@@ -15,8 +15,8 @@ class Principal:
 
     `scopes` are texts such as `write` or `write!project=walk`. The kind `attempt` is a worker that runs a job. Such a
     worker does not have the rights of a user, not even those of the job's author: it may read the inputs of the job and
-    the documents that they refer to, and write only data of its attempt. After its end (`ended`), it may only repeat
-    the request that ended it.
+    the documents to which these inputs refer, and write only data of its attempt. After the end of the attempt
+    (`ended`), the worker may only repeat the request that ended the attempt.
     """
 
     kind: Literal["anonymous", "user", "attempt", "system"]

@@ -147,7 +147,7 @@ class LogoutResource(Resource):
 
 
 class TokenQuery(PageQuery):
-    """Query of a list of tokens."""
+    """Query parameters of a list of tokens."""
 
     user: UserName | None = Field(
         None, description="List the tokens of this user; default: your own. Only for administrators."
@@ -164,9 +164,9 @@ class TokenQuery(PageQuery):
 
 
 class RevokeQuery(Request):
-    """Query of the revocation of a token."""
+    """Query parameters for revoking a token."""
 
-    with_created: bool = Field(False, description="Also revoke the tokens that were created with it.")
+    with_created: bool = Field(False, description="Also revoke the tokens that were created with this token.")
 
 
 class OwnTokens(Resource):

@@ -13,7 +13,7 @@ from marey_server.store import collections
 
 
 class CollectionsQuery(PageQuery):
-    """Filters of a list of folders."""
+    """Query parameters of a list of folders."""
 
     path: str = Field("", max_length=1024, description="Folder whose subtree is listed, itself included.")
     deleted: bool = Field(False, description="List deleted folders instead of existing ones.")

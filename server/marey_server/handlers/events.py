@@ -23,7 +23,7 @@ LOOK_AGAIN_EVERY = 4
 
 
 class EventsQuery(Request):
-    """The position and number of events to read."""
+    """Query parameters for reading events: the position in the feed, and the number of events."""
 
     after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0: from the beginning.")
     limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Greatest number of events in a page.")
@@ -48,7 +48,7 @@ class Events(Resource):
     async def get(self, project: str, query: EventsQuery) -> Reply | None:
         """Return events in the order of their commits; as text/event-stream, also events that occur later.
 
-        If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and its context
+        If events after `after` were deleted because they are old, the answer is 410 (`events-deleted`), and `context`
         contains the number after which the remaining events begin.
         """
         after = self._last_received(query)

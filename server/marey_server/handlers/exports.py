@@ -31,7 +31,7 @@ from marey_server.motions.predecessor_exports import PredecessorOptions
 
 
 class ExportQuery(Request):
-    """Format and options of the exported file."""
+    """Query parameters of an export: the format and the options of the file."""
 
     format: ExportFormat = Field("original", description="File format; original: the file exactly as it was imported.")
     unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")

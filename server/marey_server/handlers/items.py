@@ -198,7 +198,7 @@ class RevisionResource(Resource):
 
 
 class LineageQuery(Request):
-    """Query of a lineage: the revision that it starts from."""
+    """Query parameters of a lineage: the revision from which it starts."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
 
@@ -240,7 +240,7 @@ class StalenessResource(Resource):
 
 
 class ExplanationQuery(Request):
-    """Query to explain, and the folder that it is applied to."""
+    """Query parameters of an explanation: the query to explain, and the folder whose items are counted."""
 
     query: str = Field(max_length=MOST_CHARACTERS, description="Query, as for the list of items.")
     collection: str | None = Field(

@@ -25,7 +25,7 @@ FrameRange = Annotated[str, StringConstraints(pattern=r"^\d{0,9}:\d{0,9}$")]
 
 
 class PartQuery(Request):
-    """Revision, frames and joints of a part to read."""
+    """Query parameters for reading a part: its revision, frames and joints."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision to return; absent: the newest.")
     frames: FrameRange | None = Field(None, description="Half-open range of frames, such as 100:200, :200 or 100:.")
@@ -40,7 +40,7 @@ class PartQuery(Request):
 
 
 class PartChange(Request):
-    """Query of a change of a part: the message of the new revision."""
+    """Query parameters for replacing a part: the message of the new revision."""
 
     message: Message = Field("", description="Message shown in the history.")
 

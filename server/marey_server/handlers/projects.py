@@ -13,7 +13,7 @@ from marey_server.store import members, projects
 
 
 class ProjectsQuery(PageQuery):
-    """Page and order of a list of projects."""
+    """Query parameters of a list of projects: the page and the order."""
 
     sort: str = Field(
         "name",

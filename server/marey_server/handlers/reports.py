@@ -34,13 +34,13 @@ SHOWN_ONLY = "default-src 'none'; base-uri 'none'; form-action 'none'; style-src
 
 
 class ReportQuery(Request):
-    """Query of a report: the revision to read."""
+    """Query parameters of a report: its revision."""
 
     revision: int | None = Field(None, ge=1, le=MAX_INTEGER, description="Revision of the report; absent: the newest.")
 
 
 class FigureQuery(ReportQuery):
-    """Query of a figure: its form and the revision."""
+    """Query parameters of a figure: its form, and the revision of the report."""
 
     format: Literal["png", "svg", "csv", "json"] = Field(
         "png", description="Form of the figure: an image (png, svg) or the plotted data (json, csv)."
@@ -152,7 +152,7 @@ def file_of(figure: StoredFigure, query: FigureQuery) -> StoredFile:
 
 
 class WalkGraphQuery(ReportQuery):
-    """Query of a walk graph: the trials and the form."""
+    """Query parameters of a walk graph: its format, and the trial that it shows."""
 
     format: WalkGraphFormat = Field(
         "json", description="Format of the graph; GraphML can be read by networkx, Gephi, yEd and igraph."

@@ -20,7 +20,7 @@ from marey_server.motions.searching import FoundSearchable
 
 
 class SampleQuery(Request):
-    """Query of samples: their number, seed, and the model's revision."""
+    """Query parameters of samples: their number and seed, and the revision of the model."""
 
     n: int = Field(
         1,
@@ -35,7 +35,7 @@ class SampleQuery(Request):
 
 
 class SampleFileQuery(SampleQuery):
-    """Query of samples as files: the samples to draw, and the format."""
+    """Query parameters of samples as files: in addition, the file format and the unit of length."""
 
     format: MotionFormat = Field(
         DEFAULT_FORMAT, description="File format; several files are returned in one ZIP archive."

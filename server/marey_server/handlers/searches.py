@@ -20,7 +20,7 @@ from marey_server.motions.searching import SearchedModels
 
 
 class FoundFileQuery(Request):
-    """Query of a search with a file as result: its format and unit."""
+    """Query parameters of a search whose result is a file: the format of the file and its unit of length."""
 
     format: MotionFormat = Field(DEFAULT_FORMAT, description="File format of the motion.")
     unit: WrittenUnit = Field(DEFAULT_UNIT, description="Unit of length of a BVH file.")

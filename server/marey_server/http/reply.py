@@ -80,7 +80,7 @@ class Rendered:
     body: bytes
 
     def without_content(self) -> Rendered:
-        """Return this answer for a caller who may make the change but not read its result."""
+        """Return this answer without its body, for a caller who may make the change but not read its result."""
         headers = {name: value for name, value in self.headers.items() if name != "Content-Type"}
         return Rendered(204, headers, b"")
 

@@ -63,7 +63,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 INLINE_BYTES = 4 * KIB
-"""Greatest size of JSON bodies that are decoded on the event loop; larger ones, and other forms, in a thread."""
+"""Greatest size of JSON bodies that are decoded on the event loop; all other bodies are decoded in a thread."""
 CLIENT_GONE = "The client closed the connection before this was computed."
 GUEST_BODY_BYTES = 64 * KIB
 """Greatest size of a body that a caller without a token may send, such as a search in a public project."""

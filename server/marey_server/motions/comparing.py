@@ -1,4 +1,4 @@
-"""Differences between revisions: both are read in one transaction and compared in a child process."""
+"""Differences between two revisions, which are read in one transaction and compared in a child process."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class BegunStream(Message):
 
 
 class AdvancedStream(Message):
-    """State of a stream after its next frames, and the answer to them."""
+    """New state of a stream to which frames were added, and the answer to the request that sent these frames."""
 
     answer: Tree
     offset: int

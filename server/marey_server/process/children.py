@@ -83,7 +83,7 @@ class ChildTask(Generic[T]):
             self._child = child
 
     def stop(self, reason: str) -> None:
-        """Kill the child that runs this task, if one does."""
+        """Kill the child that runs this task, if there is one."""
         with self._lock:
             if self._child is not None and not self.stopped:
                 self.stopped = reason
@@ -138,7 +138,7 @@ class Children:
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """The number of tasks that run in children, and of those that wait for one."""
+        """The number of tasks that run in children, and the number of tasks that wait for a child."""
         return len(self._running), len(self._waiting)
 
     @contextmanager

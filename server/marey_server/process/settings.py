@@ -275,7 +275,10 @@ class Settings(BaseSettings):
 
     @property
     def resolved_database_threads(self) -> int:
-        """Return the number of threads for reads; by default few on SQLite, whose reads never wait for a server."""
+        """Return the number of threads for reads.
+
+        The default is small for SQLite, because its reads do not wait for a network.
+        """
         return self.database_threads or (2 if self.resolved_database_url.startswith("sqlite") else 8)
 
     @property
@@ -285,7 +288,7 @@ class Settings(BaseSettings):
 
 
 def misspelt_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return environment variables that begin like a setting but are not one, each with the most similar setting."""
+    """Return the environment variables that look like misspelt settings, each with the most similar setting."""
     known = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
     unknown = [name for name in environment if name.startswith(PREFIX) and name.upper() not in known]
     own = [name for name in unknown if not name.startswith(f"{PREFIX}TEST_")]

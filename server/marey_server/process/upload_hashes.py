@@ -21,7 +21,7 @@ READ_BYTES = 4 * 2**20
 
 
 class _RunningHash:
-    """Hash of the first `offset` bytes of an upload, and the file to which they are copied, if there is one."""
+    """Hash of the first `offset` bytes of an upload, and the file to which these bytes are copied, if there is one."""
 
     def __init__(self, copy: Path | None) -> None:
         self.lock = threading.Lock()

@@ -76,7 +76,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class StreamStep:
-    """Update of a stream: digest of the request, its answer, and the state after it."""
+    """Update of a stream: the digest of the request, the answer to it, and the new state of the stream."""
 
     said: str
     answer: Tree

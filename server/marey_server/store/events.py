@@ -63,7 +63,7 @@ def list_events(
 
 
 def require_kept(tx: Transaction, after: int) -> None:
-    """Check that no event after the one numbered `after` was deleted, so that a client which received it misses none.
+    """Check that no event after the one numbered `after` was deleted, so that a client has missed none.
 
     Raises `GoneProblem`.
     """

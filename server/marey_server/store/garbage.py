@@ -160,7 +160,10 @@ def _sweep_strays(database: Database, grace_us: int) -> int:
 
 
 def _remove_stray(tx: Transaction, digest: str) -> int:
-    """Remove a blob's bytes if it has no row; the lock on the row's key keeps others from storing them meanwhile."""
+    """Remove the bytes of a blob if the blob has no row; return how many blobs were removed.
+
+    A lock on the key of the row keeps other writes from storing the bytes at the same time.
+    """
     row = {"digest": digest, "size_bytes": 0, "created_us": tx.now_us}
     if tx.execute(tx.insert_or_ignore(blob, row).returning(blob.c.digest)).first() is None:
         return 0

@@ -78,7 +78,7 @@ def make_cursor(tx: Transaction, order: Order, identity: Any, values: Sequence[A
 def read_cursor(tx: Transaction, cursor: str, order: Order, identity: Any) -> list[Any]:
     """Return the values of the last row of the page before the cursor.
 
-    Raises `BadRequestProblem` if this server did not sign the cursor, or it is from another list.
+    Raises `BadRequestProblem` if this server did not sign the cursor, or if the cursor is from another list.
     """
     try:
         data = base64.urlsafe_b64decode(cursor + "=" * (-len(cursor) % 4))

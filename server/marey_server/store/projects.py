@@ -96,9 +96,11 @@ def require(
     """Return the project `name` if the caller has the role and the scope that the transaction's operation declares.
 
     `at_least` raises the declared role and never lowers it. `deleted=True` looks for the project of this name that was
-    deleted last. Raises `NotFoundProblem` if the caller may not know that the project exists, `ForbiddenProblem` if the
-    caller lacks the role or the scope, and `UnauthenticatedProblem` if an anonymous caller could get them by signing
-    in.
+    deleted last.
+
+    Raises `NotFoundProblem` if the caller may not know that the project exists, and `ForbiddenProblem` if the caller
+    lacks the role or the scope. An anonymous caller who may get them by signing in gets `UnauthenticatedProblem`
+    instead.
     """
     required = tx.required_role
     need = at_least if roles.includes(at_least, required.role) else required.role

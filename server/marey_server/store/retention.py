@@ -78,7 +78,7 @@ def _retire_logs(database: Database, days: int) -> int:
 
 
 def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tuple[str, int]]:
-    """Return the next attempts, by job and fence, that ended long ago and have a log."""
+    """Return the next attempts (job id and fence) that ended long ago and have a log."""
     statement = (
         select(attempt.c.job_id, attempt.c.fence)
         .where(

@@ -74,7 +74,7 @@ class Transaction:
         return self._now_us
 
     def beside(self, principal: Principal) -> Transaction:
-        """Return this transaction on behalf of another `principal`; both are committed together."""
+        """Return a transaction for another `principal` on the same connection; the two are committed together."""
         return Transaction(self.connection, principal, self._clock, self.blobs, self.quotas)
 
     @property

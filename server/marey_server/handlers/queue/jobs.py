@@ -69,7 +69,7 @@ class JobKindResource(Resource):
 
 
 class JobsQuery(CountedPageQuery):
-    """Filters and order of a list of jobs."""
+    """Query parameters of a list of jobs: filters and order."""
 
     state: CommaSeparatedOf[JobState] = Field((), description="Return jobs in any of these states.")
     kind: CommaSeparated = Field((), description="Return jobs of any of these kinds.")
@@ -226,7 +226,7 @@ class JobResults(Resource):
 
 
 class JobEventsQuery(Request):
-    """The position and number of events to read."""
+    """Query parameters for reading events: the position in the feed, and the number of events."""
 
     after: int = Field(0, ge=0, le=2**62, description="Number of the last event received; 0: from the beginning.")
     limit: int = Field(100, ge=1, le=events.MAX_EVENTS, description="Greatest number of events in a page.")
@@ -246,7 +246,7 @@ class JobEvents(Resource):
 
 
 class JobLogQuery(Request):
-    """Query of a page of a log."""
+    """Query parameters of a page of a log."""
 
     offset: int = Field(0, ge=0, le=2**53, description="Offset of the first byte to return.")
     limit: int = Field(MOST_READ_BYTES, ge=1, le=MOST_READ_BYTES, description="Greatest number of bytes to return.")
@@ -294,8 +294,8 @@ class JobRetry(Resource):
     async def post(self, job: str) -> Rendered:
         """Submit a failed or cancelled job again with the same inputs; the answer is the new job.
 
-        Dependencies of the job that did not succeed are retried, too, and so are jobs that ended only because this job
-        did not succeed. So the rest of a pipeline continues.
+        Unsuccessful dependencies of the job are retried, too, and so are jobs that ended only because this job did not
+        succeed. So the rest of a pipeline continues.
         """
         return await self.answer_with(_accepted, retrying.retry_job, job)
 

@@ -22,7 +22,7 @@ class ProjectContents(Resource):
 
     @reads(access=Access.READER, body=ContentsRequest, answer=Document)
     async def post(self, project: str, body: ContentsRequest) -> Rendered:
-        """Return revisions by their content digests, and documents of them.
+        """Return the revisions with the given content digests, and documents of such revisions.
 
         The answer is `{"revisions": [...], "documents": [...]}` in the order of the request. A revision has its `kind`
         and the content digests of its `parts`. In documents, references to revisions are replaced by `{"content":
@@ -47,10 +47,10 @@ class ReceivedContents(Resource):
     async def post(self, project: str, dataset: str, body: ReceivedRevisions) -> Rendered:
         """Store revisions from an archive or another server, so that received commits can refer to them.
 
-        A revision must come after those that it refers to, which are named by their content digests. The revision of an
-        entry gets an item that is deleted at once; a checkout of a version with the entry restores the item. Other
-        revisions get items in the folder `imported`. Because quotas do not count deleted items, only maintainers may do
-        this.
+        A revision must come after the revisions that it refers to; a reference gives the content digest of a revision.
+        The revision of an entry gets an item that is deleted at once; a checkout of a version with the entry restores
+        the item. Other revisions get items in the folder `imported`. Because quotas do not count deleted items, only
+        maintainers may do this.
         """
         local = await self.look_up(datasets.find_local, project, body.revisions)
         drafts = await self.compute(datasets.prepare_revisions, body.revisions, local)

@@ -187,7 +187,7 @@ class DatasetMerges(Resource):
 
 
 class CherryPicks(Resource):
-    """Changes of single commits that are repeated on branches."""
+    """Cherry-picks: the changes of single commits, repeated on branches."""
 
     path = "/projects/{project}/datasets/{dataset}/cherry-picks"
     tag = "ProjectDatasets"
@@ -208,7 +208,7 @@ class CherryPicks(Resource):
 
 
 class DatasetReverts(Resource):
-    """Changes of single commits that are undone on branches."""
+    """Reverts: the changes of single commits, undone on branches."""
 
     path = "/projects/{project}/datasets/{dataset}/reverts"
     tag = "ProjectDatasets"
@@ -238,8 +238,8 @@ class FolderCheckout(Resource):
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
         """Bring the folder of the dataset to the state of a version: items are added, changed, moved and removed.
 
-        Changes in the folder that no commit has recorded are refused with 409, unless they are to be discarded.
-        Removed items can be restored, and earlier revisions stay.
+        If the folder has changes that no commit has recorded, the request is refused with 409, unless it asks to
+        discard them. Removed items can be restored, and earlier revisions stay.
         """
         return await self.answer(datasets.check_out, project, dataset, body)
 
@@ -257,7 +257,7 @@ class DatasetCommit(Resource):
 
 
 class EntriesQuery(PageQuery):
-    """Query of a list of entries."""
+    """Query parameters of a list of entries."""
 
     version: Version = Field(MAIN, description="Version whose entries are listed.")
     path: CollectionPath = Field("", description="Entry, or folder whose entries are listed; empty: all entries.")
@@ -284,7 +284,7 @@ class DatasetEntries(Resource):
 
 
 class BlameQuery(Request):
-    """Query of the origins of an entry's content."""
+    """Query parameters for the origins of an entry's content."""
 
     version: Version = Field(MAIN, description="Version that has the entry.")
     entry: EntryPath = Field(description="Path of the entry.")
@@ -306,7 +306,7 @@ class EntryBlame(Resource):
 
 
 class DifferenceQuery(Request):
-    """Query of the difference of two versions."""
+    """Query parameters for the difference of two versions."""
 
     before: Version = Field(f"{MAIN}~1", description="The earlier version.")
     after: Version = Field(MAIN, description="The later version.")

@@ -35,7 +35,7 @@ TRIES = 3
 
 
 class ProposalsQuery(PageQuery):
-    """Query of a list of proposals."""
+    """Query parameters of a list of proposals."""
 
     state: ProposalState | None = Field(None, description="State of the proposals; absent: any.")
 

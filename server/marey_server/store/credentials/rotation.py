@@ -35,7 +35,7 @@ def rotate_token(tx: Transaction, token_id: str, request: TokenRotation) -> NewT
     elif not secret_matches(request.rotation_id, old.rotation_hash):
         raise ConflictProblem(
             f"The token {token_id} was already rotated, with another rotation_id. If you did not do this, somebody "
-            "else knows the token: revoke it with the tokens that were created with it.",
+            "else knows the token: revoke it, together with all tokens that were created with it.",
             code="token-rotated",
         )
     made = tx.execute(select(token).where(token.c.successor_of == token_id)).one_or_none()

@@ -143,9 +143,9 @@ def _resolve_attempt(tx: Transaction, secret: str) -> Principal:
 def create_token(tx: Transaction, request: TokenCreate) -> NewToken:
     """Create a token of the caller; its secret is shown once.
 
-    Raises `ForbiddenProblem` if it would have a scope that the caller's own token lacks, would allow workers a label
-    that the caller's token does not allow, or would be valid longer than the caller's token. Raises `InvalidProblem`
-    for labels without the scope `work`.
+    Raises `ForbiddenProblem` if the new token would have a scope that the caller's own token lacks, would allow workers
+    a label that the caller's token does not allow, or would be valid longer than the caller's token. Raises
+    `InvalidProblem` for labels without the scope `work`.
     """
     user_id = _require_user(tx.principal, "write")
     if beyond := scopes.exceeding(request.scopes, tx.principal.scopes):
@@ -277,8 +277,10 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
     """Revoke a token of the caller; administrators may revoke any token. Raises `NotFoundProblem`.
 
     With `with_created`, also revoke the successors and predecessors of this token, all tokens that were created with
-    any of these, and so on. Without `with_created`, only this token is revoked, and the records that refer to it are
-    corrected: the tokens created with it are recorded as created with its own creator, and its successor becomes the
+    any of these, and so on.
+
+    Without `with_created`, only this token is revoked. Tokens that were created with the revoked token are then
+    recorded as created with its parent, the token with which it was itself created. Its successor is recorded as the
     successor of its predecessor. A token may always revoke itself.
     """
     principal = tx.principal

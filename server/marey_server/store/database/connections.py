@@ -6,7 +6,7 @@ admission.
 
 A read sees one snapshot and cannot write. A write is READ COMMITTED on Postgres, so that the conditions of an UPDATE
 are checked against the current row once it is locked. SQLite has one writer lane: writes run one after another, each
-starting with `BEGIN IMMEDIATE`, and reads run beside it.
+starting with `BEGIN IMMEDIATE`, and reads run at the same time as writes.
 """
 
 from __future__ import annotations

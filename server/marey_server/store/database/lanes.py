@@ -49,7 +49,10 @@ class _QueuedCall:
     future: Future[Any]
 
     def run(self) -> None:
-        """Call the function and set the future, unless it was cancelled or its client has closed the connection."""
+        """Set the future to the result of the function, or to an error if the client has closed the connection.
+
+        Does nothing if the future was cancelled.
+        """
         if self.future.set_running_or_notify_cancel():
             finish(self.future, self._call)
 

@@ -37,8 +37,8 @@ def check_out(tx: Transaction, project: str, name: str, request: CheckoutRequest
     An item whose entry has moved or changed keeps its id. For an entry of the version that the folder lacks, its
     deleted item is restored if possible; otherwise a new item is created.
 
-    Raises `ConflictProblem` if the folder has changes that no commit has recorded, unless they are to be discarded, or
-    if another request changes the folder, and `InvalidProblem` if too many entries differ.
+    Raises `ConflictProblem` if the folder has changes that no commit has recorded and that are not to be discarded, or
+    if another request changes the folder. Raises `InvalidProblem` if too many entries differ.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

@@ -1,7 +1,7 @@
 """Commits: a read prepares the new version, and a short write records it.
 
-The write checks that the branch is still at the commit that the read has found, so that a version is never based on
-one state and recorded after another.
+The write checks that the newest commit of the branch is still the one that the read has found. So no version is
+computed from one commit and recorded after another.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
 
 BRANCH_MOVED = "branch-moved"
-"""Code of the error for a branch that has another newest commit than expected."""
+"""Code of the error for a branch whose newest commit is not the expected one."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def prepare_commit(tx: Transaction, project: str, name: str, request: CommitCrea
     """Compute the version that a request describes.
 
     Raises `NotFoundProblem` for an unknown branch, entry or item, `ConflictProblem` if the branch is not at the
-    expected commit, and `InvalidProblem` if the version has the same entries as the one before.
+    expected commit, and `InvalidProblem` if the new version would have the same entries as the version before it.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)
@@ -257,7 +257,7 @@ def _from_folder(
 def _from_changes(
     tx: Transaction, project_row: ProjectRow, store: StoredChunks, before: str | None, changes: Sequence[EntryChange]
 ) -> tuple[str, Contents]:
-    """Return the tree that results from changes, applied in their order, and the contents of the revisions in it."""
+    """Apply changes in their order; return the resulting tree, and the contents of the revisions in it."""
     before = before or build(store, [])
     put = [one for one in changes if isinstance(one, PutEntry)]
     rows = _items_named(tx, project_row, put)

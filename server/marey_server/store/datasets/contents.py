@@ -28,7 +28,10 @@ class Contents:
 
 
 def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents:
-    """Return the content digests of existing revisions, and of those that they refer to; compute the missing ones."""
+    """Return the content digests of existing revisions and of the revisions to which they refer.
+
+    Missing digests are computed.
+    """
     found = Contents()
     waiting: dict[RevisionKey, _Waiting] = {}
     further = set(wanted)

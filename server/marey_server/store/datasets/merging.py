@@ -79,8 +79,8 @@ def prepare_pick(tx: Transaction, project: str, name: str, request: PickRequest,
     """Compute the cherry-pick of a commit onto a branch, or with `undo` the revert of the commit.
 
     A cherry-pick merges the commit into the branch, with the parent of the commit as the merge base; a revert merges
-    the parent, with the commit as the merge base. Raises `InvalidProblem` if the commit is a merge and the request does
-    not choose one of its parents, and if the branch would not change.
+    the parent, with the commit as the merge base. Raises `InvalidProblem` if the branch would not change, or if the
+    commit is a merge and the request does not choose one of its parents.
     """
     project_row = projects.require(tx, project)
     found = find_dataset(tx, project_row, name)

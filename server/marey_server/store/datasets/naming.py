@@ -212,7 +212,7 @@ def is_tag(name: str) -> InvalidProblem:
 def delete_ref(tx: Transaction, project: str, name: str, ref: str, *, expected_rev: ExpectedRev) -> None:
     """Delete a branch or a tag; the commits stay. The branch `main` cannot be deleted.
 
-    Raises `ConflictProblem` if it is protected, or if an open proposal is about it.
+    Raises `ConflictProblem` if the branch is protected, or if an open proposal is about it.
     """
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)

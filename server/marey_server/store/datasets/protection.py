@@ -33,7 +33,7 @@ def rule_of(ref: Row[Any]) -> Protection | None:
 
 
 def require_move(ref: Row[Any], mover: Mover) -> None:
-    """Raise an error if a branch may not move to a commit that follows its newest one.
+    """Raise an error if the mover may not move a branch forward, to a commit that follows its newest commit.
 
     Raises `ForbiddenProblem` if the role is too low, and `ConflictProblem` if only proposals move the branch.
     """
@@ -52,7 +52,10 @@ def require_move(ref: Row[Any], mover: Mover) -> None:
 
 
 def require_reset(ref: Row[Any]) -> None:
-    """Raise `ConflictProblem` if a branch may not move to a commit that does not follow its newest one."""
+    """Raise `ConflictProblem` if a branch is protected against resets.
+
+    A reset moves a branch to a commit that does not follow its newest commit.
+    """
     if ref.protection is not None:
         raise ConflictProblem(
             f"The branch {ref.name!r} is protected and cannot be reset; revert single commits instead.", code=CODE

@@ -136,7 +136,7 @@ class _Ready:
     digests: Mapping[str, str]
     bodies: Mapping[str, Tree]
     stored_bytes: Mapping[str, int]
-    """Bytes that each part counts for."""
+    """Number of bytes for which each part counts in quotas."""
 
     @property
     def required(self) -> tuple[str | None, ...]:

@@ -1,4 +1,4 @@
-"""Queries as SQL: the condition that the rows of a list of items must meet."""
+"""Conversion of queries to SQL: conditions on the rows of a list of items."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def no_item(kind: Kind, item_id: str) -> NotFoundProblem:
 
 
 def shown_items(tx: Transaction, rows: Sequence[Row[Any]], *, tags: bool = True, parts: bool = True) -> list[Item]:
-    """Return items as documents; tags and parts of all of them are read in one query each."""
+    """Return items as documents; one query reads the tags of all items, and another one their parts."""
     tags_of = read_tags(tx, [row.id for row in rows]) if tags and rows else {}
     parts_of = read_parts(tx, [(row.id, row.head) for row in rows]) if parts and rows else {}
     return [

@@ -152,7 +152,7 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 
 
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
-    """Count ended tasks at their parent jobs, and gather the results of those whose last task has ended."""
+    """Update the number of ended tasks of parent jobs; gather the results of parent jobs whose last task has ended."""
     following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
         left = tx.execute(

@@ -1,4 +1,4 @@
-"""Items that an attempt may read: the inputs of its job, and the items to which these and the parameters refer.
+"""Items that an attempt may read: the inputs of its job, and the items to which these inputs and the parameters refer.
 
 A clip names its skeleton, an annotation its clip, an evaluation its clips. Jobs follow such references while they run,
 so an attempt may read the items that the references lead to, in its project, and no others.
@@ -64,7 +64,7 @@ def unreachable_places(tx: Transaction, wanted: Iterable[PinnedPlace]) -> set[Pi
 
 
 def reachable_blobs(tx: Transaction, digests: Collection[str]) -> set[str]:
-    """Return the blobs that the attempt's job, its tasks, and the documents that it may read refer to."""
+    """Return the blobs to which the attempt's job, the tasks of the job, and the documents that it may read refer."""
     principal = tx.principal
     of_job = (
         select(job_blob.c.blob_digest)

@@ -26,7 +26,7 @@ PAGE = 256
 
 
 class StartGrace:
-    """Delay of the reaper by one lease after this process started or the database was unreachable.
+    """Delay of the reaper by the time of one lease, after this process has started or the database was unreachable.
 
     Leases expire while nobody can renew them; during the delay, live workers renew theirs. A jump of the clock has the
     same effect as an interruption; so has a long write that blocked all other writes, and therefore heartbeats.

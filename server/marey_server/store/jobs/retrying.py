@@ -73,7 +73,7 @@ class _Family:
             ids = [one for one, state in states.items() if state in UNSUCCESSFUL]
 
     def add_dependants(self) -> None:
-        """Add the jobs that ended only because one of these did not succeed, recursively."""
+        """Add the jobs that ended only because one of the jobs in this set did not succeed, recursively."""
         behind: Collection[str] = list(self._rows)
         while behind:
             rows = {row.id: row for row in self._doomed_after(behind)}
@@ -84,7 +84,7 @@ class _Family:
             self._take({one: rows[one] for one in behind}, {one: needs[one] for one in behind})
 
     def submit(self) -> dict[str, Job]:
-        """Submit the jobs again; return the new ones by the ids of the old ones."""
+        """Submit the jobs again; return the new jobs by the ids of the old ones."""
         again = {one: new_id("job") for one in self._rows}
         outside = {latest for needs in self._needs.values() for latest in needs.values()} - again.keys()
         upstream = dict.fromkeys(again.values(), JobState.WAITING)
@@ -106,7 +106,7 @@ class _Family:
             raise ConflictProblem(detail, code="too-many")
 
     def _doomed_after(self, ids: Collection[str]) -> Iterable[Row[Any]]:
-        """Return the jobs that ended only because one of these did not succeed.
+        """Return the jobs that ended only because one of the given jobs did not succeed.
 
         Jobs that have a retry already, or that the caller may not retry, are left out.
         """

@@ -55,7 +55,7 @@ def verdicts_of(tx: Transaction, project_id: str, row: Row[Any]) -> list[Row[Any
 
 
 def checks_of(tx: Transaction, row: Row[Any]) -> dict[str, ProposalCheck]:
-    """Return the checks of the newest commit of a proposal, as a mapping from their sorted names."""
+    """Return the checks of the newest commit of a proposal as a mapping from their names, sorted by name."""
     statement = (
         select(proposal_check, user.c.name.label("reporter"))
         .join(user, user.c.id == proposal_check.c.reporter_id)
