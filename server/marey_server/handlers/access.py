@@ -256,7 +256,7 @@ class UserResource(PasswordResource):
 
     @reads(access=Access.USER, answer=User, etag=True)
     async def get(self, user: str) -> Rendered:
-        """Return a user; only administrators and the user may do this."""
+        """Return a user. Only administrators may read other users than themselves."""
         return await self.answer(users.find_user, user)
 
     @writes(access=Access.USER, body=UserChange, answer=User, precondition="required", etag=True)
@@ -302,7 +302,7 @@ class UserQuotas(Resource):
 
     @reads(access=Access.USER, answer=QuotasInUse)
     async def get(self, user: str) -> Rendered:
-        """Return a user's numbers of items and bytes, with the limits; only administrators and the user may do this."""
+        """Return a user's numbers of items and bytes, with the limits. Only administrators may read those of others."""
         return await self.answer(users.read_quotas, user)
 
     @writes(access=Access.ADMINISTRATOR, scope="admin", body=QuotaChange, answer=QuotasInUse)

@@ -49,7 +49,7 @@ class ProjectCoverageStreams(Resource):
         idempotency="key",
     )
     async def post(self, project: str, body: CoverageStreamCreate) -> Rendered:
-        """Start to measure the coverage of a recording; it starts empty, or with the coverage of an evaluation.
+        """Start to measure the coverage of a recording; the coverage is empty at first, or that of an evaluation.
 
         A stream that receives no frames for a day is deleted; the number of streams of a project is limited.
         """

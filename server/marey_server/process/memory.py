@@ -66,7 +66,11 @@ class Holding:
         self._bytes = 0
 
     def grow(self, more: int) -> None:
-        """Hold more bytes. Raises `UnavailableProblem` if requests or the client already hold too many."""
+        """Hold more bytes.
+
+        Raises `UnavailableProblem` if all requests together, or the requests of the client, hold too many bytes
+        already.
+        """
         self._memory.take(self._owner, self._bytes, more, reserved=self._reserved)
         self._bytes += more
 

@@ -54,7 +54,7 @@ def _insert(
 
 
 def find_user(tx: Transaction, name: str) -> User:
-    """Return a user; only administrators and the user may do this. Raises `NotFoundProblem`."""
+    """Return a user. Only administrators may read other users. Raises `NotFoundProblem`."""
     if tx.principal.kind != "user" or tx.principal.user_name != name:
         require_administrator(tx.principal, hidden=_no_user(name))
     row = tx.execute(select(user).where(user.c.name == name)).first()
@@ -64,7 +64,7 @@ def find_user(tx: Transaction, name: str) -> User:
 
 
 def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
-    """Return a user's numbers of items and bytes, with the limits; only administrators and the user may do this."""
+    """Return a user's numbers of items and bytes, with the limits. Only administrators may read those of others."""
     if not scopes.allows(tx.principal.scopes, "read"):  # the numbers are about all projects of the user
         raise ForbiddenProblem(
             "This needs a token with the scope 'read' for all projects, because quotas count items of every project.",

@@ -252,7 +252,7 @@ class DatasetCommit(Resource):
 
     @reads(access=Access.READER, answer=Commit)
     async def get(self, project: str, dataset: str, version: str) -> Rendered:
-        """Return the commit that a version names."""
+        """Return the commit of a version, which is given as a branch, a tag or a digest."""
         return await self.answer(datasets.read_commit, project, dataset, version)
 
 

@@ -234,7 +234,7 @@ def _require_checked_out(found: Row[Any], parent: str | None) -> None:
     """Raise `ConflictProblem` if the commit checked out in the folder is not the newest commit of the branch."""
     if found.folder_commit != parent:
         raise ConflictProblem(
-            f"The folder {found.path!r} has the entries of another version than the newest one of this branch. "
+            f"The version that is checked out in the folder {found.path!r} is not the newest one of this branch. "
             "Check out the branch, or commit to the branch that is checked out.",
             code="folder-elsewhere",
             context={"folder_commit": found.folder_commit, "commit": parent},

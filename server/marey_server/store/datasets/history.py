@@ -36,7 +36,7 @@ MOST_DIFFERENCES = 100_000
 
 
 def read_commit(tx: Transaction, project: str, name: str, version: str) -> Commit:
-    """Return the commit that a version names."""
+    """Return the commit of a version, which is given as a branch, a tag or a digest."""
     row = find_dataset(tx, projects.require(tx, project), name)
     return _commit(tx, row.id, resolve(tx, row.id, version))
 

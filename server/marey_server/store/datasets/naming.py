@@ -1,4 +1,4 @@
-"""Datasets with their branches and tags, and the commits that these name."""
+"""Datasets, their branches and tags, and the commits to which names of versions refer."""
 
 from __future__ import annotations
 
@@ -255,9 +255,11 @@ def protect_branch(
 
 
 def resolve(tx: Transaction, dataset_id: str, version: str) -> str:
-    """Return the digest of the commit that a version names.
+    """Return the digest of the commit that `version` refers to.
 
-    Raises `NotFoundProblem`, and `InvalidProblem` for an abbreviated digest with which several commits begin.
+    `version` is the name of a branch or tag, or a digest, perhaps abbreviated. A suffix such as `~2` goes back by two
+    commits, along the first parents. Raises `NotFoundProblem` if there is no such commit, and `InvalidProblem` if
+    several commits begin with an abbreviated digest.
     """
     match = _VERSION.fullmatch(version)
     if match is None:

@@ -51,7 +51,7 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:
-    """Delete the results of the tasks of these jobs, which the gathered results replace.
+    """Delete the results of the tasks of these parent jobs; the combined results of the parent jobs replace them.
 
     Blobs named by the tasks may then be collected as garbage, and the tasks no longer serve as cached results.
     """
