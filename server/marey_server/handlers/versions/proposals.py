@@ -185,7 +185,7 @@ class ProposalMerges(Resource):
 
     @writes(access=Access.CONTRIBUTOR, answer=Proposal, etag=True)
     async def delete(self, project: str, dataset: str, proposal: int) -> Rendered:
-        """Withdraw a merge request that waits because of `when_green`; the proposal stays open."""
+        """Stop a proposal from being merged automatically, as `when_green` requested; the proposal stays open."""
         return await self.answer(proposals.withdraw_merge, project, dataset, proposal)
 
 
