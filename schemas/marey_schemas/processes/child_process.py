@@ -14,9 +14,11 @@ import subprocess
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import send_handle
 
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.processes.limits import die_with_parent, resident_bytes
@@ -41,25 +43,30 @@ class BadMessage(Exception):
     """Bytes that are not a message."""
 
 
-class ChildProcess:
-    """Child process in its own session, which runs `python -m module <file descriptor> <arguments>`.
+class ConnectedChild(ABC):
+    """Process in its own session, with which this process exchanges messages through a socket.
 
-    One thread starts, uses and kills it; the child is killed when this thread ends. Other threads may send messages and
-    abort it.
+    One thread uses and kills it. Other threads may send messages and abort it.
     """
 
-    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
-        self._socket, theirs = socket.socketpair()
-        with theirs:
-            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
-                env=clean_environment(threads=threads),
-            )
-        self._pipe = Connection(os.dup(self._socket.fileno()))
+    def __init__(self, connected: socket.socket) -> None:
+        self._socket = connected
+        self._pipe = Connection(os.dup(connected.fileno()))
         self._sending = threading.Lock()
+
+    @property
+    @abstractmethod
+    def pid(self) -> int:
+        """The process id."""
+
+    @property
+    @abstractmethod
+    def alive(self) -> bool:
+        """Whether the process is running."""
+
+    @abstractmethod
+    def wait(self) -> int:
+        """Return the exit status of the process; a negative number is a signal."""
 
     def wait_until_ready(self) -> None:
         """Wait until the child has loaded its modules.
@@ -76,16 +83,6 @@ class ChildProcess:
             raise ChildBroken(self.wait()) from error
 
     @property
-    def pid(self) -> int:
-        """The process id."""
-        return self._process.pid
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process is running."""
-        return self._process.poll() is None
-
-    @property
     def resident_bytes(self) -> int:
         """The resident memory of the process and its descendants, in bytes."""
         return resident_bytes(self.pid)
@@ -100,6 +97,12 @@ class ChildProcess:
             except (BrokenPipeError, ConnectionResetError):
                 return
 
+    def send_socket(self, message: bytes, passed: socket.socket) -> None:
+        """Send a message and then a socket; if the child has died, the next `receive` reports it."""
+        with self._sending, suppress(OSError):
+            self._pipe.send_bytes(message)
+            send_handle(self._pipe, passed.fileno(), self.pid)
+
     def receive(self, timeout_s: float | None = None) -> bytes | None:
         """Return the next message, or None if there is none within `timeout_s`; without a timeout, wait for it.
 
@@ -110,10 +113,6 @@ class ChildProcess:
         except ConnectionResetError as error:
             raise EOFError from error
 
-    def wait(self) -> int:
-        """Return the exit status of the process; a negative number is a signal."""
-        return self._process.wait()
-
     def kill(self, *, grace_s: float = TERMINATE_S) -> None:
         """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
         if self.alive and grace_s > 0:
@@ -122,7 +121,7 @@ class ChildProcess:
             while self.alive and time.monotonic() < deadline:
                 time.sleep(0.02)
         self._signal(signal.SIGKILL)
-        self._process.wait()
+        self.wait()
         self._close()
 
     def _close(self) -> None:
@@ -143,6 +142,42 @@ class ChildProcess:
             os.killpg(self.pid, number)
         except ProcessLookupError:
             return
+
+
+class ChildProcess(ConnectedChild):
+    """Child that runs `python -m module <file descriptor> <arguments>`; it is killed when the thread that started it
+    ends.
+    """
+
+    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                [sys.executable, "-m", module, str(theirs.fileno()), *arguments],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                env=clean_environment(threads=threads),
+            )
+        super().__init__(ours)
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is running."""
+        return self._process.poll() is None
+
+    def wait(self) -> int:
+        """Return the exit status of the process; a negative number is a signal."""
+        return self._process.wait()
+
+    def close(self) -> None:
+        """Kill the process at once."""
+        self.kill(grace_s=0.0)
 
 
 def connect_to_parent() -> Connection:

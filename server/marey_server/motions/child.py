@@ -4,9 +4,9 @@ It carries out one order after another, each within limits of memory and time. A
 
 Messages between server and child are MessagePack that the receiver validates; nothing is pickled.
 
-Arguments: the pipe's file descriptor, the memory in bytes that orders may use, and functions to call before the first
-order, which load modules. The parent kills this process if an order takes too long, or if the client that waits for its
-result has closed the connection.
+Arguments: the pipe's file descriptor, the memory in bytes that orders may use, `FORK_SERVER` or `SINGLE`, and functions
+to call first, which load modules. The parent kills a child if an order takes too long, or if the client that waits for
+its result has closed the connection.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
+from multiprocessing.connection import Connection
 from typing import Any, Self
 
 import msgpack
@@ -23,9 +25,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from marey_schemas.encoding.codecs import MSGPACK, ArrayForm, CodecError, decode_tree, encode_tree
 from marey_schemas.problems import FieldError
 from marey_schemas.processes.child_process import READY, BadMessage, connect_to_parent
+from marey_schemas.processes.forking import fork_children
 from marey_schemas.processes.limits import allow_memory, allow_processor_time
 from marey_schemas.processes.memory import keep_freed_memory
 from marey_server.errors import ApiProblem, TooLargeProblem
+
+FORK_SERVER, SINGLE = "fork-server", "single"
+"""Values of the third argument: fork children that carry out orders, or carry out orders."""
 
 
 class Message(BaseModel):
@@ -109,16 +115,25 @@ class ChildAnswer(Message):
 
 
 def main() -> None:
-    """Carry out orders until the pipe closes."""
+    """Load modules; then fork children that carry out orders, or carry out orders, until the pipe closes."""
     pipe = connect_to_parent()
+    memory_bytes, forks, functions = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
     keep_freed_memory()
-    for name in sys.argv[3:]:
+    for name in functions:
         _function(name)()
     try:
         pipe.send_bytes(READY)
     except BrokenPipeError:  # the server ended while this loaded
         return
-    allow_memory(int(sys.argv[2]))
+    if forks:
+        fork_children(pipe, partial(carry_out_orders, memory_bytes=memory_bytes))
+    else:
+        carry_out_orders(pipe, memory_bytes=memory_bytes)
+
+
+def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
+    """Carry out orders until the pipe closes; they may use `memory_bytes` more than this process uses now."""
+    allow_memory(memory_bytes)
     while True:
         try:
             order = ChildOrder.unpack(pipe.recv_bytes())

@@ -17,16 +17,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from marey_schemas.processes.child_process import BadMessage, ChildBroken, ChildProcess
+from marey_schemas.processes.child_process import BadMessage, ChildBroken, ConnectedChild
+from marey_schemas.processes.forking import FORKS
 from marey_schemas.sizes import MIB
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
+from marey_server.process.child_starting import LOADED_FIRST, ChildStarter
 
 T = TypeVar("T")
 
-CHILD_MODULE = "marey_server.motions.child"
-LOADED_FIRST = ("marey_server.motions.reading:load",)
-"""Functions that a new child calls, so that its first order does not wait for modules."""
 ORDERS_PER_CHILD = 1000
 """Number of orders after which a child is replaced, so that memory that a library loses does not add up."""
 ABANDONED_S = 1.0
@@ -74,10 +73,10 @@ class ChildTask(Generic[T]):
     future: Future[T] = field(default_factory=Future)
     stopped: str = ""
     """Reason why the child was killed: `time`, `client-gone` or `closing`."""
-    _child: ChildProcess | None = None
+    _child: ConnectedChild | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def assign(self, child: ChildProcess | None) -> None:
+    def assign(self, child: ConnectedChild | None) -> None:
         """Set the child that runs this task, or None once the task has ended."""
         with self._lock:
             self._child = child
@@ -120,9 +119,9 @@ class ChildTask(Generic[T]):
 class Children:
     """Pool of child processes; they are started when they are first needed."""
 
-    def __init__(self, limits: ChildLimits, loaded_first: Sequence[str] = LOADED_FIRST) -> None:
+    def __init__(self, limits: ChildLimits, loaded_first: Sequence[str] = LOADED_FIRST, *, forks: bool = FORKS) -> None:
         self.limits = limits
-        self._arguments = [str(limits.memory_mb * MIB), *loaded_first]
+        self._starter = ChildStarter(limits.memory_mb * MIB, loaded_first, forks=forks)
         self._changed = threading.Condition()
         self._waiting: list[ChildTask[Any]] = []
         self._running: list[ChildTask[Any]] = []
@@ -133,7 +132,6 @@ class Children:
         self._threads: list[threading.Thread] = []
         self._idle: set[int] = set()
         """Numbers of the children that wait for a task."""
-        self._starting: set[ChildProcess] = set()
         self._closed = False
 
     @property
@@ -198,11 +196,10 @@ class Children:
             left, self._waiting = self._waiting, []
             for task in self._running:
                 task.stop("closing")
-            for child in self._starting:
-                child.abort()
             self._changed.notify_all()
         for task in left:
             task.fail(_stopping())
+        self._starter.close()
         for thread in self._threads:
             thread.join(CLOSING_S)
 
@@ -243,24 +240,14 @@ class Children:
                 child, orders = None if self._closed else self._started(), 0
         _discard(child)
 
-    def _started(self) -> ChildProcess | None:
+    def _started(self) -> ConnectedChild | None:
         """Return a new child that is ready, or None if it cannot be started."""
-        child = ChildProcess(CHILD_MODULE, self._arguments, threads=1)
-        with self._changed:
-            self._starting.add(child)
-            if self._closed:
-                child.abort()
         try:
-            child.wait_until_ready()
+            return self._starter.start()
         except ChildBroken as error:
             if not self._closed:
                 log.error("%s", error)
-            _discard(child)
             return None
-        finally:
-            with self._changed:
-                self._starting.discard(child)
-        return child
 
     def _next_task(self, number: int) -> ChildTask[Any] | None:
         """Wait for the next task of the child with this number; None if the pool is closed.
@@ -283,7 +270,7 @@ class Children:
                 self._changed.wait()
         return None
 
-    def _perform(self, task: ChildTask[Any], child: ChildProcess) -> bool:
+    def _perform(self, task: ChildTask[Any], child: ConnectedChild) -> bool:
         """Run a task in a child; return whether the child can run another one."""
         try:
             order = ChildOrder(function=task.function, payload=task.make(), processor_s=self.limits.processor_s).pack()
@@ -354,7 +341,7 @@ def _after(seconds: float, function: Callable[[str], None], argument: str) -> th
     return timer
 
 
-def _discard(child: ChildProcess | None) -> None:
+def _discard(child: ConnectedChild | None) -> None:
     if child is not None:
         child.kill(grace_s=0.0)
 

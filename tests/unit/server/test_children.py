@@ -12,20 +12,22 @@ import psutil
 import pytest
 from tests.support.rest_server import PATIENCE_S
 
+from marey_schemas.processes.forking import FORKS
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem, UnavailableProblem
 from marey_server.process.children import ChildLimits, Children, ChildTask
 
 FUNCTIONS = "tests.support.child_functions"
+ONLY_WITH_FORKS = pytest.mark.skipif(not FORKS, reason="children are only forked on Linux")
 LIMITS = ChildLimits(children=2, requests=4, memory_mb=256, processor_s=1, wall_s=PATIENCE_S)
 
 
-@pytest.fixture(scope="module")
-def children() -> Iterator[Children]:
-    """Two children."""
+@pytest.fixture(scope="module", params=[False, pytest.param(True, marks=ONLY_WITH_FORKS)], ids=["single", "forked"])
+def children(request: pytest.FixtureRequest) -> Iterator[Children]:
+    """Two children, each of which loads modules, or which are forked from a process that has loaded them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAREY_DATABASE_URL", "postgresql://marey:hunter2@db/marey")
         patch.setenv("MAREY_TOKEN", "hunter2")
-        pool = Children(LIMITS, ())
+        pool = Children(LIMITS, (), forks=request.param)
         yield pool
         pool.close()
 
@@ -186,6 +188,6 @@ def test_a_pool_that_closes_kills_its_children_and_fails_what_waits(tmp_path: Pa
     for task in (running, waiting):
         with pytest.raises(UnavailableProblem, match="stopping"):
             task.future.result(PATIENCE_S)
-    assert not psutil.pid_exists(int((tmp_path / "walk").read_text()))
+    until(lambda: not psutil.pid_exists(int((tmp_path / "walk").read_text())))
     with pytest.raises(UnavailableProblem):
         start(pool, "echo")

@@ -1,0 +1,229 @@
+"""Fork server: a process that loads modules once, and then forks children that have them already.
+
+Loading numeric modules and compiled kernels takes two seconds of processor time and 200 MB for each process. A forked
+child is ready in milliseconds and shares this memory. The fork server has no other thread, since the locks of other
+threads would stay locked in its children for ever, and it never reads what children read.
+
+Parent and fork server exchange these messages: `FORK`, followed by a socket for the new child; the number of a child
+and its exit status (`STARTED` for a new one); the number of a child that the parent will not signal any more.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import socket
+import struct
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import recv_handle
+from queue import SimpleQueue
+
+from marey_schemas.processes.child_process import READY, ChildBroken, ChildProcess, ConnectedChild
+from marey_schemas.processes.limits import die_with_parent
+
+FORKS = sys.platform == "linux"
+"""Whether processes may be forked after numeric libraries were loaded; on other systems, these may have threads."""
+FORK = b"fork"
+STARTED = 1 << 16
+"""Value in place of the exit status of a child that has been started; exit statuses are smaller."""
+_NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
+
+
+class ForkServer:
+    """Parent's side of a fork server, which runs `python -m module <file descriptor> <arguments>`.
+
+    The fork server and its children are killed when the thread that started it ends. Any thread may fork children.
+    """
+
+    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
+        self._process = ChildProcess(module, arguments, threads=threads)
+        self._forking = threading.Lock()
+        self._started: SimpleQueue[int | None] = SimpleQueue()
+        self._changed = threading.Condition()
+        self._statuses: dict[int, int] = {}
+        """Exit statuses of children that have ended and may still be signalled."""
+        self._ended = False
+        self._reading: threading.Thread | None = None
+
+    def wait_until_ready(self) -> None:
+        """Wait until the fork server has loaded its modules. Raises `ChildBroken` if it ends before."""
+        self._process.wait_until_ready()
+        self._reading = threading.Thread(target=self._read, name="marey-fork-server", daemon=True)
+        self._reading.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether children can be forked."""
+        return not self._ended and self._process.alive
+
+    def fork(self) -> ForkedChild:
+        """Start a child, and wait until it is ready. Raises `ChildBroken` if it or the fork server has ended."""
+        ours, theirs = socket.socketpair()
+        with theirs, self._forking:
+            self._process.send_socket(FORK, theirs)
+            pid = None if self._ended else self._started.get()
+        if pid is None:
+            ours.close()
+            raise ChildBroken(self._process.wait())
+        child = ForkedChild(self, pid, ours)
+        child.wait_until_ready()
+        return child
+
+    def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
+        """Return the exit status of a child; None if it is running after `timeout_s`; without a timeout, wait."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
+            return self._statuses.get(pid, -signal.SIGKILL if self._ended else None)
+
+    def release(self, pid: int) -> None:
+        """Let the system use the number of an ended child again."""
+        with self._changed:
+            known = self._statuses.pop(pid, None) is not None
+        if known:
+            self._process.send(_NUMBER.pack(pid))
+
+    def abort(self) -> None:
+        """Kill the fork server and all its children at once."""
+        self._process.abort()
+
+    def close(self) -> None:
+        """Kill the fork server, and with it all its children."""
+        self._process.abort()
+        if self._reading is not None:
+            self._reading.join()
+        self._process.kill(grace_s=0.0)
+
+    def _read(self) -> None:
+        """Receive the numbers and exit statuses of children until the fork server ends."""
+        with suppress(EOFError, OSError):
+            while (message := self._process.receive()) is not None:
+                pid, status = _NUMBER_AND_STATUS.unpack(message)
+                if status == STARTED:
+                    self._started.put(pid)
+                    continue
+                with self._changed:
+                    self._statuses[pid] = status
+                    self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._started.put(None)
+
+
+class ForkedChild(ConnectedChild):
+    """Child of a fork server."""
+
+    def __init__(self, server: ForkServer, pid: int, connected: socket.socket) -> None:
+        super().__init__(connected)
+        self._server = server
+        self._pid = pid
+        self._status: int | None = None
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process is running."""
+        if self._status is None:
+            self._status = self._server.status_of(self._pid, 0.0)
+        return self._status is None
+
+    def wait(self) -> int:
+        """Return the exit status of the process; a negative number is a signal."""
+        if self._status is None:
+            self._status = self._server.status_of(self._pid)
+        assert self._status is not None
+        return self._status
+
+    def _close(self) -> None:
+        super()._close()
+        self._server.release(self._pid)
+
+
+def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None:
+    """Fork a child for each socket that the parent sends, until the parent closes the pipe; `serve` runs in the child.
+
+    Raises `RuntimeError` if this process has more than one thread.
+    """
+    if (threads := len(os.listdir("/proc/self/task"))) > 1:
+        raise RuntimeError(f"a fork server must have one thread, but this process has {threads}")
+    woken, wake = socket.socketpair()
+    woken.setblocking(False)
+    wake.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
+    gc.collect()
+    gc.freeze()  # else the first collection of each child would copy the memory that it shares
+    running: set[int] = set()
+    while True:
+        ready = wait([pipe, woken])
+        if woken in ready:
+            woken.recv(4096)
+        if pipe in ready:
+            try:
+                running |= _carry_out(pipe, serve, (woken, wake))
+            except EOFError:
+                return
+        for pid in [*running]:
+            if (status := _exit_status(pid)) is not None:
+                running.discard(pid)
+                pipe.send_bytes(_NUMBER_AND_STATUS.pack(pid, status))
+
+
+def _carry_out(
+    pipe: Connection, serve: Callable[[Connection], None], others: tuple[socket.socket, socket.socket]
+) -> set[int]:
+    """Carry out one order of the parent; return the number of the child that it has started, if any.
+
+    The child closes `others`. Raises `EOFError` if the parent has closed the pipe.
+    """
+    order = pipe.recv_bytes()
+    if order != FORK:
+        os.waitpid(_NUMBER.unpack(order)[0], 0)
+        return set()
+    with socket.socket(fileno=recv_handle(pipe)) as connected:
+        if not (pid := os.fork()):
+            _run_child(serve, connected, (pipe, *others))
+    pipe.send_bytes(_NUMBER_AND_STATUS.pack(pid, STARTED))
+    return {pid}
+
+
+def _exit_status(pid: int) -> int | None:
+    """Return the exit status of a child that has ended, and None otherwise; the number of the child stays in use."""
+    ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if ended is None:
+        return None
+    return ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
+
+
+def _run_child(
+    serve: Callable[[Connection], None], connected: socket.socket, others: Sequence[Connection | socket.socket]
+) -> None:
+    """Run the forked child; does not return."""
+    status = 1
+    try:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        die_with_parent()
+        os.setsid()
+        for other in others:
+            other.close()
+        pipe = Connection(connected.detach())
+        pipe.send_bytes(READY)  # only now can the parent signal the session of this process
+        serve(pipe)
+        status = 0
+    except BaseException:  # noqa: BLE001 - nothing may return into the fork server's code
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)

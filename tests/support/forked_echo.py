@@ -1,0 +1,38 @@
+"""Fork server for tests: its children answer with their process id, or end, as they are told."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from multiprocessing.connection import Connection
+
+from marey_schemas.processes.child_process import READY, connect_to_parent
+from marey_schemas.processes.forking import fork_children
+
+LOADED = os.getpid()
+"""Process that loaded this module."""
+
+
+def answer(pipe: Connection) -> None:
+    """Answer messages until the pipe closes."""
+    while True:
+        try:
+            message = pipe.recv_bytes()
+        except EOFError:
+            return
+        if message == b"fail":
+            raise ValueError("the message was `fail`")
+        if message.startswith(b"exit "):
+            os._exit(int(message[5:]))
+        pipe.send_bytes(f"{LOADED} {os.getppid()} {os.getpid()} {os.getsid(0)}".encode())
+
+
+if __name__ == "__main__":
+    control = connect_to_parent()
+    if sys.argv[2:] == ["broken"]:
+        sys.exit(3)
+    if sys.argv[2:] == ["threaded"]:
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+    control.send_bytes(READY)
+    fork_children(control, answer)

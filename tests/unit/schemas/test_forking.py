@@ -1,0 +1,153 @@
+"""Children that a process forks after it has loaded their modules."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from marey_schemas.processes.child_process import ChildBroken, ConnectedChild
+from marey_schemas.processes.forking import FORKS, ForkServer
+
+pytestmark = pytest.mark.skipif(not FORKS, reason="children are only forked on Linux")
+
+WAIT_S = 30.0
+
+
+@pytest.fixture
+def server() -> Iterator[ForkServer]:
+    started = ForkServer("tests.support.forked_echo", threads=1)
+    started.wait_until_ready()
+    yield started
+    started.close()
+
+
+def ids_from(child: ConnectedChild) -> list[int]:
+    """Ask a child for the process that loaded its module, its parent, itself and its session."""
+    child.send(b"who")
+    answer = child.receive(WAIT_S)
+    assert answer is not None
+    return [int(number) for number in answer.split()]
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_children_have_the_modules_of_the_fork_server_and_a_session_of_their_own(server: ForkServer) -> None:
+    children = [server.fork() for _ in range(3)]
+    for child in children:
+        loaded, parent, own, session = ids_from(child)
+        assert loaded == parent
+        assert own == session == child.pid
+        assert child.alive
+    assert len({child.pid for child in children}) == 3
+    for child in children:
+        child.kill(grace_s=0.0)
+        assert not child.alive
+
+
+@pytest.mark.parametrize(
+    ("message", "status"), [(b"exit 7", 7), (b"fail", 1), (None, 0)], ids=["exit", "exception", "closed pipe"]
+)
+def test_the_exit_status_of_a_child_is_reported(server: ForkServer, message: bytes | None, status: int) -> None:
+    child = server.fork()
+    if message is None:
+        os.kill(child.pid, signal.SIGCONT)
+        child._socket.shutdown(2)
+    else:
+        child.send(message)
+    assert child.wait() == status
+    child.kill(grace_s=0.0)
+    assert ids_from(server.fork())
+
+
+def test_a_killed_child_is_reported_with_its_signal_and_others_go_on(server: ForkServer) -> None:
+    first, second = server.fork(), server.fork()
+    first.abort()
+    with pytest.raises(EOFError):
+        first.receive(WAIT_S)
+    assert first.wait() == -signal.SIGKILL
+    first.kill(grace_s=0.0)
+    assert ids_from(second)[2] == second.pid
+
+
+def test_a_child_whose_exit_was_not_yet_read_keeps_its_number_and_loses_it_afterwards(server: ForkServer) -> None:
+    child = server.fork()
+    child.send(b"exit 0")
+    assert child.wait() == 0
+    assert psutil.Process(child.pid).status() == psutil.STATUS_ZOMBIE
+    child.kill(grace_s=0.0)
+    wait_until(lambda: not psutil.pid_exists(child.pid))
+
+
+def test_a_stopped_child_ends_by_kill(server: ForkServer) -> None:
+    child = server.fork()
+    os.kill(child.pid, signal.SIGSTOP)
+    child.kill(grace_s=0.0)
+    assert child.wait() == -signal.SIGKILL
+
+
+def test_all_children_die_with_the_fork_server(server: ForkServer) -> None:
+    children = [server.fork() for _ in range(2)]
+    server.abort()
+    for child in children:
+        assert child.wait() == -signal.SIGKILL
+    wait_until(lambda: not any(psutil.pid_exists(child.pid) for child in children))
+    assert not server.alive
+    with pytest.raises(ChildBroken):
+        server.fork()
+
+
+def test_children_die_with_the_thread_that_started_the_fork_server() -> None:
+    pids: list[int] = []
+
+    def start() -> None:
+        started = ForkServer("tests.support.forked_echo", threads=1)
+        started.wait_until_ready()
+        pids.append(started.fork().pid)
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    wait_until(lambda: not psutil.pid_exists(pids[0]))
+
+
+def test_many_threads_fork_at_the_same_time(server: ForkServer) -> None:
+    answers: list[list[int]] = []
+
+    def use() -> None:
+        for _ in range(5):
+            child = server.fork()
+            answers.append(ids_from(child))
+            child.kill(grace_s=0.0)
+
+    threads = [threading.Thread(target=use) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(answers) == 30
+    assert all(own == session for _, _, own, session in answers)
+
+
+def test_a_process_with_a_second_thread_forks_nothing() -> None:
+    server = ForkServer("tests.support.forked_echo", ["threaded"], threads=1)
+    server.wait_until_ready()
+    with pytest.raises(ChildBroken) as broken:
+        server.fork()
+    assert broken.value.status == 1
+    server.close()
+
+
+def test_a_fork_server_that_ends_while_it_loads_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(ChildBroken) as broken:
+        ForkServer("tests.support.forked_echo", ["broken"], threads=1).wait_until_ready()
+    assert broken.value.status == 3
