@@ -193,7 +193,8 @@ def propose(
     into: Annotated[
         str,
         typer.Option(
-            help="Folder for the annotations, which get the subfolders of the clips; default: the folder of each clip."
+            help="Folder for the annotations, in which the folders of the clips are repeated; default: each annotation "
+            "is stored in the folder of its clip."
         ),
     ] = "",
     wait: Wait = True,

@@ -60,7 +60,7 @@ def _move_to(take, x, z, heading):  # type: ignore[no-untyped-def]
 
 @compiled
 def _smooth(take, filters, frame, shortest_mean):  # type: ignore[no-untyped-def]
-    """Compute the smoothed root at a frame and make it the current one."""
+    """Compute the smoothed position and heading of the root at a frame, and store them as the current ones."""
     x = _estimate(take, filters.positions, frame, 0)
     z = _estimate(take, filters.positions, frame, 1)
     facing_x = _estimate(take, filters.directions, frame, 2)

@@ -257,7 +257,10 @@ def _switch_metrics(record: TrialRecord, window: Flags) -> dict[str, float | Non
 
 
 def _cost_metrics(record: TrialRecord, window: Flags) -> dict[str, float | None]:
-    """Pool the costs of steps; the cost of a step is that of its first tick, when the row shown next was chosen."""
+    """Compute statistics of the costs that are recorded at the ticks of the window, except the last tick of the record.
+
+    The costs recorded at tick i are those of the row that is displayed at tick i + 1.
+    """
     entered = window & (record.status[1:] == Status.REPLACING)
     series = {
         "pose_cost": record.pose_cost[:-1][window],

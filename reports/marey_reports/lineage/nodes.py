@@ -24,7 +24,7 @@ class Sort(StrEnum):
 
 
 class Box(NamedTuple):
-    """A box: the lines of text in it; `warning` if the box has revisions that are old or deleted."""
+    """Box of the picture with its lines of text; `warning` is true if it shows old or deleted revisions."""
 
     sort: Sort
     lines: tuple[str, ...]

@@ -106,7 +106,7 @@ class PredecessorOrigin(Noted):
 
 
 class ModelProvenance(Noted):
-    """Examples of a model, and their origin."""
+    """Motions that a model was trained on, and their origin."""
 
     predecessor: PredecessorOrigin | None = None
 

@@ -108,7 +108,7 @@ def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
 
 
 def job_of_step(pipeline: PipelineCreate, name: str, ids: Mapping[str, str]) -> JobCreate:
-    """Return the job request of a step; `ids` contains the id of the job of each step that this one depends on."""
+    """Return the job request of a step; `ids` maps each step that it depends on to the id of that step's job."""
     step = pipeline.steps[name]
 
     def resolved(choice: StepInput) -> JobInput:

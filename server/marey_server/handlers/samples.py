@@ -1,4 +1,4 @@
-"""Resources of samples of models: generated motions, the same for the same seed."""
+"""Resources that generate motions from models; the same seed gives the same motions."""
 
 from __future__ import annotations
 

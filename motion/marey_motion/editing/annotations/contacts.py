@@ -49,8 +49,8 @@ def find_stances(clip: Clip, body: MatchingBody, options: ContactOptions | None 
 def foot_speed(points: NDArray[np.floating], frame_rate_hz: float) -> Floats:
     """Compute the speed of the slowest point of a foot, without outliers.
 
-    While a foot rolls, either its heel or its toe is still. The slower of ankle and toe therefore stays slow from heel
-    strike to toe off.
+    While a foot rolls from heel strike to toe off, first its heel is still and then its toe. The ankle is close to the
+    heel, so the slower one of ankle and toe is slow during the whole contact.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Meaning of constraints for a model: tolerances, canonical frames and joints.
+"""Conversion of the constraints of a search to joints, frames in canonical time, and tolerances of a model.
 
 A `Placement` is the position and heading, in the world of the constraints, at which the model's motions begin; by
 default, they begin at the origin of the world.

@@ -91,7 +91,7 @@ def _number_sections(
     sections: Sequence[tuple[int, int, float]],
     limits: tuple[tuple[float, float], tuple[float, float]],
 ) -> None:
-    """Write each number on its section, at a place that is far enough from the earlier numbers if there is one."""
+    """Write its number on each section of a path, if possible at a distance from the numbers written before."""
     span = limits[0][1] - limits[0][0]
     placed: list[Floats] = []
     for number, (start, stop, _) in enumerate(sections, start=1):

@@ -117,9 +117,10 @@ _PARTS = (
 
 
 def _among(wanted: Collection[RevisionKey]) -> tuple[ColumnElement[bool], ...]:
-    """Return conditions that select the parts of the wanted revisions, and the parts of a few other revisions.
+    """Return SQL conditions that the parts of all wanted revisions meet.
 
-    The conditions compare ids and numbers separately: if they compared pairs, SQLite would scan the whole table.
+    Ids and numbers are compared separately, because SQLite would scan the whole table to compare pairs. Parts of other
+    revisions, with the id of one and the number of another, can therefore also meet the conditions; callers skip them.
     """
     ids, numbers = {one.item for one in wanted}, {one.revision for one in wanted}
     return revision_part.c.item_id.in_(sorted(ids)), revision_part.c.number.in_(sorted(numbers))
