@@ -31,6 +31,7 @@ from marey_client.requests import (
 )
 from marey_client.transport import Params, as_json, read_model
 from marey_schemas.access import Project, ProjectChange, QuotaChange, QuotasInUse
+from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.job_params import (
     AlignParams,
     AnnotateParams,
@@ -43,9 +44,15 @@ from marey_schemas.queue.jobs import CacheMode, Job, JobCreate
 from marey_schemas.queue.model_pipelines import model_pipeline
 from marey_schemas.queue.pipelines import PipelineCreate
 
+CommitTo = OutputsCommit | str | None
+"""Commit of the results of a job to a branch, in short form `dataset[@branch][/folder]`."""
+
 
 class ProjectHandle(ProjectItems):
-    """Handle of a project, given by name; requests are sent only by its methods."""
+    """Handle of a project, given by name; requests are sent only by its methods.
+
+    Methods that submit a job take `commit`, such as "gaits@main/studio", to commit its results when it succeeds.
+    """
 
     def __repr__(self) -> str:
         return f"<project {self.name!r} at {self.transport.url}>"
@@ -116,6 +123,7 @@ class ProjectHandle(ProjectItems):
         seed: int = 0,
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **choices: Any,
     ) -> PipelineRun:
         """Submit the jobs that make a model from takes: import, retarget, annotate, cut, align, model, tree.
@@ -126,7 +134,8 @@ class ProjectHandle(ProjectItems):
         computed again.
         """
         plan = plan_model(self, takes, name=name, **choices)
-        return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache))
+        to = OutputsCommit.of(commit)
+        return self.pipeline(model_pipeline(plan, seed=seed, priority=priority, cache=cache, commit=to))
 
     def retarget(
         self,
@@ -137,13 +146,15 @@ class ProjectHandle(ProjectItems):
         params: RetargetParams | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
     ) -> Job:
         """Submit a job that retargets clips, or folders given by path, to the skeleton with this id.
 
         Uses the newest joint mapping of each skeleton.
         """
         request = retarget_request(self, clips, skeleton, params or RetargetParams())
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def annotate(
         self,
@@ -153,6 +164,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **options: Any,
     ) -> Job:
         """Submit a job that annotates clips by a method and its options; the results go below the folder `into`.
@@ -162,17 +174,26 @@ class ProjectHandle(ProjectItems):
         """
         method = {"method": proposal} if isinstance(proposal, str) else proposal
         request = annotate_request(self, clips, AnnotateParams.model_validate({"proposal": method, **options}))
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def cut(
-        self, annotations: Annotations, *, into: str, priority: int = 0, cache: CacheMode = "use", **options: Any
+        self,
+        annotations: Annotations,
+        *,
+        into: str,
+        priority: int = 0,
+        cache: CacheMode = "use",
+        commit: CommitTo = None,
+        **options: Any,
     ) -> Job:
         """Submit a job that cuts clips along the segments of annotations, into folders below `into`.
 
         `options` are those of `CutParams`, for example `labels=("step_left", "step_right")` or `by_label=True`.
         """
         request = cut_request(self, annotations, CutParams.model_validate(options))
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def align(
         self,
@@ -182,6 +203,7 @@ class ProjectHandle(ProjectItems):
         annotations: Annotations | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **options: Any,
     ) -> Job:
         """Submit a job that aligns clips of one skeleton, all of which show the same action.
@@ -190,7 +212,8 @@ class ProjectHandle(ProjectItems):
         named and no annotations are given, the annotations of the clips are used.
         """
         request = align_request(self, clips, annotations, AlignParams.model_validate(options))
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def edit(
         self,
@@ -200,6 +223,7 @@ class ProjectHandle(ProjectItems):
         into: str = "",
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **options: Any,
     ) -> Job:
         """Submit a job that edits clips, or folders given by path, by commands or a stored edit.
@@ -208,7 +232,8 @@ class ProjectHandle(ProjectItems):
         clips themselves. `options` are those of `EditParams`.
         """
         request = edit_request(self, clips, commands, options)
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def evaluate(
         self,
@@ -218,6 +243,7 @@ class ProjectHandle(ProjectItems):
         normaliser: EvaluationHandle | str | None = None,
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **options: Any,
     ) -> Job:
         """Submit a job that evaluates clips of one skeleton, or folders of them given by path.
@@ -226,7 +252,8 @@ class ProjectHandle(ProjectItems):
         `normaliser` is an evaluation, or its id, with which the result will be comparable.
         """
         request = evaluate_request(self, clips, EvaluateParams.model_validate(options), normaliser)
-        return self.submit(request.model_copy(update={"into": into, "priority": priority, "cache": cache}))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update=chosen))
 
     def evaluation(self, job: Job, *, on_progress: OnProgress | None = None) -> EvaluationHandle:
         """Return the evaluation created by a job, after waiting for its end. Raises `JobUnsuccessful`."""
@@ -240,6 +267,7 @@ class ProjectHandle(ProjectItems):
         seed: int = 0,
         priority: int = 0,
         cache: CacheMode = "use",
+        commit: CommitTo = None,
         **options: Any,
     ) -> Job:
         """Submit a job that trains a model on clips that were aligned with each other, given as one or several folders.
@@ -247,8 +275,8 @@ class ProjectHandle(ProjectItems):
         `options` are those of `ModelParams`, for example `name="step"` or `spatial_share=0.98`.
         """
         request = model_request(aligned, ModelParams.model_validate(options))
-        update = {"into": into, "seed": seed, "priority": priority, "cache": cache}
-        return self.submit(request.model_copy(update=update))
+        chosen = {"into": into, "priority": priority, "cache": cache, "commit": OutputsCommit.of(commit)}
+        return self.submit(request.model_copy(update={"seed": seed, **chosen}))
 
     def model(self, job: Job, *, on_progress: OnProgress | None = None) -> ModelHandle:
         """Return the model created by a job, after waiting for its end. Raises `JobUnsuccessful`."""

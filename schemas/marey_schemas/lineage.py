@@ -82,6 +82,7 @@ class LineageJob(Answer):
     seed: int
     code_versions: tuple[str, ...] = Field((), description="Versions of the code that created the revisions.")
     commits: tuple[str, ...] = Field((), description="Digests of the commits from which the job took its inputs.")
+    commit: str | None = Field(None, description="Digest of the commit that has the outputs of the job.")
     finished_at: datetime | None = None
 
 

@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, find_item, require_item
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow
+from marey_client.cli.terminal.following import JOB, Sources, Wait, clips_at, follow, print_commit
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -98,6 +98,7 @@ def evaluate(
         _print_evaluation(found, as_json)
     if out is not None:
         print_message(f"report: {out}")
+    print_commit(ended)
 
 
 def _place_beside(path: str) -> tuple[str, str]:

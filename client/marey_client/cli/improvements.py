@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import Address
 from marey_client.cli.evaluations import evaluation_at
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import JOB, Wait, clips_at, follow
+from marey_client.cli.terminal.following import FINDINGS_JOB, Wait, clips_at, follow
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -51,10 +51,10 @@ From = Annotated[
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
-    add_command(app, compare, params=COMPARE, job=JOB)
-    add_command(app, suggest, params=SUGGEST, job=JOB)
-    add_command(app, optimise, params=OPTIMISE, job=JOB)
-    add_command(app, sweep, params=SWEEP, job=JOB)
+    add_command(app, compare, params=COMPARE, job=FINDINGS_JOB)
+    add_command(app, suggest, params=SUGGEST, job=FINDINGS_JOB)
+    add_command(app, optimise, params=OPTIMISE, job=FINDINGS_JOB)
+    add_command(app, sweep, params=SWEEP, job=FINDINGS_JOB)
 
 
 def compare(

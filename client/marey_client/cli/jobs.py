@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.terminal.failures import Refused, WrongUsage
-from marey_client.cli.terminal.following import SEEDED_JOB, Into, Wait, follow, input_at, print_ended
+from marey_client.cli.terminal.following import SEEDED_JOB, Into, Wait, follow, input_at, print_commit, print_ended
 from marey_client.cli.terminal.invocation import AsJson, JobId, ProjectName, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_client.cli.terminal.schema_options import Chosen, add_command
@@ -112,6 +112,7 @@ def submit_job(
         return
     print_message(f"{ended.id} {ended.state}")
     print_json(ended if as_json else ended.result)
+    print_commit(ended)
     if (ended.result or {}).get("refused"):
         raise Refused
 

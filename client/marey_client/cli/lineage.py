@@ -151,3 +151,5 @@ def _job_words(job: LineageJob) -> Iterator[str]:
     yield from job.code_versions
     for commit in job.commits:
         yield f"inputs of commit {commit.rpartition(':')[2][:12]}"
+    if job.commit is not None:
+        yield f"results in commit {job.commit.rpartition(':')[2][:12]}"

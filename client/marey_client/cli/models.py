@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.addresses import Address, addresses_in_one_project, require_item
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, input_at
+from marey_client.cli.terminal.following import SEEDED_JOB, Wait, follow, input_at, print_commit
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_table
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -60,6 +60,7 @@ def model(
         ended = follow(marey, submitted, wait=wait, as_json=as_json)
         if ended is not None:
             _print_model(project.model(ended), as_json)
+            print_commit(ended)
 
 
 def sample(

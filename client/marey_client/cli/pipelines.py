@@ -12,7 +12,7 @@ import typer
 
 from marey_client.cli.addresses import Address, require_item
 from marey_client.cli.terminal.failures import INTERRUPTED, Refused, WrongUsage
-from marey_client.cli.terminal.following import SEEDED_JOB, clips_at
+from marey_client.cli.terminal.following import SEEDED_JOB, clips_at, commit_text
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_refused, print_table, progress
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf, add_command
@@ -198,7 +198,7 @@ def follow_run(run: PipelineRun, project: str, *, wait: bool, as_json: bool) -> 
         print_steps(run, as_json)
         if not as_json:
             _print_shortfalls(run)
-    if any(map(_refused, run.steps.values())):
+    if any(_refused(job) or job.publish_conflict for job in run.steps.values()):
         raise Refused
     return None
 
@@ -222,6 +222,8 @@ def _print_shortfalls(run: PipelineRun) -> None:
             print_message(f"{step} found nothing in {places}")
         for note in result.get("notes", ()):
             print_message(f"{step}: {note}")
+        if job.commit is not None and job.state == "succeeded":
+            print_message(f"{step}: {commit_text(job)}")
 
 
 def print_steps(run: PipelineRun, as_json: bool) -> None:

@@ -46,12 +46,13 @@ def boxes_of(graph: LineageGraph) -> tuple[list[Box], list[Arrow]]:
     arrows: list[Arrow] = []
     made_by = {group.job for group in groups}
     jobs = [job for job in graph.jobs if job.id in made_by]
-    commits = sorted({commit for job in jobs for commit in job.commits})
+    commits = sorted({commit for job in jobs for commit in (*job.commits, job.commit) if commit is not None})
     job_boxes = {job.id: len(boxes) + index for index, job in enumerate(jobs)}
     boxes += map(_job_box, jobs)
     commit_boxes = {commit: len(boxes) + index for index, commit in enumerate(commits)}
     boxes += (Box(Sort.COMMIT, (f"commit {commit.rpartition(':')[2][:12]}",)) for commit in commits)
     arrows += (Arrow(commit_boxes[commit], job_boxes[job.id]) for job in jobs for commit in job.commits)
+    arrows += (Arrow(job_boxes[job.id], commit_boxes[job.commit]) for job in jobs if job.commit is not None)
     arrows += (Arrow(job_boxes[group.job], index) for index, group in enumerate(groups) if group.job in job_boxes)
     arrows += dict.fromkeys(_into(link, groups, job_boxes) for link in links)
     return boxes, arrows

@@ -95,6 +95,7 @@ class Commit(Answer):
     message: str
     at: datetime
     entries: int = Field(description="Number of entries.")
+    job: str | None = Field(None, description="Job that made the commit of its outputs; null: a user or a program.")
 
 
 class Entry(Answer):

@@ -13,6 +13,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.naming import MAIN, DatasetName, Version
 from marey_schemas.kinds import Kind
 from marey_schemas.names import CollectionPath, Message
+from marey_schemas.queue.commits import CommitConflict, JobCommit, OutputsCommit
 
 
 class JobState(StrEnum):
@@ -153,6 +154,9 @@ class JobCreate(Request):
     labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the job.")
     resources: Resources = Resources()
     message: Message = ""
+    commit: OutputsCommit | None = Field(
+        None, description="Commit of the outputs to a branch of a dataset, made when the job succeeds."
+    )
 
 
 class Progress(Request):
@@ -179,6 +183,9 @@ class JobOutput(Answer):
     kind: Kind
     revision: int
     created: bool = Field(description="False if the item had the same content before.")
+    entry: str | None = Field(
+        None, description="Path at which the job commits the output to a dataset; null if the job makes no commit."
+    )
 
 
 def commits_of(inputs: Mapping[str, Any]) -> set[str]:
@@ -225,7 +232,10 @@ class Job(Answer):
     failure: JobFailure | None = None
     result: dict[str, Any] | None = None
     cancel_requested: bool = False
-    publish_conflict: dict[str, Any] | None = None
+    publish_conflict: CommitConflict | None = Field(
+        None, description="Reason why the outputs are not on the branch to which the job was to commit them."
+    )
+    commit: JobCommit | None = Field(None, description="Commit of the outputs; null if the submission asks for none.")
     author: str | None
     created_at: datetime
     run_at: datetime

@@ -8,6 +8,7 @@ from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
 from marey_schemas.names import CollectionPath, Message
+from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 
 MOST_STEPS = 32
@@ -44,6 +45,7 @@ class PipelineStep(Request):
     labels: dict[str, str] | None = None
     resources: Resources | None = None
     message: Message | None = None
+    commit: OutputsCommit | None = None
 
 
 class PipelineCreate(Request):
@@ -58,6 +60,9 @@ class PipelineCreate(Request):
     labels: dict[str, str] = Field(default_factory=dict, description="Labels that a worker must have to run the steps.")
     resources: Resources = Resources()
     message: Message = ""
+    commit: OutputsCommit | None = Field(
+        None, description="Commit that each step makes of its outputs when it succeeds, if its kind makes items."
+    )
 
 
 class Pipeline(Answer):

@@ -192,6 +192,7 @@ class CompleteAnswer(Answer):
     job: str
     state: JobState
     outputs: tuple[JobOutput, ...] = ()
+    commit: str | None = Field(None, description="Commit of a dataset that has the outputs.")
 
 
 class FailAnswer(Answer):

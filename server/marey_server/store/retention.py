@@ -1,7 +1,7 @@
 """Retention: deletes events, logs and jobs that are older than the settings allow.
 
 Work is done in batches, each in a transaction of its own, so that no other write waits long. If a process dies between
-two batches, the next round continues. A job that created a revision is never deleted.
+two batches, the next round continues. A job that created a revision or a commit is never deleted.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from marey_server.store.database.connections import Database
 from marey_server.store.garbage import BATCH
 from marey_server.store.tables import (
     attempt,
+    dataset_commit,
     job,
     job_blob,
     job_dependency,
@@ -123,7 +124,7 @@ task = job.alias("task")
 def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
     """Return the next jobs that can be deleted.
 
-    They ended long ago, neither they nor their tasks created a revision, and no other job depends on them.
+    They ended long ago, neither they nor their tasks created a revision or a commit, and no other job depends on them.
     """
     tasks = select(task.c.id).where(task.c.parent_id == job.c.id)
     with_tasks = or_(job_dependency.c.on_job_id == job.c.id, job_dependency.c.on_job_id.in_(tasks))
@@ -146,7 +147,8 @@ def _old_jobs(tx: Transaction, age_us: int, after: str) -> list[str]:
 
 
 def _made_something(job_id: ColumnElement[str]) -> ColumnElement[bool]:
-    return or_(exists().where(revision.c.job_id == job_id), exists().where(lineage.c.job_id == job_id))
+    made = (revision.c.job_id, lineage.c.job_id, dataset_commit.c.job_id)
+    return or_(*(exists().where(column == job_id) for column in made))
 
 
 def _delete_tasks(tx: Transaction, parent: str) -> int:

@@ -298,7 +298,9 @@ job = Table(
     Column("outputs", Document),  # [{name, item, kind, revision, created}], what the job published
     Column("failure", Document),
     Column("progress", Document),
-    Column("publish_conflict", Document),
+    Column("publish_conflict", Document),  # why the outputs are not on the branch that `commit_to` names
+    Column("commit_to", Document),  # where the job commits its outputs, as `store.jobs.commits` describes it
+    Column("committed", DIGEST),  # commit that has the outputs
     Column("parent_id", ID, ForeignKey("job.id"), index=True),
     Column("position", Integer),
     Column("size", Integer),  # set for the parent job of a fan-out, which depends on its tasks
@@ -532,7 +534,9 @@ dataset_commit = Table(
     Column("entries", BigInteger, nullable=False),
     Column("generation", Integer, nullable=False),  # 0, or 1 more than the greatest generation of a parent
     Column("write_id", String(64)),  # the name that the client gave to the commit
+    Column("job_id", ID, ForeignKey("job.id")),  # the job that committed its outputs; it commits once
     Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
+    Index("uq_dataset_commit_job", "job_id", unique=True),
 )
 
 fast_forward = Table(  # merges that moved a branch to an existing commit; other merges are commits with a `write_id`

@@ -101,8 +101,8 @@ def log(
         found = list(islice(at.on(marey).log(at.version, path=path.strip("/")), most))
     if as_json:
         return print_json(found)
-    rows = [(short(one.digest), one.at, one.author, one.entries, one.message) for one in found]
-    return print_table(("commit", "time", "author", "entries", "message"), rows, right=("entries",))
+    rows = [(short(one.digest), one.at, one.author, one.entries, one.job, one.message) for one in found]
+    return print_table(("commit", "time", "author", "entries", "job", "message"), rows, right=("entries",))
 
 
 @dataset.command("show")
@@ -210,13 +210,14 @@ def blame(
         return print_json(found)
     origins = {**found.parts, "tags": found.tags, "path": found.place}
     rows = [_origin_row(name, one, found.path) for name, one in origins.items()]
-    return print_table(("part", "commit", "time", "author", "message", "note"), rows)
+    return print_table(("part", "commit", "time", "author", "job", "message", "note"), rows)
 
 
 def _origin_row(name: str, one: Origin, path: str) -> tuple[object, ...]:
     notes = [] if one.path == path else [f"then {one.path}"]
     notes += [] if one.certain else ["or an earlier commit"]
-    return name, short(one.commit.digest), one.commit.at, one.commit.author, one.commit.message, ", ".join(notes)
+    made = one.commit
+    return name, short(made.digest), made.at, made.author, made.job, made.message, ", ".join(notes)
 
 
 @dataset.command("checkout")
@@ -247,4 +248,5 @@ def _pairs(one: Commit) -> list[tuple[str, object]]:
         ("entries", one.entries),
         ("tree", one.tree),
         ("message", one.message),
+        *([("job", one.job)] if one.job is not None else []),
     ]

@@ -2,24 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from marey_client.cli.addresses import Address
 from marey_client.cli.revisions import find_revision, find_version
-from marey_client.cli.terminal.failures import Refused
+from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.output import Advance, print_json, print_message, print_refused, progress
-from marey_client.cli.terminal.schema_options import OptionsOf
+from marey_client.cli.terminal.schema_options import Chosen, OptionsOf
+from marey_schemas.wording import without_prefix
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey
     from marey_schemas.kinds import Kind
     from marey_schemas.queue.jobs import ExistingInput, Job
 
-JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
-SEEDED_JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("seed", "priority", "cache"))
+_COMMIT = OptionsOf("marey_schemas.queue.commits:CommitOptions")
+
+
+@dataclass(frozen=True)
+class _CommittingJob(OptionsOf):
+    """Options of a job that creates items: those of the job, and those of the commit of its results."""
+
+    @cached_property
+    def options(self) -> tuple[Any, ...]:
+        """The options of the job, then those of the commit."""
+        return (*self._job.options, *_COMMIT.options)
+
+    def read(self, typed: Mapping[str, Any]) -> Chosen:
+        """Return the fields of `JobCreate`. Raises `WrongUsage`."""
+        from pydantic import ValidationError
+
+        from marey_schemas.queue.commits import CommitOptions
+
+        try:
+            commit = CommitOptions.model_validate(_COMMIT.read(typed)).commit()
+        except ValidationError as error:
+            raise WrongUsage(f"--commit-to: {without_prefix(error.errors()[0]['msg'])}") from None
+        except ValueError as error:
+            raise WrongUsage(str(error)) from None
+        return {**self._job.read(typed), **({} if commit is None else {"commit": commit})}
+
+    @property
+    def _job(self) -> OptionsOf:
+        return OptionsOf(self.model, only=self.only)
+
+
+FINDINGS_JOB = OptionsOf("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
+JOB = _CommittingJob("marey_schemas.queue.jobs:JobCreate", only=("priority", "cache"))
+SEEDED_JOB = _CommittingJob("marey_schemas.queue.jobs:JobCreate", only=("seed", "priority", "cache"))
 
 Sources = Annotated[
     list[str],
@@ -98,7 +133,7 @@ def show_progress(now: Job, advance: Advance, count: int | None = None, unit: st
 def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None] | None = None) -> None:
     """Print the refused inputs of a job, then call `show` with its result; without `show`, print the counts in it.
 
-    Raises `Refused` if inputs were refused."""
+    Raises `Refused` if inputs were refused, or if the results are not on the branch that was to get them."""
     result = ended.result or {}
     refused = result.get("refused", ())
     if as_json:
@@ -106,8 +141,33 @@ def print_ended(ended: Job, as_json: bool, show: Callable[[dict[str, Any]], None
     else:
         print_refused(refused)
         (show or _shown_counts(ended, refused))(result)
+    print_commit(ended)
     if refused:
         raise Refused
+
+
+def print_commit(ended: Job) -> None:
+    """Print which commit has the results of a job. Raises `Refused` if it is not on the branch that was to get it."""
+    if ended.commit is not None:
+        print_message(commit_text(ended))
+    if ended.publish_conflict is not None:
+        raise Refused
+
+
+def commit_text(ended: Job) -> str:
+    """Return a sentence about the commit of a job that has ended."""
+    from marey_client.cli.datasets.places import short
+
+    commit, conflict = ended.commit, ended.publish_conflict
+    assert commit is not None
+    name = f"{commit.dataset}@{commit.branch}"
+    if conflict is not None:
+        place = f"{ended.project}/{commit.dataset}@{conflict.branch}"
+        advice = "" if conflict.branch is None else f" marey dataset merge {place} --into {commit.branch}"
+        return f"{name} did not move. {conflict.detail}{advice}"
+    if commit.digest is None:
+        return f"{name} has these results already, so there is no new commit"
+    return f"{name} is at {short(commit.digest)} now"
 
 
 def _shown_counts(ended: Job, refused: Sequence[Any]) -> Callable[[dict[str, Any]], None]:

@@ -201,7 +201,13 @@ def _insert(tx: Transaction, prepared: PreparedCommit, author: str) -> str:
 
 
 def insert_commit(
-    tx: Transaction, dataset_id: str, record: CommitRecord, *, entries: int, write_id: str | None = None
+    tx: Transaction,
+    dataset_id: str,
+    record: CommitRecord,
+    *,
+    entries: int,
+    write_id: str | None = None,
+    job_id: str | None = None,
 ) -> None:
     """Store a commit whose tree and parents are stored; `entries` is the number of its entries."""
     above = select(dataset_commit.c.generation).where(
@@ -209,7 +215,7 @@ def insert_commit(
     )
     row = {
         "dataset_id": dataset_id, "digest": record.digest, "tree": record.tree, "author": record.author,
-        "message": record.message, "at": record.at, "entries": entries, "write_id": write_id,
+        "message": record.message, "at": record.at, "entries": entries, "write_id": write_id, "job_id": job_id,
         "generation": max((number + 1 for number in tx.execute(above).scalars()), default=0),
     }  # fmt: skip
     tx.execute(insert(dataset_commit).values(**row))

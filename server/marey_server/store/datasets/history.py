@@ -58,7 +58,7 @@ def tree_of(tx: Transaction, dataset_id: str, digest: str) -> str:
 def _shown(row: Row[Any], parents: Sequence[str]) -> Commit:
     return Commit(
         digest=row.digest, tree=row.tree, parents=tuple(parents), author=row.author, message=row.message,
-        at=datetime.fromisoformat(row.at), entries=row.entries,
+        at=datetime.fromisoformat(row.at), entries=row.entries, job=row.job_id,
     )  # fmt: skip
 
 

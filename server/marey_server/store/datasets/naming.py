@@ -79,7 +79,7 @@ def create_dataset(tx: Transaction, project: str, request: DatasetCreate) -> Dat
     }  # fmt: skip
     with taken(ConflictProblem(f"There is a dataset {request.name!r} already.", code="name-taken")):
         tx.execute(insert(dataset).values(**row))
-    tx.execute(insert(dataset_ref).values(**_new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
+    tx.execute(insert(dataset_ref).values(**new_ref(tx, dataset_id, MAIN, RefKind.BRANCH, None)))
     tx.emit("dataset.created", dataset_id, project_id=project_row.id, name=request.name)
     return _shown(find_dataset(tx, project_row, request.name))
 
@@ -122,7 +122,8 @@ def delete_dataset(tx: Transaction, project: str, name: str, *, expected_rev: Ex
 # -- branches and tags ------------------------------------------------------------------------------------------------
 
 
-def _new_ref(tx: Transaction, dataset_id: str, name: str, kind: RefKind, digest: str | None) -> dict[str, Any]:
+def new_ref(tx: Transaction, dataset_id: str, name: str, kind: RefKind, digest: str | None) -> dict[str, Any]:
+    """Return the row to insert for a new branch or tag."""
     return {
         "dataset_id": dataset_id, "name": name, "kind": kind.value, "digest": digest,
         "created_us": tx.now_us, "updated_us": tx.now_us, "rev": 1,
@@ -176,7 +177,7 @@ def create_ref(tx: Transaction, project: str, name: str, request: RefCreate) -> 
     held = tx.execute(select(func.count()).where(dataset_ref.c.dataset_id == row.id)).scalar_one()
     _require_room(held, MOST_REFS, "branches and tags in a dataset", "too-many-refs")
     with taken(ConflictProblem(f"There is a branch or tag {request.name!r} already.", code="name-taken")):
-        tx.execute(insert(dataset_ref).values(**_new_ref(tx, row.id, request.name, request.kind, digest)))
+        tx.execute(insert(dataset_ref).values(**new_ref(tx, row.id, request.name, request.kind, digest)))
     tx.emit(f"{request.kind.value}.created", row.id, project_id=project_row.id, name=request.name, commit=digest)
     made = find_ref(tx, row.id, request.name)
     assert made is not None

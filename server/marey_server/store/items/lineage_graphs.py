@@ -160,7 +160,9 @@ class _LineageWalk:
 
     def _makers(self, ids: Collection[str]) -> dict[str, Row[Any]]:
         """Return the rows of the jobs and tasks that have the given ids, as a mapping from id to row."""
-        columns = (job.c.id, job.c.parent_id, job.c.kind, job.c.seed, job.c.code_version, job.c.finished_us)
+        columns = (
+            job.c.id, job.c.parent_id, job.c.kind, job.c.seed, job.c.code_version, job.c.finished_us, job.c.committed,
+        )  # fmt: skip
         found: dict[str, Row[Any]] = {}
         for some in _batches(sorted(ids)):
             found |= {row.id: row for row in self._tx.execute(select(*columns).where(job.c.id.in_(some)))}
@@ -181,7 +183,7 @@ class _LineageWalk:
             row = whole[name]
             yield LineageJob(
                 id=name, kind=row.kind, seed=row.seed, code_versions=tuple(sorted(versions[name])),
-                commits=tuple(sorted(commits[name])),
+                commits=tuple(sorted(commits[name])), commit=row.committed,
                 finished_at=None if row.finished_us is None else datetime_of(row.finished_us),
             )  # fmt: skip
 

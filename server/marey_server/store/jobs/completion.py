@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from sqlalchemy import and_, bindparam, exists, select, tuple_, update
@@ -20,7 +21,7 @@ from marey_server import faults
 from marey_server.access.principal import Principal
 from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store.database.prepared import Prepared
-from marey_server.store.jobs import staging
+from marey_server.store.jobs import commits, staging
 from marey_server.store.jobs.endings import ENDED_COLUMNS, AttemptEnd, Ended, as_ended, end_attempts, end_jobs
 from marey_server.store.jobs.failure import ENDING_COLUMNS, apply_outcome, decide_outcome
 from marey_server.store.jobs.fan_out import release_tasks
@@ -89,6 +90,8 @@ _WIN = Prepared(
         job.c.into_path,
         job.c.author_id,
         job.c.message,
+        job.c.kind,
+        job.c.commit_to,
         job.c.cache_key,
         job.c.gathers,
     )
@@ -107,7 +110,11 @@ def _complete(
     records = []
     for row in sorted(won, key=lambda row: row.id):
         request = requests[row.id, row.fence]
-        outputs = staging.publish_drafts(tx, row, staged.get((row.id, row.fence), {}))
+        published = commits.publish_outputs(tx, row, staged.get((row.id, row.fence), {}))
+        if published.failure is not None:
+            done[row.id, row.fence] = _fail_for_commit(tx, row, published.failure)
+            continue
+        outputs = published.outputs
         of_attempt = Principal("attempt", job_id=row.id, fence=row.fence, project_id=row.project_id)
         staging.keep_named_blobs(tx.beside(of_attempt), row.id, set(staging.named_blobs(request.result)))
         records.append(
@@ -119,16 +126,23 @@ def _complete(
                 "its_environment": request.environment,
             }
         )
+        if published.columns:
+            tx.execute(update(job).where(job.c.id == row.id).values(**published.columns))
         answer = CompleteAnswer(
-            job=row.id, state=JobState.SUCCEEDED, outputs=tuple(JobOutput(**output) for output in outputs)
+            job=row.id,
+            state=JobState.SUCCEEDED,
+            outputs=tuple(JobOutput(**output) for output in outputs),
+            commit=published.commit,
         )
-        done[row.id, row.fence] = (as_ended(row), answer)
+        done[row.id, row.fence] = (replace(as_ended(row), commit=published.commit), answer)
     if done:
         _record(tx, records)
-        unshared = {(row.id, row.fence) for row in won if row.cache_key is None} & staged.keys()
+        failed = {place for place, (end, _) in done.items() if not end.succeeded}
+        unshared = {(row.id, row.fence) for row in won if row.cache_key is None or (row.id, row.fence) in failed}
+        unshared &= staged.keys()
         if unshared:
             staging.drop_staged(tx, unshared)
-        if gathered := [row.id for row in won if row.gathers]:
+        if gathered := [row.id for row in won if row.gathers and (row.id, row.fence) not in failed]:
             release_tasks(tx, gathered)
         end_attempts(
             tx,
@@ -136,14 +150,22 @@ def _complete(
                 AttemptEnd(
                     job_id,
                     fence,
-                    "succeeded",
+                    end.state,
+                    None if end.failure is None else end.failure["detail"],
                     write_id=requests[job_id, fence].write_id,
                     answer=answer.model_dump(mode="json"),
                 )
-                for (job_id, fence), (_, answer) in done.items()
+                for (job_id, fence), (end, answer) in done.items()
             ],
         )
     return done
+
+
+def _fail_for_commit(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
+    """Record that a job failed because its outputs may not be committed; nothing of it was published."""
+    tx.execute(update(job).where(job.c.id == row.id).values(state="failed", failure=failure))
+    end = replace(as_ended(row), state=JobState.FAILED.value, failure=failure)
+    return end, CompleteAnswer(job=row.id, state=JobState.FAILED)
 
 
 _RECORD = Prepared(
@@ -172,9 +194,9 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
     earlier = stored_answer(tx, *place, write_id)
     if earlier is None:
         return _end_cancelled(tx, place, write_id)
-    if earlier["state"] not in (JobState.SUCCEEDED, JobState.CANCELLED):
+    if earlier["state"] != JobState.CANCELLED and "outputs" not in earlier:  # the answer to a report of failure
         raise lease_lost(*place)
-    return CompleteAnswer(job=earlier["job"], state=earlier["state"], outputs=earlier.get("outputs", ()))
+    return CompleteAnswer(**earlier)
 
 
 def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:

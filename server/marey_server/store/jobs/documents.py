@@ -11,6 +11,7 @@ from sqlalchemy import Row, Select, bindparam, func, select
 from marey_schemas.queue.jobs import Job, JobState, Progress
 from marey_server.store.database.clock import datetime_of
 from marey_server.store.database.prepared import Prepared
+from marey_server.store.jobs.commits import shown_commit
 from marey_server.store.tables import job, job_dependency, project, user
 from marey_server.store.transaction import IN_LIST, Transaction
 
@@ -141,6 +142,7 @@ def _document(row: Any, after: tuple[str, ...], children: dict[str, int], at_wor
         result=row.result,
         cancel_requested=row.cancel_requested_us is not None,
         publish_conflict=row.publish_conflict,
+        commit=shown_commit(row),
         author=row.author_name,
         created_at=datetime_of(row.created_us),
         run_at=datetime_of(row.run_at_us),

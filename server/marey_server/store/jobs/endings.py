@@ -25,6 +25,8 @@ class Ended:
     state: str
     parent_id: str | None
     failure: dict[str, Any] | None = None
+    commit: str | None = None
+    """Commit that has the outputs of the job."""
 
     @property
     def succeeded(self) -> bool:
@@ -32,12 +34,12 @@ class Ended:
         return self.state == "succeeded"
 
 
-ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c.failure)
+ENDED_COLUMNS = (job.c.id, job.c.project_id, job.c.state, job.c.parent_id, job.c.failure, job.c.committed)
 
 
 def as_ended(row: Row[Any]) -> Ended:
     """Convert a database row with the columns `ENDED_COLUMNS` to an ended job."""
-    return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure)
+    return Ended(row.id, row.project_id, row.state, row.parent_id, row.failure, row.committed)
 
 
 def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str, Any]:

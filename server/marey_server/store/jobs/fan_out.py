@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import and_, delete, select, update
 
 from marey_schemas.queue.jobs import FailureReason
+from marey_server.store.jobs import commits
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import RUNNING
@@ -24,7 +25,8 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
     If all tasks succeeded, the parent job succeeds or is queued. Otherwise it is cancelled if cancellation was
     requested, and failed if a task failed.
     """
-    head = tx.execute(select(job.c.kind, job.c.gathers, job.c.cancel_requested_us).where(job.c.id == parent_id)).one()
+    columns = (*commits.JOB_COLUMNS, job.c.gathers, job.c.cancel_requested_us)
+    head = tx.execute(select(*columns).where(job.c.id == parent_id)).one()
     rows = tx.execute(
         select(job.c.id, job.c.state, job.c.result, job.c.failure)
         .where(job.c.parent_id == parent_id)
@@ -46,8 +48,12 @@ def gather(tx: Transaction, parent_id: str) -> list[Ended]:
         tx.execute(update(job).where(running).values(state="queued", rev=job.c.rev + 1))
         wake_workers(tx, [head.kind])
         return []
-    state = "succeeded" if succeeded and not head.gathers else "cancelled"
-    return end_jobs(tx, running, state, result=result)
+    if not succeeded or head.gathers:
+        return end_jobs(tx, running, "cancelled", result=result)
+    made = commits.commit_tasks(tx, head)
+    if made.failure is not None:
+        return end_jobs(tx, running, "failed", failure=made.failure, result=result)
+    return end_jobs(tx, running, "succeeded", result=result, **made.columns)
 
 
 def release_tasks(tx: Transaction, gathered: Collection[str]) -> None:

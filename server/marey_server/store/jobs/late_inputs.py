@@ -16,7 +16,7 @@ from marey_schemas.queue.job_kinds import KindDeclaration, UnknownKindError, fin
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.wording import without_prefix
 from marey_server import faults
-from marey_server.store.jobs import layout, result_cache
+from marey_server.store.jobs import commits, layout, result_cache
 from marey_server.store.jobs.endings import Ended, end_jobs, failure_document
 from marey_server.store.jobs.events import emit_job_events, wake_workers
 from marey_server.store.jobs.fencing import WAITING
@@ -99,6 +99,7 @@ def _with_late_inputs(tx: Transaction, row: Row[Any]) -> NewJob:
         row.labels_key,
         row.author_id,
         id=row.id,
+        commit_to=commits.with_new_base(tx, row.commit_to),
     )
     return NewJob(row.id, row.project_id, submission, pins)
 

@@ -12,6 +12,7 @@ from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_schemas.queue.jobs import JobCreate, Resources, commits_of
 from marey_server.store.ids import new_id
 from marey_server.store.jobs import result_cache
+from marey_server.store.jobs.commits import Target
 from marey_server.store.jobs.endings import Ended
 from marey_server.store.jobs.inputs import PinnedInputs, items_by_id
 from marey_server.store.transaction import Transaction
@@ -34,6 +35,7 @@ class Submission:
     """Whether some inputs are outputs of jobs that have not succeeded yet."""
     id: str = field(default_factory=lambda: new_id("job"))
     retry_of: str | None = None
+    commit_to: Target | None = None
 
 
 @dataclass
@@ -211,6 +213,7 @@ def layout_columns(tx: Transaction, one: NewJob) -> dict[str, Any]:
     return {
         "state": one.state,
         "inputs": one.pins,
+        "commit_to": one.submission.commit_to,
         "unbound": one.unbound,
         "size": one.size,
         "gathers": one.gathers,

@@ -60,9 +60,14 @@ def _announce(tx: Transaction, ended: Sequence[Ended]) -> None:
         emit_job_events(
             tx,
             f"job.{state}",
-            [(end.project_id, end.id, end.failure or {}) for end in ended if end.state == state],
+            [(end.project_id, end.id, _facts_of(end)) for end in ended if end.state == state],
         )
     wake_watchers(tx, [end.id for end in ended])
+
+
+def _facts_of(end: Ended) -> dict[str, Any]:
+    """Return the body of the event of an end: the failure, or the commit that has the outputs."""
+    return end.failure or ({} if end.commit is None else {"commit": end.commit})
 
 
 # -- dependants -------------------------------------------------------------------------------------------------------

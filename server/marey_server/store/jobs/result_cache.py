@@ -20,7 +20,7 @@ from marey_schemas.encoding.canonical import canonical_json
 from marey_schemas.queue.job_kinds import KindDeclaration
 from marey_server.errors import ApiProblem
 from marey_server.store import blobs
-from marey_server.store.jobs import staging
+from marey_server.store.jobs import commits, staging
 from marey_server.store.jobs.endings import Ended, end_jobs
 from marey_server.store.jobs.events import wake_workers
 from marey_server.store.jobs.fencing import QUEUED, RUNNING, WAITING
@@ -241,7 +241,7 @@ def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
     """
     waits = and_(job.c.id == job_id, job.c.state == WAITING)
     source = job.alias("source")
-    own = (job.c.id, job.c.project_id, job.c.into_path, job.c.author_id, job.c.message, job.c.inputs)
+    own = (*commits.JOB_COLUMNS, job.c.inputs)
     shared = (
         source.c.inputs.label("source_inputs"),
         source.c.fence,
@@ -260,16 +260,19 @@ def _publish_anew(tx: Transaction, job_id: str) -> list[Ended]:
     named = set(staging.named_blobs(row.result))
     if not staging.take_up_documents(tx, drafts) or not blobs.share_with_job(tx, row.id, named):
         return []
-    outputs = staging.publish_drafts(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
+    made = commits.publish_outputs(tx, row, staging.with_inputs(drafts, row.source_inputs, row.inputs))
+    if made.failure is not None:
+        return end_jobs(tx, waits, "failed", dependencies_left=0, failure=made.failure)
     return end_jobs(
         tx,
         waits,
         "succeeded",
         dependencies_left=0,
         result=row.result,
-        outputs=outputs,
+        outputs=made.outputs,
         code_version=row.code_version,
         environment=row.environment,
+        **made.columns,
     )
 
 

@@ -13,6 +13,7 @@ from marey_schemas.queue.jobs import FailureReason, Job, JobState
 from marey_server.access import roles
 from marey_server.errors import ConflictProblem
 from marey_server.store.ids import new_id
+from marey_server.store.jobs import commits
 from marey_server.store.jobs.inputs import PinnedInputs
 from marey_server.store.jobs.layout import Submission, request_of
 from marey_server.store.jobs.reading import find_job, require_own
@@ -92,7 +93,7 @@ class _Family:
         submissions = []
         for one, row in self._rows.items():
             stand_ins = {earlier: again.get(latest, latest) for earlier, latest in self._needs[one].items()}
-            submissions.append(_again(self._tx, row, again[one], stand_ins))
+            submissions.append(_again(self._tx, self._project, row, again[one], stand_ins))
         made = submit_checked(self._tx, self._project, submissions, upstream)
         return dict(zip(self._rows, made, strict=True))
 
@@ -134,7 +135,7 @@ class _Family:
 # -- one of them -------------------------------------------------------------------------------------------------------
 
 
-def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
+def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_ins: Mapping[str, str]) -> Submission:
     """Return the submission that retries a job under the id `new`, with its dependencies replaced by their retries."""
     try:
         kind = find_kind(row.kind)
@@ -156,6 +157,7 @@ def _again(tx: Transaction, row: Row[Any], new: str, stand_ins: Mapping[str, str
         unbound=row.unbound,
         id=new,
         retry_of=row.id,
+        commit_to=commits.check_again(tx, project, kind, row.commit_to, row.into_path),
     )
 
 

@@ -26,7 +26,7 @@ from marey_server.errors import InvalidProblem
 from marey_server.field_errors import field_errors, json_pointer
 from marey_server.store.database.prepared import Prepared
 from marey_server.store.ids import new_id
-from marey_server.store.jobs import result_cache, staging
+from marey_server.store.jobs import commits, result_cache, staging
 from marey_server.store.jobs.documents import document_of_new, job_documents
 from marey_server.store.jobs.endings import dependency_failure
 from marey_server.store.jobs.events import emit_job_events, wake_workers
@@ -146,7 +146,16 @@ def _check(
         tx.principal.user_id,
         after=tuple(dict.fromkeys((*request.after, *late))),
         unbound=bool(late),
+        commit_to=_target(tx, project, kind, request, at),
     )
+
+
+def _target(
+    tx: Transaction, project: ProjectRow, kind: KindDeclaration, request: JobCreate, at: str
+) -> commits.Target | None:
+    if request.commit is None:
+        return None
+    return commits.check_target(tx, project, kind, request.commit, request.into, f"{at}/commit")
 
 
 def _count_tasks(kind: KindDeclaration, params: Any, at: str) -> int:
@@ -265,17 +274,20 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 
 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
-    """Return the job request of a step, without the collection that the pipeline gave it if the kind cannot use one.
+    """Return the job request of a step, without what the pipeline gives to all steps and this one cannot use.
 
-    Results such as trees have a fixed place.
+    This is the collection, if the results of the step have a fixed place, as trees have, and the commit, if the step
+    creates no items.
     """
-    if step.into is not None:
-        return request
     try:
         kind = find_kind(request.kind)
         params = kind.params.model_validate(request.params)
     except (UnknownKindError, ValidationError):
         return request  # it is refused where it is checked, with the place of what is wrong
+    if step.commit is None and not commits.kinds_made_by(kind):
+        request = request.model_copy(update={"commit": None})
+    if step.into is not None:
+        return request
     unclear = kind.unclear_place
     if unclear is None or unclear(params, request.into) is None or unclear(params, "") is not None:
         return request

@@ -1,0 +1,100 @@
+"""Commits that jobs make of their outputs: what a submission asks for, and what a job answers."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal
+
+from pydantic import Field
+
+from marey_schemas.base import Answer, Options, Request
+from marey_schemas.datasets.naming import MAIN, DatasetName, RefName
+from marey_schemas.names import CollectionPath, Message
+
+MOST_COMMITTED = 10_000
+"""Greatest number of entries that the commit of one job adds, changes or removes."""
+MOST_LISTED = 100
+"""Greatest number of paths that a conflict lists."""
+
+_PLACE = re.compile(r"([^/@]+)(?:@([^/@]+))?(/.*)?")
+
+
+class OutputsCommit(Request):
+    """Commit of the outputs of a job to a branch of a dataset, in the transaction that publishes these outputs."""
+
+    dataset: DatasetName
+    branch: RefName = MAIN
+    folder: CollectionPath | None = Field(
+        None,
+        description="Folder of the dataset that receives the outputs, with their paths relative to `into`; null: the "
+        "outputs get the paths that they have in the project, relative to the dataset's folder if they are in it.",
+    )
+    message: Message = Field("", description="Message of the commit; empty: the kind and the id of the job.")
+    replace: bool = Field(
+        False,
+        description="Also remove the entries that the folder has from earlier and that this job does not make again, "
+        "if they are of the kinds that the job makes.",
+    )
+
+    @classmethod
+    def at(cls, place: str, **fields: Any) -> OutputsCommit:
+        """Return the commit to a place that is written `dataset[@branch][/folder]`. Raises `ValueError`."""
+        match = _PLACE.fullmatch(place.strip())
+        if match is None:
+            raise ValueError(f"{place!r} names no branch of a dataset; write dataset[@branch][/folder]")
+        folder = None if match[3] is None else match[3].strip("/")
+        return cls(dataset=match[1], branch=match[2] or MAIN, folder=folder, **fields)
+
+    @classmethod
+    def of(cls, given: OutputsCommit | str | None) -> OutputsCommit | None:
+        """Return a commit that may be given as text."""
+        return cls.at(given) if isinstance(given, str) else given
+
+
+class CommitOptions(Options):
+    """Options of commands that submit jobs: the commit of the outputs."""
+
+    commit_to: str | None = Field(
+        None, description="Commit the results to a branch when the job ends: dataset[@branch][/folder]."
+    )
+    commit_message: str | None = Field(
+        None, description="Message of the commit; absent: the kind and the id of the job."
+    )
+    commit_replace: bool = Field(
+        False, description="Remove the entries of the folder that the job does not make again, in the same commit."
+    )
+
+    def commit(self) -> OutputsCommit | None:
+        """Return the commit that the options ask for, or None. Raises `ValueError`."""
+        if self.commit_to is not None:
+            return OutputsCommit.at(self.commit_to, message=self.commit_message or "", replace=self.commit_replace)
+        if self.commit_message is not None or self.commit_replace:
+            raise ValueError("--commit-to is missing: the branch that gets the commit")
+        return None
+
+
+class CommitConflict(Answer):
+    """Reason why the outputs of a job that has succeeded are not on the branch that the submission names."""
+
+    code: Literal["paths-changed", "too-many-changes", "path-too-long", "too-many-refs"]
+    detail: str
+    branch: str | None = Field(None, description="Branch that has the outputs instead; null: they are in no commit.")
+    paths: tuple[str, ...] = Field((), description=f"Paths in conflict, at most {MOST_LISTED}.")
+    count: int = Field(0, description="Number of paths in conflict.")
+
+
+class JobCommit(Answer):
+    """Commit that a job makes of its outputs."""
+
+    dataset: str
+    branch: str
+    folder: str = Field(description="Folder of the dataset that receives the outputs.")
+    message: str
+    replace: bool
+    base: str | None = Field(
+        description="Newest commit of the branch when the inputs of the job were fixed: what others change later is "
+        "not overwritten."
+    )
+    digest: str | None = Field(
+        None, description="Commit that has the outputs; null before the end of the job, and if no entry changed."
+    )

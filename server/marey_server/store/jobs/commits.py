@@ -1,0 +1,285 @@
+"""Commits of the outputs of jobs: checks at submission, and the commit in the transaction that ends the job.
+
+A job commits once: tasks of a fan-out publish their outputs, and their parent job commits these when it ends. If the
+commit is not allowed any more, the job fails and publishes nothing, as if its author had lost access.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+from sqlalchemy import and_, select
+
+from marey_schemas.access import Role
+from marey_schemas.datasets.naming import RefKind
+from marey_schemas.kinds import Kind
+from marey_schemas.problems import FieldError
+from marey_schemas.queue.commits import MOST_COMMITTED, JobCommit, OutputsCommit
+from marey_schemas.queue.job_kinds import KindDeclaration
+from marey_schemas.queue.jobs import FailureReason
+from marey_server.access import roles, scopes
+from marey_server.errors import AUTHOR_LOST, ApiProblem, ForbiddenProblem, InvalidProblem, NotFoundProblem
+from marey_server.store.datasets.committing import author_of
+from marey_server.store.datasets.contents import find_contents_of, store_contents
+from marey_server.store.datasets.folders import tags_of
+from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
+from marey_server.store.datasets.outputs import CommittedOutputs, OutputEntries, commit_outputs, too_many_changes
+from marey_server.store.datasets.protection import Mover, require_move
+from marey_server.store.jobs import staging
+from marey_server.store.jobs.endings import failure_document
+from marey_server.store.jobs.staging import StagedDraft
+from marey_server.store.projects import ProjectRow
+from marey_server.store.tables import job, member, user
+from marey_server.store.transaction import Transaction
+from marey_versions.records import DatasetEntry, RevisionKey, key_of
+
+Target = dict[str, Any]
+"""Stored commit of a job: the fields of `OutputsCommit`, `dataset_id`, `base` (the newest commit of the branch when the
+inputs were fixed), `within` (the dataset's folder), and `kinds` (of the outputs)."""
+
+
+# -- submission -------------------------------------------------------------------------------------------------------
+
+
+def check_target(
+    tx: Transaction, project: ProjectRow, kind: KindDeclaration, request: OutputsCommit, into: str, at: str
+) -> Target:
+    """Return the commit that a submission asks for, as it is stored.
+
+    Raises `InvalidProblem` with a pointer below `at` for an unknown dataset or branch, and for a job without outputs
+    to commit; `ForbiddenProblem` and `ConflictProblem` if the caller may not commit to the branch.
+    """
+    if not scopes.allows(tx.principal.scopes, "write", project.name):
+        raise ForbiddenProblem(
+            f"A job that commits its outputs needs a token with the scopes 'jobs' and 'write' in the project "
+            f"{project.name!r}.",
+            code="insufficient-scope",
+        )
+    kinds = kinds_made_by(kind)
+    if not kinds:
+        raise _invalid(at, "no-outputs", f"Jobs of the kind {kind.name} create no items to commit.")
+    try:
+        found = find_dataset(tx, project, request.dataset)
+    except NotFoundProblem as error:
+        raise _invalid(f"{at}/dataset", error.error_code, error.detail) from None
+    ref = find_ref(tx, found.id, request.branch)
+    if ref is None:
+        detail = f"The dataset {request.dataset!r} has no branch {request.branch!r}."
+        raise _invalid(f"{at}/branch", "no-version", detail)
+    if ref.kind != RefKind.BRANCH:
+        raise _invalid(f"{at}/branch", "is-tag", is_tag(request.branch).detail)
+    try:
+        require_move(ref, Mover(author_of(tx), project.role))
+    except ApiProblem as error:
+        fault = FieldError(pointer=f"{at}/branch", code=error.error_code, detail=error.detail)
+        raise type(error)(error.detail, code=error.error_code, errors=[fault]) from None
+    target = {
+        **request.model_dump(), "dataset_id": found.id, "base": ref.digest, "within": found.path or "", "kinds": kinds,
+    }  # fmt: skip
+    if request.replace and not _entry_folder(target, into):
+        detail = "The commit would replace the whole dataset; name a folder of it."
+        raise _invalid(f"{at}/replace", "whole-dataset", detail)
+    return target
+
+
+def kinds_made_by(kind: KindDeclaration) -> list[str]:
+    """Return the kinds of the items that jobs of a kind create."""
+    return sorted({one.value for one in kind.outputs.values() if isinstance(one, Kind)})
+
+
+def check_again(
+    tx: Transaction, project: ProjectRow, kind: KindDeclaration, target: Target | None, into: str
+) -> Target | None:
+    """Return the commit of a job that is retried, with the base of the first try. Raises as `check_target` does."""
+    if target is None:
+        return None
+    request = OutputsCommit.model_validate({name: target[name] for name in OutputsCommit.model_fields})
+    checked = check_target(tx, project, kind, request, into, "/commit")
+    return {**checked, "base": target["base"]} if checked["dataset_id"] == target["dataset_id"] else checked
+
+
+def with_new_base(tx: Transaction, target: Target | None) -> Target | None:
+    """Return the commit of a job whose inputs are fixed now, so that it follows the present head of the branch."""
+    ref = None if target is None else find_ref(tx, target["dataset_id"], target["branch"])
+    return target if target is None or ref is None else {**target, "base": ref.digest}
+
+
+def shown_commit(row: Any) -> JobCommit | None:
+    """Return the commit of a job as a document, None if it makes none; a task leaves it to its parent job."""
+    target: Target | None = row.commit_to
+    if target is None or row.parent_id is not None:
+        return None
+    return JobCommit.model_validate(
+        {**target, "folder": _entry_folder(target, row.into_path), "message": _message(row), "digest": row.committed}
+    )
+
+
+def _invalid(pointer: str, code: str, detail: str) -> InvalidProblem:
+    return InvalidProblem(detail, errors=[FieldError(pointer=pointer, code=code, detail=detail)])
+
+
+def _entry_folder(target: Target, into: str, below: str = "") -> str:
+    """Return the folder of the dataset that receives the outputs of the folder `below` of a job's results."""
+    if target["folder"] is not None:
+        return _joined(target["folder"], below)
+    place, within = _joined(into, below), target["within"]
+    return f"{place}/".removeprefix(f"{within}/").rstrip("/") if within else place
+
+
+def _joined(*names: str) -> str:
+    return "/".join(filter(None, names))
+
+
+# -- the end of a job -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PublishedOutputs:
+    """Published outputs of a job, and the values of the columns that its commit determines.
+
+    With a `failure`, the outputs were not published, because the commit is not allowed.
+    """
+
+    outputs: list[dict[str, Any]] = field(default_factory=list)
+    columns: Mapping[str, Any] = field(default_factory=dict)
+    failure: dict[str, Any] | None = None
+
+    @property
+    def commit(self) -> str | None:
+        """The digest of the commit that has the outputs."""
+        return self.columns.get("committed")
+
+
+JOB_COLUMNS = (
+    job.c.id,
+    job.c.project_id,
+    job.c.kind,
+    job.c.parent_id,
+    job.c.into_path,
+    job.c.author_id,
+    job.c.message,
+    job.c.commit_to,
+)
+"""Columns of a job that the functions below need."""
+
+
+def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
+    """Publish the drafts of a job (`JOB_COLUMNS`) and commit them if its submission asks for that, all or nothing."""
+    if row.commit_to is None:
+        return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
+    if row.parent_id is not None:
+        return PublishedOutputs(_publish_entries(tx, row, drafts))
+    try:
+        with tx.connection.begin_nested():
+            outputs = _publish_entries(tx, row, drafts)
+            return PublishedOutputs(outputs, _commit(tx, row, outputs))
+    except _CommitRefused as error:
+        return PublishedOutputs(failure=error.failure)
+
+
+def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
+    """Commit the outputs of all tasks of a parent job (`JOB_COLUMNS`) if its submission asks for that."""
+    if row.commit_to is None:
+        return PublishedOutputs()
+    tasks = select(job.c.outputs).where(job.c.parent_id == row.id).order_by(job.c.position)
+    outputs = [one for of_task in tx.execute(tasks).scalars() for one in of_task or ()]
+    try:
+        return PublishedOutputs([], _commit(tx, row, outputs))
+    except _CommitRefused as error:
+        return PublishedOutputs(failure=error.failure)
+
+
+class _CommitRefused(Exception):
+    """The outputs of a job may not be committed to its branch."""
+
+    def __init__(self, target: Target, error: ApiProblem) -> None:
+        detail = f"The outputs cannot be committed to {target['dataset']}@{target['branch']}. {error.detail}"
+        super().__init__(detail)
+        self.failure = failure_document(FailureReason.ERROR, error.error_code, detail)
+
+
+def _publish_entries(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
+    """Publish the drafts of a job, and compute the digests of their content, so that a parent job need not do it."""
+    outputs = staging.publish_drafts(tx, row, drafts)
+    store_contents(tx, find_contents_of(tx, map(_revision, outputs)))
+    return [{**one, "entry": _entry_path(row, drafts[one["name"]])} for one in outputs]
+
+
+def _entry_path(row: Any, draft: StagedDraft) -> str:
+    return _joined(_entry_folder(row.commit_to, row.into_path, draft["collection"]), draft["item_name"])
+
+
+def _revision(output: Mapping[str, Any]) -> RevisionKey:
+    return RevisionKey(output["item"], output["revision"])
+
+
+def _commit(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Commit outputs on behalf of the job's author; return the columns of the job that record the commit."""
+    if not outputs:
+        return {}
+    if len(outputs) > MOST_COMMITTED:
+        made = CommittedOutputs(conflict=too_many_changes())
+    else:
+        target: Target = row.commit_to
+        try:
+            made = commit_outputs(tx, _entries_of(tx, row, outputs), _mover(tx, row))
+        except ApiProblem as error:
+            raise _CommitRefused(target, error) from None
+    conflict = None if made.conflict is None else made.conflict.model_dump(mode="json")
+    return {"committed": made.digest, **({} if conflict is None else {"publish_conflict": conflict})}
+
+
+def _entries_of(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]]) -> OutputEntries:
+    target: Target = row.commit_to
+    contents = find_contents_of(tx, map(_revision, outputs))
+    tags = tags_of(tx, sorted({one["item"] for one in outputs}))
+    entries: dict[str, DatasetEntry] = {}
+    revisions: dict[str, RevisionKey] = {}
+    for one in outputs:
+        path = _free_path(one, revisions)
+        entry = DatasetEntry(path, one["kind"], contents.parts[_revision(one)], tags.get(one["item"], ()))
+        entries[entry.key], revisions[entry.key] = entry, _revision(one)
+    return OutputEntries(
+        dataset_id=target["dataset_id"], project_id=row.project_id, branch=target["branch"], base=target["base"],
+        entries=entries, revisions=revisions, message=_message(row), job_id=row.id,
+        replaced=_entry_folder(target, row.into_path) if target["replace"] else None, kinds=target["kinds"],
+    )  # fmt: skip
+
+
+def _free_path(output: Mapping[str, Any], taken: Mapping[str, RevisionKey]) -> str:
+    """Return the path of an output, with a number if another item of the same job has the path.
+
+    Two outputs may have one name if items with equal content are reused.
+    """
+    for number in count(1):
+        path = output["entry"] if number == 1 else f"{output['entry']}-{number}"
+        other = taken.get(key_of(path, output["kind"]))
+        if other is None or other.item == output["item"]:
+            return str(path)
+    raise AssertionError("unreachable")
+
+
+def _message(row: Any) -> str:
+    return row.commit_to["message"] or f"Results of {row.kind} {row.id}"
+
+
+def _mover(tx: Transaction, row: Any) -> Mover:
+    """Return the author of a job with the role that the author has now.
+
+    Raises `ForbiddenProblem` if the author is disabled, or may not write to the project any more.
+    """
+    if row.author_id is None:
+        return Mover(str(tx.principal.actor), Role.OWNER)
+    in_project = and_(member.c.user_id == user.c.id, member.c.project_id == row.project_id)
+    found = tx.execute(
+        select(user.c.name, user.c.administrator, user.c.disabled, member.c.role)
+        .select_from(user.outerjoin(member, in_project))
+        .where(user.c.id == row.author_id)
+    ).one()
+    role = Role.OWNER if found.administrator else found.role and Role(found.role)
+    if found.disabled or role is None or not roles.includes(role, Role.CONTRIBUTOR):
+        raise ForbiddenProblem("The author of the job may not write to the project any more.", code=AUTHOR_LOST)
+    return Mover(found.name, role)
