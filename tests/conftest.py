@@ -15,6 +15,7 @@ pytest_plugins = (
     "tests.support.tiers",
     "tests.support.store_fixtures",
     "tests.support.queue_desk",
+    "tests.support.committing_desk",
 )
 
 MEMORY = Path("/dev/shm")

@@ -1,79 +1,27 @@
 """Jobs that commit their outputs: one transaction publishes the outputs and moves the branch, or neither."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
+from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk, document
-from tests.support.store_fixtures import WRITE, requiring
 
-from marey_schemas.datasets.commits import Commit, CommitCreate, PutEntry, RemoveEntry
-from marey_schemas.datasets.naming import MAIN, DatasetCreate
+from marey_schemas.access import MemberChange, Role, UserCreate
+from marey_schemas.datasets.commits import CommitCreate, PutEntry, RemoveEntry
+from marey_schemas.datasets.naming import RefCreate, RefKind
+from marey_schemas.datasets.protection import ProtectionRule
+from marey_schemas.items import ItemChange
 from marey_schemas.kinds import Kind
-from marey_schemas.queue.commits import OutputsCommit
-from marey_schemas.queue.jobs import Job
-from marey_schemas.queue.worker_protocol import Lease
-from marey_server.store import datasets
-from marey_server.store.items.drafts import Draft
-
-
-class CommittingDesk:
-    """Desk with the dataset `gaits`, to which jobs commit."""
-
-    def __init__(self, desk: Desk) -> None:
-        self.desk = desk
-        self.write(datasets.create_dataset, "lab", DatasetCreate(name="gaits"))
-
-    def read(self, function: Any, *args: Any, **kwargs: Any) -> Any:
-        return self.desk.database.read(self.desk.user, requiring(WRITE, function), *args, **kwargs)
-
-    def write(self, function: Any, *args: Any, **kwargs: Any) -> Any:
-        return self.desk.database.write(self.desk.user, requiring(WRITE, function), *args, **kwargs)
-
-    def submit(
-        self, kind: str = "sum", to: str = "gaits", *, commit: dict[str, Any] | None = None, **fields: Any
-    ) -> str:
-        return self.desk.submit(kind, commit=OutputsCommit.at(to, **(commit or {})), **fields)
-
-    def work(self, *names: str, **fields: Any) -> Lease:
-        """Claim a job, and complete it with outputs of these names."""
-        lease = self.desk.claim()
-        if names:
-            self.desk.stage(lease, *names, **fields)
-        self.desk.complete(lease)
-        return lease
-
-    def job(self, job_id: str) -> Job:
-        return self.desk.job(job_id)
-
-    def head(self, branch: str = MAIN) -> str | None:
-        found: str | None = self.read(datasets.read_ref, "lab", "gaits", branch).commit
-        return found
-
-    def commit(self, version: str = MAIN) -> Commit:
-        found: Commit = self.read(datasets.read_commit, "lab", "gaits", version)
-        return found
-
-    def entries(self, version: str = MAIN) -> dict[str, str | None]:
-        """The items of a version by path."""
-        page = self.read(datasets.list_entries, "lab", "gaits", version, path="", cursor=None, limit=1000)
-        return {one.path: one.item for one in page.items}
-
-    def put(self, path: str, *, number: int, branch: str = MAIN) -> str:
-        """Commit a new item at a path as a person; return its id."""
-        (made,) = self.desk.publish(Draft("d", Kind.STUDY, f"own{number}", {"study": document(number=number)}, "own"))
-        self.change(PutEntry(path=path, item=made.item), branch=branch)
-        return made.item
-
-    def change(self, *changes: Any, branch: str = MAIN) -> Commit:
-        request = CommitCreate(branch=branch, message="by hand", changes=changes)
-        prepared = self.read(datasets.prepare_commit, "lab", "gaits", request)
-        made: Commit = self.write(datasets.record_commit, "lab", "gaits", prepared)
-        return made
-
-
-@pytest.fixture
-def gaits(desk: Desk) -> CommittingDesk:
-    return CommittingDesk(desk)
+from marey_schemas.lineage import LineageRequest
+from marey_schemas.queue.jobs import ItemInput, JobOutputsInput
+from marey_schemas.queue.worker_protocol import BatchCompletion, StagedOutput
+from marey_server.access.principal import SYSTEM
+from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem
+from marey_server.store import datasets, events, fsck, items, members, users
+from marey_server.store.jobs import commits, completion, reading, retrying, staging
+from marey_server.store.retention import Retention, retire
 
 
 def test_a_job_commits_its_outputs_when_it_completes(gaits: CommittingDesk) -> None:
@@ -133,3 +81,431 @@ def test_an_entry_that_was_removed_meanwhile_is_a_conflict(gaits: CommittingDesk
     assert conflict is not None
     assert gaits.entries() == {}
     assert gaits.entries(made).keys() == {"made/a"}
+
+
+def test_commits_of_others_to_the_same_branch_are_all_kept(gaits: CommittingDesk) -> None:
+    """Several jobs that started from one commit land one after another."""
+    jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(5)]
+    for number in range(5):
+        gaits.work(f"a{number}", facts={"number": number})
+    assert len(gaits.entries()) == 5
+    assert {one.job for one in gaits.log()} == set(jobs)
+    assert all(gaits.job(one).publish_conflict is None for one in jobs)
+
+
+def test_two_jobs_that_make_one_path_differently_end_on_two_branches(gaits: CommittingDesk) -> None:
+    first, second = (gaits.submit(into="made", cache="off", params={"number": number}) for number in range(2))
+    gaits.work("a", facts={"of": 1})
+    gaits.work("a", facts={"of": 2})
+    assert gaits.commit().job == first
+    conflict = gaits.job(second).publish_conflict
+    assert conflict is not None
+    assert conflict.branch == second
+    assert gaits.commit(second).job == second
+    assert gaits.entries() == gaits.entries(second)  # the second revision of the same item
+    assert gaits.commit().tree != gaits.commit(second).tree
+
+
+def test_the_same_result_is_committed_once(gaits: CommittingDesk) -> None:
+    first, second = (gaits.submit(into="made", cache="off") for _ in range(2))
+    gaits.work("a")
+    gaits.work("a")
+    assert [one.job for one in gaits.log()] == [first]
+    found = gaits.job(second)
+    assert (found.state, found.publish_conflict, found.commit and found.commit.digest) == ("succeeded", None, None)
+
+
+def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) -> None:
+    """Somebody tags the entry while a job computes its content anew."""
+    first = gaits.submit(into="made")
+    gaits.work("a")
+    (made,) = gaits.desk.outputs(first)
+    second = gaits.submit(into="made", cache="off")
+    gaits.write(items.change_item, "lab", Kind.STUDY, made.item, ItemChange(tags=("seen",)), expected_rev=None)
+    gaits.change(PutEntry(path="made/a", item=made.item))
+    gaits.work("a", facts={"anew": 1})
+    assert gaits.job(second).publish_conflict is None
+    (entry,) = gaits.read(datasets.list_entries, "lab", "gaits", "main", path="", cursor=None, limit=10).items
+    assert (entry.tags, entry.revision) == (("seen",), 2)
+
+
+# -- once, or not at all ----------------------------------------------------------------------------------------------
+
+
+def test_a_completion_that_is_repeated_commits_once(gaits: CommittingDesk) -> None:
+    made = gaits.submit(into="made")
+    lease = gaits.desk.claim()
+    gaits.desk.stage(lease, "a")
+    first = gaits.desk.complete(lease, write_id="the-write-id")
+    assert gaits.desk.complete(lease, write_id="the-write-id") == first
+    assert first.commit == gaits.head() == gaits.job(made).commit.digest  # type: ignore[union-attr]
+    assert len(gaits.log()) == 1
+    with pytest.raises(LeaseLostProblem):
+        gaits.desk.complete(lease, write_id="another-write-id")
+
+
+def test_an_attempt_that_lost_its_lease_commits_nothing(gaits: CommittingDesk) -> None:
+    made = gaits.submit(into="made")
+    late = gaits.desk.claim()
+    gaits.desk.stage(late, "late")
+    gaits.desk.clock.advance(3600)
+    gaits.desk.reap()
+    prompt = gaits.desk.claim()
+    with pytest.raises(LeaseLostProblem):
+        gaits.desk.complete(late)
+    assert gaits.head() is None
+    gaits.desk.stage(prompt, "a")
+    gaits.desk.complete(prompt)
+    assert gaits.entries().keys() == {"made/a"}
+    assert gaits.commit().job == made
+
+
+def test_a_cancelled_job_commits_nothing(gaits: CommittingDesk) -> None:
+    made = gaits.submit(into="made")
+    lease = gaits.desk.claim()
+    gaits.desk.stage(lease, "a")
+    gaits.desk.cancel(made)
+    assert gaits.desk.complete(lease).state == "cancelled"
+    assert gaits.head() is None
+    assert gaits.job(made).commit.digest is None  # type: ignore[union-attr]
+
+
+def test_jobs_that_end_in_one_batch_commit_one_after_another(gaits: CommittingDesk) -> None:
+    jobs = [gaits.submit(into=f"made{number}", cache="off") for number in range(4)]
+    leases = gaits.desk.claim_many()
+    for lease in leases:
+        gaits.desk.stage(lease, "a")
+    batch = [BatchCompletion(job=one.job, fence=one.fence, write_id=gaits.desk.write_id()) for one in leases]
+    results = gaits.desk.database.write(gaits.desk.user, completion.complete_many, batch)
+    assert {one.answer.commit for one in results if one.answer} == {one.digest for one in gaits.log()}
+    assert {one.job for one in gaits.log()} == set(jobs)
+
+
+# -- fan-outs, cached results, pipelines ------------------------------------------------------------------------------
+
+
+def test_a_fan_out_commits_once_at_its_end(gaits: CommittingDesk) -> None:
+    things = gaits.desk.things(5)
+    made = gaits.submit("square", into="made", inputs={"things": tuple(ItemInput(item=one) for one in things)})
+    leases = gaits.desk.claim_many()
+    assert len(leases) == 3
+    for number, lease in enumerate(leases):
+        assert gaits.head() is None
+        gaits.desk.stage(lease, f"a{number}", f"b{number}")
+        gaits.desk.complete(lease)
+    assert [one.job for one in gaits.log()] == [made]
+    outputs = gaits.desk.outputs(made)
+    assert gaits.entries() == {one.entry: one.item for one in outputs}
+    assert len(outputs) == 6
+    assert gaits.job(leases[0].job).commit is None
+    assert gaits.job(made).commit.digest == gaits.head()  # type: ignore[union-attr]
+
+
+def test_a_fan_out_of_which_a_task_fails_commits_nothing_and_its_retry_everything(gaits: CommittingDesk) -> None:
+    things = gaits.desk.things(4)
+    made = gaits.submit("square", into="made", inputs={"things": tuple(ItemInput(item=one) for one in things)})
+    first, second = gaits.desk.claim_many()
+    gaits.desk.stage(first, "a")
+    gaits.desk.complete(first)
+    gaits.desk.fail(second, retryable=False)
+    assert gaits.job(made).state == "failed"
+    assert gaits.head() is None
+    again = gaits.write(retrying.retry_job, made).id
+    gaits.work("b")
+    assert gaits.job(again).state == "succeeded"
+    assert gaits.entries().keys() == {"made/a", "made/b"}
+    assert [one.job for one in gaits.log()] == [again]
+
+
+def test_a_job_whose_tasks_are_gathered_commits_what_it_gathered(gaits: CommittingDesk) -> None:
+    things = gaits.desk.things(1)
+    made = gaits.submit("survey", into="made", params={"number": 2}, inputs={"things": (ItemInput(item=things[0]),)})
+    for lease in gaits.desk.claim_many():
+        gaits.desk.complete(lease)
+    assert gaits.head() is None
+    gaits.work("whole")
+    assert gaits.entries().keys() == {"made/whole"}
+    assert gaits.commit().job == made
+
+
+def test_a_cached_result_is_committed_too(gaits: CommittingDesk) -> None:
+    gaits.desk.submit("sum", into="first")
+    gaits.work("a")
+    made = gaits.submit(into="second")
+    found = gaits.job(made)
+    assert (found.state, found.cached_from is not None) == ("succeeded", True)
+    assert gaits.entries().keys() == {"second/a"}
+    assert gaits.commit().job == made
+
+
+def test_jobs_that_wait_for_one_result_all_commit_it(gaits: CommittingDesk) -> None:
+    jobs = [gaits.submit(into=f"made{number}") for number in range(3)]
+    gaits.work("a")
+    assert gaits.entries().keys() == {"made0/a", "made1/a", "made2/a"}
+    assert {one.job for one in gaits.log()} == set(jobs)
+
+
+def test_identical_jobs_that_all_meet_a_conflict_share_the_commit(gaits: CommittingDesk) -> None:
+    jobs = [gaits.submit(into="made", commit_message="same") for _ in range(3)]
+    gaits.put("made/a", number=7)
+    gaits.work("a")
+    assert gaits.branches() == {"main", *jobs}
+    assert len({gaits.head(one) for one in jobs}) == 1
+
+
+def test_a_step_that_reads_an_earlier_one_starts_from_the_commit_of_that(gaits: CommittingDesk) -> None:
+    """Both steps make the same path; the second one follows the first, so it is no conflict."""
+    first = gaits.submit(into="made")
+    second = gaits.submit("square", into="made", inputs={"things": (JobOutputsInput(job=first),)})
+    gaits.work("a")
+    gaits.work("a", facts={"step": 2})
+    assert gaits.job(second).publish_conflict is None
+    assert [one.job for one in gaits.log()] == [second, first]
+
+
+# -- who may ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("to", "pointer", "code"),
+    [
+        ("nothing", "/commit/dataset", "no-dataset"),
+        ("gaits@nothing", "/commit/branch", "no-version"),
+        ("gaits@v1", "/commit/branch", "is-tag"),
+    ],
+)
+def test_an_unknown_place_is_refused_with_its_field(gaits: CommittingDesk, to: str, pointer: str, code: str) -> None:
+    gaits.put("a", number=1)
+    gaits.write(datasets.create_ref, "lab", "gaits", RefCreate(name="v1", kind=RefKind.TAG))
+    with pytest.raises(InvalidProblem) as caught:
+        gaits.submit(to=to)
+    assert [(one.pointer, one.code) for one in caught.value.errors] == [(pointer, code)]
+
+
+def test_a_job_without_items_or_a_folder_to_replace_has_nothing_to_commit(gaits: CommittingDesk) -> None:
+    with pytest.raises(InvalidProblem, match="create no items"):
+        gaits.submit("errand")
+    with pytest.raises(InvalidProblem, match="whole dataset"):
+        gaits.submit(commit_replace=True)
+
+
+def test_a_token_that_may_only_submit_jobs_may_not_commit(gaits: CommittingDesk) -> None:
+    gaits.desk.user = replace(gaits.desk.user, scopes=("read", "jobs"))
+    with pytest.raises(ForbiddenProblem, match="'write'"):
+        gaits.submit()
+
+
+def protect(gaits: CommittingDesk, **rule: Any) -> None:
+    gaits.write(datasets.protect_branch, "lab", "gaits", "main", ProtectionRule(**rule), expected_rev=None)
+
+
+def test_a_branch_that_only_proposals_move_refuses_the_submission(gaits: CommittingDesk) -> None:
+    gaits.put("a", number=1)
+    protect(gaits, direct_commits=False)
+    with pytest.raises(ConflictProblem) as caught:
+        gaits.submit()
+    assert caught.value.error_code == "branch-protected"
+    assert [one.pointer for one in caught.value.errors] == ["/commit/branch"]
+
+
+def drop_branch(gaits: CommittingDesk) -> None:
+    gaits.write(datasets.delete_ref, "lab", "gaits", "work", expected_rev=None)
+
+
+def drop_dataset(gaits: CommittingDesk) -> None:
+    gaits.write(datasets.delete_dataset, "lab", "gaits", expected_rev=None)
+
+
+def protect_work(gaits: CommittingDesk) -> None:
+    rule = ProtectionRule(direct_commits=False)
+    gaits.write(datasets.protect_branch, "lab", "gaits", "work", rule, expected_rev=None)
+
+
+LATER = [(drop_branch, "no-version"), (drop_dataset, "no-dataset"), (protect_work, "branch-protected")]
+
+
+@pytest.mark.parametrize(("change", "code"), LATER, ids=[code for _, code in LATER])
+@pytest.mark.parametrize("way", ["single", "fan-out", "cached"])
+def test_a_job_fails_if_its_commit_is_not_possible_any_more(
+    gaits: CommittingDesk, way: str, change: Callable[[CommittingDesk], None], code: str
+) -> None:
+    gaits.put("own", number=1)
+    gaits.write(datasets.create_ref, "lab", "gaits", RefCreate(name="work", kind=RefKind.BRANCH))
+    things = tuple(ItemInput(item=one) for one in gaits.desk.things(4))
+    if way == "fan-out":
+        made = gaits.submit("square", "gaits@work", into="made", inputs={"things": things})
+    else:
+        if way == "cached":
+            gaits.desk.submit("sum", into="first")
+        made = gaits.submit(to="gaits@work", into="made")
+    leases = gaits.desk.claim_many()
+    change(gaits)
+    for number, lease in enumerate(leases):
+        gaits.desk.stage(lease, f"a{number}")
+    answers = [gaits.desk.complete(lease, write_id=f"the-write-id-{lease.job}") for lease in leases]
+    found = gaits.job(made)
+    assert (found.state, found.failure and found.failure.code) == ("failed", code)
+    assert (found.commit and found.commit.digest, found.result if way == "single" else None) == (None, None)
+    if way == "single":
+        assert answers[0].state == "failed"
+        assert gaits.desk.complete(leases[0], write_id=f"the-write-id-{made}") == answers[0]
+        assert gaits.desk.outputs(made) == []
+        (attempt,) = gaits.read(reading.list_attempts, made).items
+        assert attempt.outcome == "failed"
+        assert "gaits@work" in attempt.detail
+    if way != "fan-out":
+        assert not gaits.desk.outputs(made)
+
+
+def test_an_author_who_lost_the_role_that_the_rule_asks_for_commits_nothing(gaits: CommittingDesk) -> None:
+    gaits.put("own", number=1)
+    other = gaits.write(users.create_user, UserCreate(name="bob"), who=SYSTEM)
+    bob = replace(gaits.desk.user, user_id=other.id, user_name="bob")
+    owner = gaits.desk.user
+
+    def become(role: Role) -> None:
+        gaits.desk.database.write(owner, members.put_member, "lab", "bob", MemberChange(role=role))
+
+    become(Role.MAINTAINER)
+    protect(gaits, role=Role.MAINTAINER, direct_commits=True)
+    gaits.desk.user = bob
+    made = gaits.submit(into="made")
+    gaits.desk.user = owner
+    lease = gaits.desk.claim()
+    gaits.desk.stage(lease, "a")
+    become(Role.CONTRIBUTOR)
+    assert gaits.desk.complete(lease).state == "failed"
+    assert gaits.job(made).failure.code == "branch-protected"  # type: ignore[union-attr]
+    with pytest.raises(ForbiddenProblem, match="maintainer"):
+        gaits.write(retrying.retry_job, made, who=bob)
+    become(Role.MAINTAINER)
+    again = gaits.write(retrying.retry_job, made, who=bob).id
+    gaits.work("a")
+    assert gaits.commit().job == again
+    assert gaits.commit().author == "bob"
+
+
+# -- folders ----------------------------------------------------------------------------------------------------------
+
+
+def test_replacing_removes_what_the_job_does_not_make_again(gaits: CommittingDesk) -> None:
+    gaits.submit(into="made")
+    gaits.work("a", "b")
+    own = gaits.put("other/c", number=1)
+    gaits.submit(into="made", cache="off", commit_replace=True)
+    gaits.put("made/later", number=2)
+    gaits.work("b", "c")
+    assert gaits.entries().keys() == {"made/b", "made/c", "made/later", "other/c"}
+    assert gaits.entries()["other/c"] == own
+
+
+def test_a_job_without_outputs_replaces_nothing(gaits: CommittingDesk) -> None:
+    gaits.submit(into="made")
+    gaits.work("a")
+    head = gaits.head()
+    made = gaits.submit(into="made", cache="off", commit_replace=True)
+    gaits.work()
+    assert (gaits.job(made).state, gaits.head()) == ("succeeded", head)
+
+
+def test_an_entry_that_somebody_changed_is_not_replaced(gaits: CommittingDesk) -> None:
+    gaits.submit(into="made")
+    gaits.work("a")
+    made = gaits.submit(into="made", cache="off", commit_replace=True)
+    theirs = gaits.put("made/a", number=3)
+    gaits.work("b")
+    assert gaits.job(made).publish_conflict is not None
+    assert gaits.entries() == {"made/a": theirs}
+    assert gaits.entries(made).keys() == {"made/b"}
+
+
+@pytest.mark.parametrize(
+    ("to", "into", "path"),
+    [
+        ("walks", "walks/made", "made/sub/a"),
+        ("walks", "elsewhere", "elsewhere/sub/a"),
+        ("walks@main/there", "walks/made", "there/sub/a"),
+        ("walks@main/", "elsewhere", "sub/a"),
+        ("walks", "walks", "sub/a"),
+    ],
+)
+def test_outputs_have_their_paths_in_the_folder_of_the_dataset(desk: Desk, to: str, into: str, path: str) -> None:
+    walks = CommittingDesk(desk, "walks", collection="walks")
+    made = walks.submit(to=to, into=into)
+    walks.work("a", collection="sub")
+    assert walks.entries().keys() == {path}
+    assert desk.outputs(made)[0].entry == path
+
+
+def test_the_folder_of_a_dataset_goes_on_from_the_commit_of_a_job(desk: Desk) -> None:
+    walks = CommittingDesk(desk, "walks", collection="walks")
+    desk.things(1, "walks")
+    request = CommitCreate(message="first")
+    walks.write(datasets.record_commit, "lab", "walks", walks.read(datasets.prepare_commit, "lab", "walks", request))
+    walks.submit(into="walks/made")
+    walks.work("a")
+    with pytest.raises(InvalidProblem, match="Nothing has changed"):
+        walks.read(datasets.prepare_commit, "lab", "walks", request)
+    walks.submit(into="elsewhere", cache="off")
+    walks.work("a")
+    with pytest.raises(ConflictProblem, match="another version"):
+        walks.read(datasets.prepare_commit, "lab", "walks", request)
+
+
+def test_outputs_of_one_name_are_numbered(gaits: CommittingDesk) -> None:
+    """Skeletons of an import may have one name; equal ones are one item, others are numbered."""
+    gaits.submit(into="made")
+    lease = gaits.desk.claim()
+    drafts = [
+        StagedOutput(
+            name=f"n{number}", kind=Kind.STUDY, item_name="rig", parts={"study": document(number=number // 2)},
+            reuse="by_content",
+        )
+        for number in range(4)
+    ]  # fmt: skip
+    principal = gaits.desk._attempt_of(lease)
+    prepared = [staging.prepare_output(one) for one in drafts]
+    gaits.desk.database.write(principal, staging.stage, lease.job, lease.fence, prepared)
+    gaits.desk.complete(lease)
+    assert gaits.entries().keys() == {"made/rig", "made/rig-2"}
+
+
+def test_a_commit_of_too_many_outputs_is_recorded_as_a_conflict(
+    gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commits, "MOST_COMMITTED", 2)
+    made = gaits.submit(into="made")
+    gaits.work("a", "b", "c")
+    found = gaits.job(made)
+    assert found.state == "succeeded"
+    assert found.publish_conflict is not None
+    assert (found.publish_conflict.code, found.publish_conflict.branch) == ("too-many-changes", None)
+    assert gaits.head() is None
+    assert len(gaits.desk.outputs(made)) == 3
+
+
+# -- records ----------------------------------------------------------------------------------------------------------
+
+
+def test_events_and_lineage_name_the_commit(gaits: CommittingDesk) -> None:
+    made = gaits.submit(into="made")
+    gaits.work("a")
+    gaits.desk.database.write(SYSTEM, events.number_events)
+    told = {one.kind: one for one in gaits.read(events.list_events, "lab", after=0, limit=1000)}
+    assert told["branch.moved"].body["job"] == made
+    assert told["branch.moved"].body["commit"] == told["job.succeeded"].body["commit"] == gaits.head()
+    (output,) = gaits.desk.outputs(made)
+    graph = gaits.read(items.read_lineage_graph, "lab", Kind.STUDY, output.item, LineageRequest())
+    assert [(one.id, one.commit) for one in graph.jobs] == [(made, gaits.head())]
+
+
+def test_a_job_that_a_commit_names_is_kept(gaits: CommittingDesk) -> None:
+    gaits.desk.submit("sum", into="made")
+    gaits.work("a")
+    made = gaits.submit(into="made", cache="off")
+    gaits.work("a")
+    assert [one.created for one in gaits.desk.outputs(made)] == [False]
+    gaits.desk.clock.advance(1000 * 86400.0)
+    retire(gaits.desk.database, Retention(events_days=0, logs_days=0, jobs_days=10))
+    assert gaits.job(made).commit.digest == gaits.head()  # type: ignore[union-attr]
+    assert list(fsck.check_store(gaits.desk.database)) == []
