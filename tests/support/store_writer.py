@@ -1,14 +1,19 @@
-"""A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`."""
+"""A process that writes to a database, for tests that kill it: `store_writer.py URL USER_ID USER_NAME WORK FOLDER`.
+
+The work `complete JOB FENCE` completes an attempt.
+"""
 
 import sys
 from pathlib import Path
 from typing import Any
 
 from marey_schemas.kinds import Kind
+from marey_schemas.queue.worker_protocol import CompleteRequest
 from marey_server.access.principal import Principal
 from marey_server.store import blobs, garbage, items, projects
 from marey_server.store.blob_backings import DirectoryBlobs
 from marey_server.store.database.connections import Database
+from marey_server.store.jobs import completion
 from marey_server.store.transaction import Transaction
 
 LARGE_FILES = [bytes([number]) * 2**20 for number in range(12)]
@@ -38,6 +43,11 @@ def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None
             print(database.write(who, blobs.put_blob, data), flush=True)
     elif work == "publish":
         database.write(who, publish)
+    elif work.startswith("complete "):
+        _, job_id, fence = work.split()
+        attempt = Principal("attempt", job_id=job_id, fence=int(fence), scopes=("read",))
+        request = CompleteRequest(write_id=f"write-{job_id}-{fence}")
+        database.write(attempt, completion.complete, job_id, int(fence), request)
     else:
         garbage.collect_garbage(database, grace_us=-1)
     database.close()
