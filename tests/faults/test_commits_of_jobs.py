@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import pytest
+from sqlalchemy import update
 from tests.support import store_writer
 from tests.support.committing_desk import CommittingDesk
 from tests.support.interleaving import Step, interleave
@@ -26,9 +27,11 @@ from marey_schemas.queue.worker_protocol import CompleteRequest, Lease
 from marey_server.errors import ApiProblem
 from marey_server.store import datasets, items
 from marey_server.store.database.connections import Database
-from marey_server.store.datasets import committing, outputs
+from marey_server.store.datasets import outputs
+from marey_server.store.datasets.naming import find_ref
 from marey_server.store.fsck import check_store
 from marey_server.store.jobs import completion
+from marey_server.store.tables import dataset_ref
 from marey_server.store.transaction import Transaction
 
 BEFORE = (
@@ -147,13 +150,14 @@ def test_jobs_that_complete_at_once_all_reach_the_branch(gaits: CommittingDesk) 
 
 
 def do_not_lock(patch: pytest.MonkeyPatch) -> None:
-    found = outputs.find_ref
-    patch.setattr(outputs, "find_ref", lambda tx, dataset_id, name, lock=False: found(tx, dataset_id, name))
+    def find(tx: Transaction, dataset_id: str, name: str, *, lock: bool) -> Any:
+        return find_ref(tx, dataset_id, name)
 
     def move(tx: Transaction, prepared: Any, digest: str, _mover: Any) -> None:
-        which = (committing.dataset_ref.c.dataset_id == prepared.dataset_id, committing.dataset_ref.c.name == "main")
-        tx.execute(committing.update(committing.dataset_ref).where(*which).values(digest=digest))
+        which = (dataset_ref.c.dataset_id == prepared.dataset_id, dataset_ref.c.name == prepared.branch)
+        tx.execute(update(dataset_ref).where(*which).values(digest=digest))
 
+    patch.setattr(outputs, "find_ref", find)
     patch.setattr(outputs, "move_branch_to", move)
 
 
