@@ -9,7 +9,7 @@ from tests.support.queue_desk import Desk, document
 from tests.support.store_fixtures import WRITE, requiring
 
 from marey_schemas.access import Role
-from marey_schemas.datasets.commits import Commit, CommitCreate, PutEntry
+from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, PutEntry
 from marey_schemas.datasets.naming import MAIN, DatasetCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.commits import OutputsCommit
@@ -80,10 +80,14 @@ class CommittingDesk:
         page = self.read(datasets.list_commits, "lab", self.name, version, path="", cursor=None, limit=1000)
         return list(page.items)
 
+    def listed(self, version: str = MAIN) -> list[Entry]:
+        """Return the entries of a version."""
+        page = self.read(datasets.list_entries, "lab", self.name, version, path="", cursor=None, limit=1000)
+        return list(page.items)
+
     def entries(self, version: str = MAIN) -> dict[str, str | None]:
         """Return the items of a version by path."""
-        page = self.read(datasets.list_entries, "lab", self.name, version, path="", cursor=None, limit=1000)
-        return {one.path: one.item for one in page.items}
+        return {one.path: one.item for one in self.listed(version)}
 
     def put(self, path: str, *, number: int, branch: str = MAIN) -> str:
         """Commit a new item at a path as a person; return its id."""
