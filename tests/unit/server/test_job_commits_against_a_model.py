@@ -166,6 +166,13 @@ class CommittingMachine(RuleBasedStateMachine):
         assert len(self.gaits.desk.outputs(job.id)) == (0 if fate == "failed" else len(job.results))
         self.ended.append(job)
 
+    @rule(branch=branches, name=names, first=numbers, second=numbers)
+    def commit_while_a_job_runs(self, branch: str, name: str, first: int, second: int) -> None:
+        if branch not in self.model.protected:
+            self.submit(branch, {name: first}, replace=False)
+            self.commit(name, second, branch)
+            self.complete(len(self.running) - 1)
+
     @precondition(lambda self: self.ended)
     @rule(index=which)
     def repeat_a_completion(self, index: int) -> None:
