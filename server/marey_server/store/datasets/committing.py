@@ -119,9 +119,9 @@ def record_commit(
     digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.existing is not None and prepared.write_id is not None:
         tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))
-    if prepared.of_folder:
-        tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
     move_branch_to(tx, prepared, digest, mover)
+    if prepared.of_folder:  # after the branch, as jobs do that commit, so that the two never wait for each other
+        tx.execute(update(dataset).where(dataset.c.id == found.id).values(folder_commit=digest))
     tx.emit("branch.moved", found.id, project_id=project_row.id, branch=prepared.branch, commit=digest)
     faults.point("dataset_commit.before_commit")
     tx.after_commit(lambda: faults.point("dataset_commit.after_commit"))
