@@ -98,7 +98,7 @@ def compare_timing(before: Poses, after: Poses, rate_ratio: float) -> Timing:
 
 
 def _paces(count_before: int, count_after: int, rate_ratio: float) -> list[float]:
-    """Return the paces to try: the ratio of the frame rates, 1, and the ratio of the numbers of frames."""
+    """Return the paces to try: 1, the ratio of the frame rates, and the ratio of the numbers of frames."""
     paces = [rate_ratio, 1.0]
     if count_before > 1 and count_after > 1:
         paces.append((count_after - 1) / (count_before - 1))

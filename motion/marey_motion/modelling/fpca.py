@@ -82,10 +82,10 @@ def find_components(
     Notes
     -----
     There are fewer examples than coefficients. Therefore, the eigenvectors u of the (m, m) matrix of the examples'
-    inner products are computed instead of those of the covariance, at a fraction of the cost. A direction is the sum of
-    the deviations weighted by u, whatever the inner product; the inner product matters only for the projections that
-    compute scores. Shares of the variance refer to the variance in all components. The largest entry of each direction
-    is positive.
+    inner products are computed instead of those of the covariance, at a fraction of the cost. For either kind of inner
+    product, a direction is the sum of the examples' deviations from the mean, weighted by the entries of u. The same
+    inner product projects the deviations onto the directions to compute the scores. Each share of the variance is
+    relative to the variance before components are left out. The largest entry of each direction is positive.
     """
     examples = len(coefficients)
     if coefficients.shape[1] != basis.count or weights.shape != coefficients.shape[2:]:

@@ -132,8 +132,8 @@ class _Cutting:
         if count > 1:
             raise JobRefused(
                 "same-name",
-                f"{count} pieces would have the path {folder}/{name}; cut one layer at a time, or cut clips of one "
-                "folder in separate jobs with different folders for the results",
+                f"{count} pieces would have the path {folder}/{name}; cut one layer in each job, or cut each folder "
+                "of clips in a job of its own, with another folder for its results",
             )
         long = [name for _, name in places if len(name) > MAX_NAME_LENGTH]
         if long:

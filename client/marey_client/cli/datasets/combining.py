@@ -24,18 +24,18 @@ CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of 
 Preview = Annotated[bool, typer.Option("--preview", help="Show the result without recording it.")]
 Ours = Annotated[
     list[str] | None,
-    typer.Option(metavar="PATH:KIND", help="Conflict in which the content of the branch is kept; may be repeated."),
+    typer.Option(metavar="PATH:KIND", help="Resolve this conflict with the content of the branch; may be repeated."),
 ]
 Theirs = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND", help="Conflict in which the content of the other version is taken; may be repeated."
+        metavar="PATH:KIND", help="Resolve this conflict with the content of the other version; may be repeated."
     ),
 ]
 Base = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PATH:KIND", help="Conflict in which the content before both changes is restored; may be repeated."
+        metavar="PATH:KIND", help="Resolve this conflict with the content before both changes; may be repeated."
     ),
 ]
 Parent = Annotated[

@@ -291,7 +291,7 @@ def _prepare(body, targets, frame, work):  # type: ignore[no-untyped-def]
 
 @compiled
 def _try_step(body, damping, local, root, work):  # type: ignore[no-untyped-def]
-    """Fill the trial pose after a damped step; joints at their limits slide along them."""
+    """Compute the trial pose, which a damped step leads to; joints at their limits slide along them."""
     _fill_softness(body, damping, work)
     work.blocked[:] = 0
     for _ in range(LIMIT_PASSES):

@@ -41,7 +41,7 @@ def motion_of_document(
     skeleton_file: str = "the skeleton document",
     frame_rate_hz: float | None = None,
 ) -> SourceMotion:
-    """Read a clip document with the file of its skeleton document, or a skeleton document alone.
+    """Read a document of a clip, for which `skeleton` contains its skeleton, or a document of a skeleton.
 
     Parameters
     ----------

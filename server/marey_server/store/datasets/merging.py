@@ -189,7 +189,7 @@ def _changed(store: StoredChunks, base: str, tree: str, most: int | None = None)
     found = list(islice(difference(store, base, tree), None if most is None else most + 1))
     if most is not None and len(found) > most:
         raise InvalidProblem(
-            f"One side has changed more than {most:,} entries; preview the merge to compute its result.",
+            f"One side has changed more than {most:,} entries, so the merge is not computed here; request its preview.",
             code=LARGE_MERGE,
         )
     return compare_entries(found)

@@ -115,8 +115,8 @@ def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[st
     for content, key in keys.items():
         if contents.revisions[key] != content:
             raise InvalidProblem(
-                f"The request gives a revision the content digest {content}, but its documents have the content digest "
-                f"{contents.revisions[key]}.",
+                f"According to the request, a revision has the content digest {content}, but the documents of this "
+                f"revision have the content digest {contents.revisions[key]}.",
                 code="other-content",
             )
     store_contents(tx, contents)
