@@ -39,6 +39,16 @@ class ApiProblem(Exception):
         return (type(self).__doc__ or "").strip().splitlines()[0]
 
 
+def forget_origin(error: BaseException) -> None:
+    """Remove the traceback and the causes of a refusal, which nobody logs.
+
+    A function that stores its error in a future refers to both, and the traceback refers to the function. Such circles
+    would keep the whole body of a refused request until the garbage collector finds them, which stops all threads.
+    """
+    if isinstance(error, ApiProblem):
+        error.__traceback__ = error.__context__ = error.__cause__ = None
+
+
 # 400
 
 

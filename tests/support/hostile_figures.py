@@ -10,18 +10,21 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import itertools
 import multiprocessing
+import os
 import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.synchronize import Event
 from operator import itemgetter
 from pathlib import Path
 
 import httpx
-from tests.support.furnished_house import House, build_house
+from tests.support.furnished_house import House, build_house, start_attempt
 from tests.support.hostile_client import (
     ATTACKED,
     ENDS_CREDENTIALS,
@@ -118,26 +121,38 @@ def _said(outcome: Outcome) -> str:
     return f"{outcome.shot.label} ({len(outcome.shot.data)} bytes): {outcome.status} after {outcome.seconds:.2f} s"
 
 
-def attack(url: str, every: Sequence[Shot], seconds: float) -> None:
-    """Send shots over 200 connections for a time, and print the faults and the longest waits."""
-    deadline = time.monotonic() + seconds
+def attack(url: str, every: Sequence[Shot], seconds: float, nice: int, begun: Event) -> None:
+    """Send shots over 200 connections for a time, and print the faults and the processor time that sending took."""
+    os.nice(nice)
+    begun.set()
+    start, processor = time.monotonic(), time.process_time()
+    deadline = start + seconds
     endless = itertools.takewhile(lambda _shot: time.monotonic() < deadline, itertools.cycle(every))
     outcomes = asyncio.run(fire_all(url, endless, CONNECTIONS))
     counts: dict[int | None, int] = {}
     for outcome in outcomes:
         counts[outcome.status] = counts.get(outcome.status, 0) + 1
-    print(f"{len(outcomes)} hostile requests in {seconds:.0f} s; answers by status: {counts}", flush=True)
+    took_s = time.monotonic() - start
+    own = (time.process_time() - processor) / took_s
+    print(f"{len(outcomes)} hostile requests in {took_s:.0f} s by a program that takes {own:.2f} processors; "
+          f"answers by status: {counts}", flush=True)  # fmt: skip
     for outcome in filter(lambda outcome: outcome.fault, outcomes):
         print(f"  FAULT {outcome.fault}", flush=True)
 
 
 def companions_of(house: House) -> list[Companion]:
-    """Return a reader, a worker that sends heartbeats, and an orchestrator that asks whether the server is ready."""
-    people, values = house.people, house.variables
-    reader, attempt = people.client(house.tokens["reader"]), people.client(house.tokens["attempt"])
+    """Return a reader, a worker that sends heartbeats, and an orchestrator that asks whether the server is ready.
+
+    Reader and attempt have tokens of their own, which no hostile client has.
+    """
+    people = house.people
+    reader = people.client(people.make_user("visitor"))
+    people.client(house.tokens["owner"]).put("/projects/lab/members/visitor", json={"role": "reader"})
+    lease = start_attempt(people, house.tokens, house.variables["item"])
+    attempt = people.client(lease["attempt_token"])
     asking = httpx.Client(base_url=people.address, timeout=120)
-    heartbeat = f"/jobs/{values['job']}/attempts/{values['fence']}/heartbeat"
-    clip = f"/projects/lab/clips/{values['item']}"
+    heartbeat = f"/jobs/{lease['job']}/attempts/{lease['fence']}/heartbeat"
+    clip = f"/projects/lab/clips/{house.variables['item']}"
     return [
         Companion("reads a clip", lambda: reader.get(clip)),
         Companion("sends heartbeats", lambda: attempt.post(heartbeat, json={})),
@@ -145,8 +160,9 @@ def companions_of(house: House) -> list[Companion]:
     ]
 
 
-def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float) -> None:
+def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float, nice: int) -> None:
     """Print what well-behaved clients wait, alone and beside 200 hostile connections of 20 principals."""
+    companions = companions_of(house)
     several = [house]
     for number in range(20 - len(PEOPLE)):
         tokens = {"stranger": house.people.make_user(f"stranger{number}")}
@@ -157,24 +173,31 @@ def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float) -> 
         for shot in some(shots(one, tuple(one.tokens)), 2_000, SEED)
         if not shot.route.endswith(ENDS_CREDENTIALS) and len(shot.data) <= SMALL_BYTES
     ]
-    companions = companions_of(house)
-    for name in (
-        "alone",
-        f"beside {CONNECTIONS} hostile connections of {sum(len(one.tokens) for one in several)} callers",
-    ):
-        cost.reset_peak()
-        start, processor = time.monotonic(), cost.processor_s()
-        with companions[0], companions[1], companions[2]:
-            if name == "alone":
-                time.sleep(seconds / 3)
-            else:
-                crowd = multiprocessing.get_context("spawn").Process(target=attack, args=(url, hostile, seconds))
-                crowd.start()
-                crowd.join()
-        busy = (cost.processor_s() - processor) / (time.monotonic() - start)
-        print(f"{name}: peak {cost.own_peak_mb():.0f} MB, with children {cost.peak_mb():.0f} MB; {busy:.2f} processors")
-        for companion in companions:
-            print(companion.line(), flush=True)
+    with measuring("alone", companions, cost):
+        time.sleep(seconds / 3)
+    processes = multiprocessing.get_context("spawn")
+    begun = processes.Event()
+    crowd = processes.Process(target=attack, args=(url, hostile, seconds, nice, begun))
+    crowd.start()
+    begun.wait()
+    callers = sum(len(one.tokens) for one in several)
+    with measuring(f"beside {CONNECTIONS} hostile connections of {callers} callers", companions, cost):
+        crowd.join()
+
+
+@contextlib.contextmanager
+def measuring(name: str, companions: Sequence[Companion], cost: ProcessCost) -> Iterator[None]:
+    """Print what the companions wait inside the block, and what the server takes."""
+    cost.reset_peak()
+    start, processor = time.monotonic(), cost.processor_s()
+    with companions[0], companions[1], companions[2]:
+        yield
+    busy = (cost.processor_s() - processor) / (time.monotonic() - start)
+    load = os.getloadavg()[0]
+    print(f"{name}: peak {cost.own_peak_mb():.0f} MB, with children {cost.peak_mb():.0f} MB; {busy:.2f} processors; "
+          f"load of the machine {load:.1f}")  # fmt: skip
+    for companion in companions:
+        print(companion.line(), flush=True)
 
 
 def main() -> None:
@@ -182,6 +205,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.support.hostile_figures")
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--shots", type=int, default=1_000)
+    parser.add_argument("--nice", type=int, default=0, help="niceness of the hostile program, 0 to 19")
     parser.add_argument("--database", help="address of an empty Postgres database with the newest schema")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -192,8 +216,9 @@ def main() -> None:
             house, cost = build_house(People(process.url, database)), ProcessCost(process.process.pid)
             cost.wait_until_idle(STARTING_S)
             if given.seconds:
-                measure_crowd(process.url, house, cost, given.seconds)
-            measure_costs(process.url, some(shots(house), given.shots, SEED), cost)
+                measure_crowd(process.url, house, cost, given.seconds, given.nice)
+            if given.shots:
+                measure_costs(process.url, some(shots(house), given.shots, SEED), cost)
         finally:
             process.stop()
             database.close()

@@ -29,7 +29,8 @@ ADDRESS_SHARE = 0.75
 """Largest share of all connections that one address may have; trusted proxies may have more."""
 EVICTED_SHARE = 1 / 16
 """Share of all connections that is closed at once when the limit is reached, if so many are idle."""
-ACCEPTED_AT_ONCE = 128
+ACCEPTED_AT_ONCE = 4
+"""Number of connections that are accepted in one round of the event loop; the requests on open ones come between."""
 PAUSE_S = 0.5
 """Time in seconds for which no connection is accepted after a failure for lack of descriptors or memory."""
 LOG_EVERY_S = 60.0

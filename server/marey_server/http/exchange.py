@@ -16,7 +16,7 @@ from tornado.web import HTTPError, RequestHandler
 from marey_schemas.address import API
 from marey_schemas.problems import MEDIA_TYPE, Problem
 from marey_schemas.sizes import KIB, MIB
-from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem
+from marey_server.errors import ApiProblem, MethodNotAllowedProblem, UnauthenticatedProblem, forget_origin
 from marey_server.http.declarations import Declared, Operation
 from marey_server.http.etags import entity_tag
 from marey_server.http.reply import Rendered
@@ -119,6 +119,7 @@ class Exchange(RequestHandler):
         """Answer before the body is read, then discard the body; closing the connection could lose the answer."""
         self.refused = True
         self._write_problem(error)
+        forget_origin(error)
         if self.request.headers.get("Expect", "").lower() == "100-continue":
             self.finish()
         elif self.expects_body():
@@ -193,6 +194,7 @@ class Exchange(RequestHandler):
             error = self.method_not_allowed()
         self.set_header("X-Request-Id", self.request_id)
         self._write_problem(error)
+        forget_origin(error)
         if not self._finished:
             self.finish()
 

@@ -21,9 +21,9 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
-from functools import cached_property, partial
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from functools import partial
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 from urllib.parse import urlencode
 
@@ -32,10 +32,16 @@ from tornado.web import stream_request_body
 
 from marey_schemas.encoding.codecs import JSON
 from marey_schemas.sizes import KIB
-from marey_server.access.principal import ANONYMOUS, Principal
-from marey_server.access.secret_tokens import hash_secret
-from marey_server.errors import ApiProblem, AuthorLostProblem, BadRequestProblem, ClientGoneProblem, TooLargeProblem
+from marey_server.access.principal import ANONYMOUS
+from marey_server.errors import (
+    ApiProblem,
+    AuthorLostProblem,
+    BadRequestProblem,
+    TooLargeProblem,
+    UnauthenticatedProblem,
+)
 from marey_server.http import negotiation
+from marey_server.http.calling import CallingExchange
 from marey_server.http.calls import (
     BodyTarget,
     Call,
@@ -50,13 +56,9 @@ from marey_server.http.calls import (
 )
 from marey_server.http.declarations import Access, Bytes, Declared, Document, Operation, RequestBody
 from marey_server.http.etags import ANY_STATE, Precondition, write_precondition
-from marey_server.http.exchange import JOINED_BYTES, Exchange
+from marey_server.http.exchange import JOINED_BYTES
 from marey_server.http.reply import AnswerForm, Loaded, Rendered, Reply, render
 from marey_server.http.validation import decode_body, parse_query, validate_body
-from marey_server.process.children import ChildTask
-from marey_server.process.memory import STRANGERS, Holding
-from marey_server.process.password_lanes import limited_address
-from marey_server.store.database.lanes import Client
 from marey_server.store.transaction import Transaction
 
 P = ParamSpec("P")
@@ -64,7 +66,6 @@ T = TypeVar("T")
 
 INLINE_BYTES = 4 * KIB
 """Greatest size of JSON bodies that are decoded on the event loop; all other bodies are decoded in a thread."""
-CLIENT_GONE = "The client closed the connection before this was computed."
 GUEST_BODY_BYTES = 64 * KIB
 """Greatest size of a body that a caller without a token may send, such as a search in a public project."""
 ADMISSION_S = 5.0
@@ -73,15 +74,13 @@ _METHODS = ("get", "post", "put", "patch", "delete")
 
 
 @stream_request_body
-class Resource(Exchange):
+class Resource(CallingExchange):
     """Resource with a path and declared methods."""
 
     tag: ClassVar[str]
     uneventful = False
     """Whether a success is too frequent to be logged, such as an empty claim or a readiness check."""
 
-    operation: Operation
-    caller: Caller
     media: negotiation.MediaType
     query: BaseModel | None = None
     precondition: Precondition = ANY_STATE
@@ -96,23 +95,8 @@ class Resource(Exchange):
         """Set up the state of one request."""
         super().initialize()
         self._received: bytearray | bytes = bytearray()
-        self._in_children: set[ChildTask[Any]] = set()
-
-    @property
-    def principal(self) -> Principal | None:
-        """The principal of the request, after authentication."""
-        caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
-        return caller.principal if caller is not None else None
 
     # -- for the methods of resources ---------------------------------------------------------------------------------
-
-    async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
-        return await self._read(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
-
-    async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `function(tx, ...)` on behalf of the caller, commit, and return its result."""
-        return await self._write(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
 
     async def answer(
         self,
@@ -151,79 +135,6 @@ class Resource(Exchange):
         rendered = await asyncio.wrap_future(rendering.submit(self.client, render, reply, self.answer_form, answers))
         self.holding.shrink(loaded_bytes)
         return rendered
-
-    async def _read(self, function: Callable[[Transaction], T]) -> T:
-        queue = self.services.database.queue_read
-        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
-
-    async def _write(self, function: Callable[[Transaction], T]) -> T:
-        queue = self.services.database.queue_write
-        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
-
-    @cached_property
-    def holding(self) -> Holding:
-        """Memory that this request holds: its body and its answer."""
-        return Holding(self.services.memory, self.client, reserved=self.operation.reserved)
-
-    @cached_property
-    def client(self) -> Client:
-        """Client for which this request counts in queues: a token that was accepted before, or else an address."""
-        token = self.caller.token
-        if token is not None and self.services.knows(token):
-            return Client(hash_secret(token), is_gone=self.is_gone)
-        return Client(limited_address(self.client_address), known=False, is_gone=self.is_gone)
-
-    async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `function` in a thread, away from the event loop, and return its result."""
-        future = self.services.compute_threads.submit_for(self.client, function, *args, **kwargs)
-        return await asyncio.wrap_future(future)
-
-    @asynccontextmanager
-    async def using_children(self) -> AsyncIterator[None]:
-        """Count this request among those that use child processes, while the `async with` block runs.
-
-        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
-        """
-        if self.principal is None:  # children are shared among users, not among their tokens
-            await self.look_up(_identify)
-        with self.services.children.request(self._child_user):
-            yield
-
-    async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Call `function` (`module:name`) in a child process, with `make()` as argument, and return `read(result)`.
-
-        If the client closes the connection, the child is killed and `ClientGoneProblem` is raised.
-        """
-        if self._gone:
-            raise ClientGoneProblem(CLIENT_GONE)
-        count_stop = self.services.metrics.count_stopped_child
-        task = self.services.children.submit(self._child_user, function, make, read, count_stop)
-        self._in_children.add(task)
-        try:
-            return await asyncio.wrap_future(task.future)
-        except asyncio.CancelledError:
-            task.abandon()
-            if self._gone:
-                raise ClientGoneProblem(CLIENT_GONE) from None
-            raise
-        finally:
-            self._in_children.discard(task)
-
-    async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
-        """Call a function in a child process as `compute_in_child` does, and count the request during the call.
-
-        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
-        """
-        async with self.using_children():
-            order = await self.compute(make)
-            self.holding.grow(len(order))
-            return await self.compute_in_child(function, lambda: order, read)
-
-    @property
-    def _child_user(self) -> str:
-        """User whose share of child processes this request uses; callers without a user have one share together."""
-        user = self.principal.user_id if self.principal is not None else None
-        return user or STRANGERS
 
     def _write_problem(self, error: BaseException) -> None:
         super()._write_problem(error)
@@ -276,6 +187,8 @@ class Resource(Exchange):
     async def prepare(self) -> None:
         """Check the path, the query and the headers before the body is received."""
         self.services.in_flight.add(self)
+        if (turn := self._turn()) is not None:
+            await turn
         try:
             self._check_head()
             body = self.operation.body
@@ -289,6 +202,15 @@ class Resource(Exchange):
         except ApiProblem as error:
             await self._wait_for_refusal()
             await self.refuse(error)
+
+    def _turn(self) -> asyncio.Future[None] | None:
+        """Return what the request must wait for before anything of it is checked, or None."""
+        operation = self.operations.get(self.request.method or "")
+        token = None
+        with suppress(UnauthenticatedProblem):
+            token = negotiation.bearer_token(self.request.headers.get("Authorization"))
+        reserved = operation is not None and operation.reserved
+        return self.services.turns.take(self._client_with(token), reserved=reserved)
 
     async def _admit(self) -> None:
         """Refuse callers who may not send the body before any of it is received or decoded.
@@ -423,8 +345,6 @@ class Resource(Exchange):
     def on_connection_close(self) -> None:
         """Release the body and stop child processes, because the client has closed the connection."""
         super().on_connection_close()
-        for task in list(self._in_children):
-            task.abandon()
         if not self.performing and hasattr(self, "operation"):
             self.holding.release()
 
@@ -454,7 +374,3 @@ class Resource(Exchange):
 def _read_tree(decode: Callable[[], Any], content: Any) -> Any:
     tree = decode()
     return tree if content is Document else validate_body(content, tree)
-
-
-def _identify(_tx: Transaction) -> None:
-    """Do nothing. It is run in a transaction only because every transaction identifies the caller."""

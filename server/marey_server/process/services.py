@@ -24,6 +24,7 @@ from marey_server.process.observe import Metrics
 from marey_server.process.password_lanes import PasswordLane, RefusedTries
 from marey_server.process.refusal_brake import RefusalBrake
 from marey_server.process.settings import Settings
+from marey_server.process.turns import Turns
 from marey_server.process.upload_hashes import UploadHashes
 from marey_server.store import events
 from marey_server.store.credentials import tokens
@@ -86,6 +87,7 @@ class Services:
         """Lane for all other sign-ins."""
         self.refused_tries = RefusedTries()
         self.refusal_brake = RefusalBrake()
+        self.turns = Turns()
         self.compute_threads = ComputeThreads()
         self.children = children or Children(settings.child_limits)
         self.disk = DiskSpace(settings.data, settings.min_free_bytes)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from collections.abc import Iterator
 
 import pytest
@@ -101,3 +103,38 @@ def test_closing_without_waiting_cancels_what_is_queued(release: threading.Event
     assert queued.cancelled()
     release.set()
     assert running.result(PATIENCE_S)
+
+
+class Tree:
+    """Decoded body."""
+
+
+def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:
+    """Otherwise only the garbage collector frees bodies of refused requests, and it stops all threads to do so."""
+    trees: list[weakref.ref[Tree]] = []
+
+    def check(tree: Tree) -> None:
+        trees.append(weakref.ref(tree))
+        raise ValueError("not allowed")
+
+    def refuse() -> None:
+        tree = Tree()
+        try:
+            check(tree)
+        except ValueError:
+            raise UnavailableProblem("Not now.") from None
+
+    lane = Lane("test", 1)
+    gc.disable()
+    try:
+        future = lane.submit(ANNA, refuse)
+        error = future.exception(PATIENCE_S)
+        lane.close()
+        assert isinstance(error, UnavailableProblem)
+        assert trees[0]() is None
+        kept = weakref.ref(future)
+        del future, error
+        assert kept() is None
+    finally:
+        gc.enable()
+        lane.close()

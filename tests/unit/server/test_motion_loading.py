@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import gc
+import importlib
+import sys
 from pathlib import Path
 
 import pytest
 
 from marey_server.motions import annotating, importing
+from marey_server.motions.loading import LOADING
 
 SLOW = ("marey_motion", "marey_server.motions.reading")
 """What takes long to import; the module of the server imports the motion library itself."""
@@ -33,3 +37,21 @@ def test_threads_of_the_server_import_the_motion_library_one_at_a_time(module: o
     }
     assert found
     assert found <= alone
+
+
+def test_the_garbage_collector_skips_modules_once_they_are_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "module_of_a_test.py").write_text("objects = [[] for _ in range(1000)]\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    try:
+        with LOADING:
+            importlib.import_module("module_of_a_test")
+        skipped = gc.get_freeze_count()
+        assert skipped > 1000
+        with LOADING:
+            importlib.import_module("module_of_a_test")
+        assert gc.get_freeze_count() <= skipped
+    finally:
+        gc.unfreeze()
+        sys.modules.pop("module_of_a_test", None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, ParamSpec, TypeVar
 
-from marey_server.errors import ClientGoneProblem, UnavailableProblem
+from marey_server.errors import ClientGoneProblem, UnavailableProblem, forget_origin
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -74,6 +74,7 @@ def finish(future: Future[Any], function: Callable[[], Any]) -> None:
         fault.__cause__ = error
         future.set_exception(fault)
     except BaseException as error:  # noqa: BLE001 - for whoever waits
+        forget_origin(error)
         future.set_exception(error)
     else:
         future.set_result(result)

@@ -1,0 +1,137 @@
+"""Exchange that calls the store, and computes in threads and child processes, on behalf of its caller."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from functools import cached_property, partial
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from marey_server.access.principal import ANONYMOUS, Principal
+from marey_server.access.secret_tokens import hash_secret
+from marey_server.errors import ClientGoneProblem
+from marey_server.http.calls import Caller, run_plain
+from marey_server.http.declarations import Operation
+from marey_server.http.exchange import Exchange
+from marey_server.process.children import ChildTask
+from marey_server.process.memory import STRANGERS, Holding
+from marey_server.process.password_lanes import limited_address
+from marey_server.store.database.lanes import Client
+from marey_server.store.transaction import Transaction
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+CLIENT_GONE = "The client closed the connection before this was computed."
+
+
+class CallingExchange(Exchange):
+    """Exchange with a caller, whose share of threads, child processes and memory it uses."""
+
+    operation: Operation
+    caller: Caller
+
+    def initialize(self) -> None:
+        """Set up the state of one request."""
+        super().initialize()
+        self._in_children: set[ChildTask[Any]] = set()
+
+    @property
+    def principal(self) -> Principal | None:
+        """The principal of the request, after authentication."""
+        caller: Caller | None = getattr(self, "caller", None)  # absent where the request was refused before
+        return caller.principal if caller is not None else None
+
+    async def look_up(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run `function(tx, ...)` on behalf of the caller in a read-only transaction and return its result."""
+        return await self._read(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
+
+    async def change(self, function: Callable[Concatenate[Transaction, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run `function(tx, ...)` on behalf of the caller, commit, and return its result."""
+        return await self._write(partial(run_plain, self.caller, lambda tx: function(tx, *args, **kwargs)))
+
+    async def _read(self, function: Callable[[Transaction], T]) -> T:
+        queue = self.services.database.queue_read
+        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
+
+    async def _write(self, function: Callable[[Transaction], T]) -> T:
+        queue = self.services.database.queue_write
+        return await asyncio.wrap_future(queue(self.client, ANONYMOUS, function, reserved=self.operation.reserved))
+
+    @cached_property
+    def holding(self) -> Holding:
+        """Memory that this request holds: its body and its answer."""
+        return Holding(self.services.memory, self.client, reserved=self.operation.reserved)
+
+    @cached_property
+    def client(self) -> Client:
+        """Client for which this request counts in queues: a token that was accepted before, or else an address."""
+        return self._client_with(self.caller.token)
+
+    def _client_with(self, token: str | None) -> Client:
+        if token is not None and self.services.knows(token):
+            return Client(hash_secret(token), is_gone=self.is_gone)
+        return Client(limited_address(self.client_address), known=False, is_gone=self.is_gone)
+
+    async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run `function` in a thread, away from the event loop, and return its result."""
+        future = self.services.compute_threads.submit_for(self.client, function, *args, **kwargs)
+        return await asyncio.wrap_future(future)
+
+    @asynccontextmanager
+    async def using_children(self) -> AsyncIterator[None]:
+        """Count this request among those that use child processes, while the `async with` block runs.
+
+        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
+        """
+        if self.principal is None:  # children are shared among users, not among their tokens
+            await self.look_up(_identify)
+        with self.services.children.request(self._child_user):
+            yield
+
+    async def compute_in_child(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
+        """Call `function` (`module:name`) in a child process, with `make()` as argument, and return `read(result)`.
+
+        If the client closes the connection, the child is killed and `ClientGoneProblem` is raised.
+        """
+        if self._gone:
+            raise ClientGoneProblem(CLIENT_GONE)
+        count_stop = self.services.metrics.count_stopped_child
+        task = self.services.children.submit(self._child_user, function, make, read, count_stop)
+        self._in_children.add(task)
+        try:
+            return await asyncio.wrap_future(task.future)
+        except asyncio.CancelledError:
+            task.abandon()
+            if self._gone:
+                raise ClientGoneProblem(CLIENT_GONE) from None
+            raise
+        finally:
+            self._in_children.discard(task)
+
+    async def compute_apart(self, function: str, make: Callable[[], bytes], read: Callable[[bytes], T]) -> T:
+        """Call a function in a child process as `compute_in_child` does, and count the request during the call.
+
+        Raises `UnavailableProblem` if too many requests use child processes or wait for one.
+        """
+        async with self.using_children():
+            order = await self.compute(make)
+            self.holding.grow(len(order))
+            return await self.compute_in_child(function, lambda: order, read)
+
+    @property
+    def _child_user(self) -> str:
+        """User whose share of child processes this request uses; callers without a user have one share together."""
+        user = self.principal.user_id if self.principal is not None else None
+        return user or STRANGERS
+
+    def on_connection_close(self) -> None:
+        """Stop child processes, because the client has closed the connection."""
+        super().on_connection_close()
+        for task in list(self._in_children):
+            task.abandon()
+
+
+def _identify(_tx: Transaction) -> None:
+    """Do nothing. It is run in a transaction only because every transaction identifies the caller."""
