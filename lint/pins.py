@@ -20,7 +20,7 @@ FOLDER = "pins"
 BELOW = {"build": None, "all": "build", "dev": "all", "bench": "dev", "audit": "dev"}
 """Layers of packages, each with the one that it extends: the build backend, then extras of `pyproject.toml`."""
 _PIN = re.compile(
-    r"(?P<name>[a-z0-9][a-z0-9.-]*)==(?P<version>[^\s;\\]+)[^\n]*(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
+    r"(?P<name>[a-z0-9][a-z0-9.-]*)(?:\[[^\]]*\])?==(?P<version>[^\s;\\]+)[^\n]*(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
 )
 
 
@@ -77,8 +77,9 @@ def _resolve(wanted: Sequence[str], known: str, *options: str) -> str:
         pins.write_text(re.sub(r"(?m)^(-r|#).*\n", "", known), "utf-8")
         requirements.write_text("\n".join(dict.fromkeys(wanted)), "utf-8")
         target = ["--universal", "--python-version", "3.11", "--output-file", str(pins), str(requirements)]
-        quiet = ["--quiet", "--no-header", "--no-annotate"]
-        subprocess.run([sys.executable, "-m", "uv", "pip", "compile", *quiet, *options, *target], check=True)
+        # pip resolves `name[extra]` apart from `name`, and accepts only pins of the names that packages require.
+        form = ["--quiet", "--no-header", "--no-annotate", "--no-strip-extras"]
+        subprocess.run([sys.executable, "-m", "uv", "pip", "compile", *form, *options, *target], check=True)
         return pins.read_text("utf-8")
 
 

@@ -2,10 +2,12 @@
 
 import re
 import tomllib
+from importlib.metadata import distributions
 from typing import Any
 
 import pytest
 from lint.pins import BELOW, FOLDER, ROOT, layers_of, pins_in, split
+from packaging.requirements import Requirement
 
 PYPROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 FILES = {layer: (ROOT / FOLDER / f"{layer}.txt").read_text("utf-8") for layer in BELOW}
@@ -43,6 +45,17 @@ def test_a_layer_pins_what_its_extra_requires(layer: str) -> None:
     assert FILES[layer].startswith(f"# Written by `make pins`.\n-r {BELOW[layer]}.txt\n")
 
 
+def test_a_pin_names_the_extras_that_other_packages_require() -> None:
+    """Otherwise pip finds no pin for `coverage[toml]` as soon as a newer version than the pinned one is published."""
+    pinned = {name: text for pins in PINS.values() for name, text in pins.items()}
+    missing = []
+    for package in filter(lambda one: name_of(one.name) in pinned, distributions()):
+        for one in map(Requirement, package.requires or ()):
+            if one.extras and (one.marker is None or one.marker.evaluate({"extra": ""})):
+                missing += [str(one) for extra in one.extras if f"[{extra}" not in pinned[name_of(one.name)]]
+    assert missing == []
+
+
 def test_the_build_backend_has_the_pinned_version() -> None:
     assert all(one in FILES["build"] for one in PYPROJECT["build-system"]["requires"])
     assert all(re.fullmatch(r"[\w-]+==[\w.]+", one) for one in PYPROJECT["build-system"]["requires"])
@@ -64,3 +77,8 @@ def test_a_pin_keeps_all_its_versions_and_hashes() -> None:
     )
     two = f"{older}\n{newer}"
     assert pins_in(f"# note\n-r all.txt\n{two}\n") == {"x-y": two}
+
+
+def test_a_pin_may_have_extras() -> None:
+    text = f"x-y[toml]==1.0 \\\n    --hash=sha256:{'0' * 64}"
+    assert pins_in(text) == {"x-y": text}
