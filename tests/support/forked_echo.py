@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import threading
@@ -28,10 +29,19 @@ def answer(pipe: Connection) -> None:
         pipe.send_bytes(f"{LOADED} {os.getppid()} {os.getpid()} {os.getsid(0)}".encode())
 
 
+def refuse() -> int:
+    """Fail as `os.fork` does if the system has no memory left."""
+    raise BlockingIOError(errno.EAGAIN, "no memory is left")
+
+
 if __name__ == "__main__":
     control = connect_to_parent()
     if sys.argv[2:] == ["broken"]:
         sys.exit(3)
+    if sys.argv[2:] == ["full"]:
+        forks = iter([refuse])
+        fork = os.fork
+        os.fork = lambda: next(forks, fork)()
     if sys.argv[2:] == ["threaded"]:
         threading.Thread(target=threading.Event().wait, daemon=True).start()
     control.send_bytes(READY)

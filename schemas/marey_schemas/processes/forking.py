@@ -32,6 +32,8 @@ FORKS = sys.platform == "linux"
 FORK = b"fork"
 STARTED = 1 << 16
 """Value in place of the exit status of a child that has been started; exit statuses are smaller."""
+NO_CHILD = -1
+"""Value in place of the number of a child that could not be started."""
 _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
 
 
@@ -68,9 +70,9 @@ class ForkServer:
         with theirs, self._forking:
             self._process.send_socket(FORK, theirs)
             pid = None if self._ended else self._started.get()
-        if pid is None:
+        if pid is None or pid == NO_CHILD:
             ours.close()
-            raise ChildBroken(self._process.wait())
+            raise ChildBroken(self._process.wait() if pid is None else 1)
         child = ForkedChild(self, pid, ours)
         child.wait_until_ready()
         return child
@@ -191,10 +193,15 @@ def _carry_out(
         os.waitpid(_NUMBER.unpack(order)[0], 0)
         return set()
     with socket.socket(fileno=recv_handle(pipe)) as connected:
-        if not (pid := os.fork()):
+        try:
+            pid = os.fork()
+        except OSError:  # the system has no memory or process left; other children go on
+            traceback.print_exc()
+            pid = NO_CHILD
+        if pid == 0:
             _run_child(serve, connected, (pipe, *others))
     pipe.send_bytes(_NUMBER_AND_STATUS.pack(pid, STARTED))
-    return {pid}
+    return {pid} - {NO_CHILD}
 
 
 def _exit_status(pid: int) -> int | None:

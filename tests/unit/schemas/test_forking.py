@@ -138,6 +138,15 @@ def test_many_threads_fork_at_the_same_time(server: ForkServer) -> None:
     assert all(own == session for _, _, own, session in answers)
 
 
+def test_a_fork_that_fails_is_reported_and_the_next_one_succeeds() -> None:
+    server = ForkServer("tests.support.forked_echo", ["full"], threads=1)
+    server.wait_until_ready()
+    with pytest.raises(ChildBroken):
+        server.fork()
+    assert ids_from(server.fork())
+    server.close()
+
+
 def test_a_process_with_a_second_thread_forks_nothing() -> None:
     server = ForkServer("tests.support.forked_echo", ["threaded"], threads=1)
     server.wait_until_ready()
