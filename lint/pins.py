@@ -20,7 +20,8 @@ FOLDER = "pins"
 BELOW = {"build": None, "all": "build", "dev": "all", "bench": "dev", "audit": "dev"}
 """Layers of packages, each with the one that it extends: the build backend, then extras of `pyproject.toml`."""
 _PIN = re.compile(
-    r"(?P<name>[a-z0-9][a-z0-9.-]*)(?:\[[^\]]*\])?==(?P<version>[^\s;\\]+)[^\n]*(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
+    r"(?P<name>[a-z0-9][a-z0-9.-]*)(?:\[[^\]]*\])?==(?P<version>[^\s;\\]+)[^\n]*"
+    r"(?:\n    --hash=sha256:[0-9a-f]{64}[^\n]*)*"
 )
 
 

@@ -257,7 +257,10 @@ def require_apart(things: Sequence[Thing]) -> None:
 
 
 def _things(project: ProjectHandle, address: Address, kind: str | None, *, deleted: bool) -> Iterator[Thing]:
-    """Yield the folders and items at an address: folders before items, the most recently deleted first."""
+    """Yield the folders and items at an address, folders first.
+
+    With `deleted`, these are the deleted ones; those of one kind begin with the one that was deleted last.
+    """
     from marey_schemas.kinds import Kind
 
     if kind in (None, FOLDER) and (folder := _folder(project, address, deleted=deleted)) is not None:

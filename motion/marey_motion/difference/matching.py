@@ -2,7 +2,8 @@
 
 A run consists of consecutive frames of both clips, whose frame numbers differ by a constant, the lag. Between runs,
 frames are removed or inserted. Candidates for the lags are found first; the runs are then the cheapest path through
-them. Frames that follow an insertion therefore remain matched, and still or cyclic motion has no more runs than needed.
+them. So frames after an insertion remain matched, and motion that stands still or repeats is not split into more runs
+than needed.
 """
 
 from __future__ import annotations

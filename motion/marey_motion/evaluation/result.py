@@ -99,7 +99,8 @@ class EvaluationResult:
     ----------
     suite : pooled metrics over all trials, and by family under "circle.…" and "switching.…"
     usage : use of each clip, in the order of `clips`
-    switches : (S, 3) int64    row left, row entered and count of all jumps of the suite; ordered by the first two
+    switches : (S, 3) int64    for each pair of rows between which the suite jumped: the row before the jump, the
+        row after it, and the number of these jumps; ordered by the first two
     records : record of each trial, in the order of `trials`
     baseline : result of the same suite over clips generated for every cell of the grid, without records; None if not
         computed

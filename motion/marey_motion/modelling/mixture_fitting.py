@@ -90,10 +90,10 @@ def one_thread() -> Iterator[None]:
 def fit_mixture(latents: Floats, options: MixtureOptions | None = None, *, seed: int = 0) -> FittedMixture:
     """Fit a mixture to latent vectors.
 
-    With no more than d + 1 examples a full covariance is singular; one component then has a covariance shrunk towards a
-    sphere (Ledoit and Wolf 2004). Otherwise, mixtures with different numbers of components are compared by
-    `options.criterion`. A number is excluded if one of the components has fewer than d + 1 examples, or fewer than 5,
-    or if held-out examples are not more likely than under a single component.
+    With no more than d + 1 examples, a full covariance would be singular. The mixture then has one component only, and
+    its covariance is shrunk towards a sphere (Ledoit and Wolf 2004). Otherwise, mixtures with different numbers of
+    components are compared by `options.criterion`. A mixture is excluded if one of its components has fewer than d + 1
+    examples, or fewer than 5, or if held-out examples are not more likely than under a single component.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ class ProtectionRule(Request):
     @model_validator(mode="after")
     def _is_consistent(self) -> ProtectionRule:
         if self.role is Role.READER:
-            raise ValueError("readers cannot move a branch; require the role contributor, maintainer or owner")
+            raise ValueError("role: readers can never move a branch; set role to contributor, maintainer or owner")
         if self.direct_commits and (self.approvals or self.checks or self.up_to_date):
             raise ValueError(
                 "direct_commits: direct commits would bypass approvals, checks and up_to_date; set direct_commits to "

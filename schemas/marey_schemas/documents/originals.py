@@ -25,7 +25,10 @@ CONTENT = {
 
 
 class StoredOriginal(Request):
-    """Imported file, and `content`: the digest of those members of a part whose values come from the file."""
+    """Imported file from which a revision was read.
+
+    `content` is the digest of those members of a part whose values were read from this file.
+    """
 
     name: str = Field("", max_length=1024, description="Name of the file without its folders.")
     blob: Digest

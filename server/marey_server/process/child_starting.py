@@ -1,4 +1,6 @@
-"""Start of child processes: on Linux, by forking a process that has loaded their modules; elsewhere, one by one."""
+"""Start of child processes: on Linux, they are forked from a process that has loaded their modules; on other systems,
+each child loads the modules itself.
+"""
 
 from __future__ import annotations
 

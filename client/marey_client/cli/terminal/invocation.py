@@ -34,7 +34,7 @@ NO_OPTIONS = Invocation(None, None, False)
 
 
 def credential_of(context: typer.Context) -> Credential:
-    """Return the server and the token that the options, the environment or `marey login` name."""
+    """Return the server and the token, as given by options, by the environment, or by an earlier `marey login`."""
     from marey_client.credentials import resolve
 
     given = context.find_object(Invocation) or NO_OPTIONS

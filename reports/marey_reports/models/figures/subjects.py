@@ -91,7 +91,7 @@ class ModelSubject:
         return points_of(self.primitive.skeleton, poses)
 
     def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
-        """Choose the canonical frames that strips show; the column of each frame is centred on the mean motion."""
+        """Choose the frames in canonical time that strips show, one per column, with the mean motion in the middle."""
         return choose_moments(self, count)
 
 

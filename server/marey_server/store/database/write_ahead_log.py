@@ -55,7 +55,7 @@ class WriteAheadLog:
         self._failing = False
 
     def after_commit(self, connection: sqlite3.Connection) -> None:
-        """Start to copy a log that is no longer short, or restart it if little is left to copy.
+        """Start to copy the log if it is no longer short; if little is left to copy, let SQLite overwrite it.
 
         `connection` has just committed. Only one thread may call this method at a time.
         """
