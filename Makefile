@@ -15,7 +15,7 @@ EFFORT ?= 4
 PYTEST := $(BIN)/python -m pytest -q -n 3 --dist loadgroup $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help installed demo check test soak coverage lint format dev bench docs pins audit bom clean
+.PHONY: help installed demo check test soak lint format dev bench docs pins audit bom clean
 
 help: ## Show what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -54,10 +54,6 @@ soak: $(VENV)/.installed-dev lint ## Long forms of all tests, on both databases;
 	$(PYTEST) --tier soak --effort $(EFFORT) -o timeout=7200 --durations=25 tests
 	$(BIN)/python -m tests.support.motion_fuzz $$((300 * $(EFFORT)))
 	$(BIN)/python -m tests.support.hostile_figures
-
-coverage: $(VENV)/.installed-dev ## Branch coverage of each package by the tests of make check, beside its minimum
-	$(PYTEST) --tier check --cov --cov-report= tests
-	$(BIN)/python -m tests.support.branch_coverage
 
 lint: $(VENV)/.installed-dev ## Style, types, and which package may import which
 	$(BIN)/ruff check .

@@ -38,6 +38,10 @@ if __name__ == "__main__":
     control = connect_to_parent()
     if sys.argv[2:] == ["broken"]:
         sys.exit(3)
+    if sys.argv[2:] == ["numeric"]:
+        import numpy as np
+
+        np.ones((200, 200)) @ np.ones((200, 200))
     if sys.argv[2:] == ["full"]:
         forks = iter([refuse])
         fork = os.fork

@@ -18,9 +18,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import send_handle
 
-from marey_schemas.processes.environment import clean_environment
+from marey_schemas.processes.environment import clean_environment, thread_limits
 from marey_schemas.processes.limits import die_with_parent, resident_bytes
 
 READY = b"ready"
@@ -29,6 +28,8 @@ READY_S = 300.0
 """Longest wait in seconds for `READY`; after an installation, the child may have to compile its modules first."""
 TERMINATE_S = 10.0
 MOST_MESSAGE_BYTES = 1 << 30
+ONE_DESCRIPTOR = b"\x01"
+"""Number of descriptors in a message, as `multiprocessing.reduction.recv_handle` expects it."""
 
 
 class ChildBroken(Exception):
@@ -98,10 +99,16 @@ class ConnectedChild(ABC):
                 return
 
     def send_socket(self, message: bytes, passed: socket.socket) -> None:
-        """Send a message and then a socket; if the child has died, the next `receive` reports it."""
-        with self._sending, suppress(OSError):
-            self._pipe.send_bytes(message)
-            send_handle(self._pipe, passed.fileno(), self.pid)
+        """Send a message and then a socket, which the child receives by `recv_handle`.
+
+        If that fails, the child is killed, because it would wait for the socket; the next `receive` reports its end.
+        """
+        with self._sending:
+            try:
+                self._pipe.send_bytes(message)
+                socket.send_fds(self._socket, [ONE_DESCRIPTOR], [passed.fileno()])
+            except OSError:
+                self.abort()
 
     def receive(self, timeout_s: float | None = None) -> bytes | None:
         """Return the next message, or None if there is none within `timeout_s`; without a timeout, wait for it.
@@ -149,7 +156,8 @@ class ChildProcess(ConnectedChild):
     ends.
     """
 
-    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
+    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int, at_most: bool = False) -> None:
+        """Start the process; with `at_most`, settings of numeric libraries cannot allow it more than `threads`."""
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
@@ -157,7 +165,7 @@ class ChildProcess(ConnectedChild):
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                env=clean_environment(threads=threads),
+                env=clean_environment(threads=threads) | (thread_limits(threads) if at_most else {}),
             )
         super().__init__(ours)
 

@@ -37,5 +37,9 @@ def clean_environment(source: Mapping[str, str] | None = None, *, threads: int |
     extra = {name.strip() for name in source.get(EXTRA_VARIABLE, "").split(",")}
     passed_on = PASSED_ON | OWN_VARIABLES | extra
     kept = {name: text for name, text in source.items() if name in passed_on or name.startswith(PASSED_ON_PREFIXES)}
-    limited = {} if threads is None else dict.fromkeys(THREAD_VARIABLES, str(threads))
-    return limited | kept
+    return (thread_limits(threads) if threads is not None else {}) | kept
+
+
+def thread_limits(threads: int) -> dict[str, str]:
+    """Return the variables that limit numeric libraries to a number of threads."""
+    return dict.fromkeys(THREAD_VARIABLES, str(threads))

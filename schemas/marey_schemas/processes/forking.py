@@ -24,7 +24,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import recv_handle
 from queue import SimpleQueue
 
-from marey_schemas.processes.child_process import READY, ChildBroken, ChildProcess, ConnectedChild
+from marey_schemas.processes.child_process import READY, TERMINATE_S, ChildBroken, ChildProcess, ConnectedChild
 from marey_schemas.processes.limits import die_with_parent
 
 FORKS = sys.platform == "linux"
@@ -32,6 +32,8 @@ FORKS = sys.platform == "linux"
 FORK = b"fork"
 STARTED = 1 << 16
 """Value in place of the exit status of a child that has been started; exit statuses are smaller."""
+LOST = 1 << 17
+"""Value in place of the exit status of a child whose fork server has ended."""
 NO_CHILD = -1
 """Value in place of the number of a child that could not be started."""
 _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
@@ -40,71 +42,118 @@ _NUMBER, _NUMBER_AND_STATUS = struct.Struct("<q"), struct.Struct("<qq")
 class ForkServer:
     """Parent's side of a fork server, which runs `python -m module <file descriptor> <arguments>`.
 
-    The fork server and its children are killed when the thread that started it ends. Any thread may fork children.
+    A thread of its own starts and watches it, so it lives until it is closed or this process ends. Any thread may fork
+    children.
     """
 
-    def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int) -> None:
-        self._process = ChildProcess(module, arguments, threads=threads)
+    def __init__(self, module: str, arguments: Sequence[str] = ()) -> None:
+        self._command = (module, arguments)
+        self._launched: SimpleQueue[Exception | None] = SimpleQueue()
+        self._process: ChildProcess | None = None
+        self._aborted = False
         self._forking = threading.Lock()
         self._started: SimpleQueue[int | None] = SimpleQueue()
         self._changed = threading.Condition()
         self._statuses: dict[int, int] = {}
         """Exit statuses of children that have ended and may still be signalled."""
         self._ended = False
-        self._reading: threading.Thread | None = None
+        self._watching = threading.Thread(target=self._watch, name="marey-fork-server", daemon=True)
 
     def wait_until_ready(self) -> None:
-        """Wait until the fork server has loaded its modules. Raises `ChildBroken` if it ends before."""
-        self._process.wait_until_ready()
-        self._reading = threading.Thread(target=self._read, name="marey-fork-server", daemon=True)
-        self._reading.start()
+        """Start the fork server, and wait until it has loaded its modules.
+
+        Raises `ChildBroken` if it ends before, and `OSError` if the system cannot start it.
+        """
+        self._watching.start()
+        if (error := self._launched.get()) is not None:
+            raise error
 
     @property
     def alive(self) -> bool:
         """Whether children can be forked."""
-        return not self._ended and self._process.alive
+        return not self._ended and self._process is not None and self._process.alive
 
     def fork(self) -> ForkedChild:
-        """Start a child, and wait until it is ready. Raises `ChildBroken` if it or the fork server has ended."""
+        """Start a child, and wait until it is ready.
+
+        Raises `ChildBroken` if it or the fork server has ended, and `OSError` if this process has no descriptor left.
+        """
+        assert self._process is not None, "wait_until_ready comes first"
         ours, theirs = socket.socketpair()
-        with theirs, self._forking:
-            self._process.send_socket(FORK, theirs)
-            pid = None if self._ended else self._started.get()
-        if pid is None or pid == NO_CHILD:
+        try:
+            with theirs, self._forking:
+                self._process.send_socket(FORK, theirs)
+                pid = None if self._ended else self._started.get()
+            if pid is None or pid == NO_CHILD:
+                raise ChildBroken(self._process.wait() if pid is None else 1)
+            child = ForkedChild(self, pid, ours)
+        except BaseException:
             ours.close()
-            raise ChildBroken(self._process.wait() if pid is None else 1)
-        child = ForkedChild(self, pid, ours)
-        child.wait_until_ready()
+            raise
+        try:
+            child.wait_until_ready()
+        except ChildBroken:
+            child.kill(grace_s=0.0)
+            raise
         return child
 
     def status_of(self, pid: int, timeout_s: float | None = None) -> int | None:
         """Return the exit status of a child; None if it is running after `timeout_s`; without a timeout, wait."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or pid in self._statuses, timeout_s)
-            return self._statuses.get(pid, -signal.SIGKILL if self._ended else None)
+            return self._statuses.get(pid, LOST if self._ended else None)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the fork server has ended, so that the system may use the numbers of its children again."""
+        return self._ended
 
     def release(self, pid: int) -> None:
         """Let the system use the number of an ended child again."""
         with self._changed:
             known = self._statuses.pop(pid, None) is not None
-        if known:
+        if known and self._process is not None:
             self._process.send(_NUMBER.pack(pid))
 
     def abort(self) -> None:
         """Kill the fork server and all its children at once."""
-        self._process.abort()
+        self._aborted = True
+        if self._process is not None:
+            self._process.abort()
 
     def close(self) -> None:
         """Kill the fork server, and with it all its children."""
-        self._process.abort()
-        if self._reading is not None:
-            self._reading.join()
-        self._process.kill(grace_s=0.0)
+        self.abort()
+        if self._watching.ident is not None:
+            self._watching.join()
 
-    def _read(self) -> None:
+    def _watch(self) -> None:
+        """Start the fork server, receive the numbers and exit statuses of children, and reap it at its end."""
+        module, arguments = self._command
+        try:
+            process = self._process = ChildProcess(module, arguments, threads=1, at_most=True)
+            if self._aborted:
+                process.abort()
+            process.wait_until_ready()
+        except (ChildBroken, OSError) as error:
+            self._end()
+            self._launched.put(error)
+            return
+        self._launched.put(None)
+        self._read(process)
+        self._end()
+        process.kill(grace_s=0.0)
+
+    def _end(self) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        self._started.put(None)
+
+    def _read(self, process: ChildProcess) -> None:
         """Receive the numbers and exit statuses of children until the fork server ends."""
         with suppress(EOFError, OSError):
-            while (message := self._process.receive()) is not None:
+            while (message := process.receive()) is not None:
                 pid, status = _NUMBER_AND_STATUS.unpack(message)
                 if status == STARTED:
                     self._started.put(pid)
@@ -112,10 +161,6 @@ class ForkServer:
                 with self._changed:
                     self._statuses[pid] = status
                     self._changed.notify_all()
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
-        self._started.put(None)
 
 
 class ForkedChild(ConnectedChild):
@@ -126,6 +171,7 @@ class ForkedChild(ConnectedChild):
         self._server = server
         self._pid = pid
         self._status: int | None = None
+        self._released = False
 
     @property
     def pid(self) -> int:
@@ -146,8 +192,24 @@ class ForkedChild(ConnectedChild):
         assert self._status is not None
         return self._status
 
+    def kill(self, *, grace_s: float = TERMINATE_S) -> None:
+        """End the process and its descendants: by SIGTERM, and after `grace_s` by SIGKILL."""
+        if not self._released:
+            super().kill(grace_s=grace_s)
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Send a signal to the session of the process, or, as long as it has none, to the process."""
+        if self._released or self._server.has_ended:
+            return
+        try:
+            os.killpg(self._pid, number)
+        except ProcessLookupError:
+            with suppress(ProcessLookupError):
+                os.kill(self._pid, number)
+
     def _close(self) -> None:
         super()._close()
+        self._released = True
         self._server.release(self._pid)
 
 
@@ -196,7 +258,8 @@ def _carry_out(
         try:
             pid = os.fork()
         except OSError:  # the system has no memory or process left; other children go on
-            traceback.print_exc()
+            with suppress(OSError, ValueError):
+                traceback.print_exc()
             pid = NO_CHILD
         if pid == 0:
             _run_child(serve, connected, (pipe, *others))
@@ -231,6 +294,8 @@ def _run_child(
     except BaseException:  # noqa: BLE001 - nothing may return into the fork server's code
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(status)

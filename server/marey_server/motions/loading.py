@@ -29,6 +29,7 @@ class Loading:
     def __exit__(self, *_error: object) -> None:
         if len(sys.modules) != self._modules:
             self._modules = len(sys.modules)
+            gc.collect()
             gc.freeze()
         self._lock.release()
 

@@ -22,7 +22,7 @@ Loading = TypeVar("Loading", ChildProcess, ForkServer)
 class ChildStarter:
     """Start of child processes that may use `memory_bytes` for their orders; any thread may start children.
 
-    All children are killed when the starter is closed, and when the thread that started the first one ends.
+    All children are killed when the starter is closed.
     """
 
     def __init__(self, memory_bytes: int, loaded_first: Sequence[str], *, forks: bool) -> None:
@@ -35,12 +35,12 @@ class ChildStarter:
         self._closed = False
 
     def start(self) -> ConnectedChild:
-        """Return a new child that is ready. Raises `ChildBroken` if it cannot be started."""
+        """Return a new child that is ready. Raises `ChildBroken` or `OSError` if it cannot be started."""
         if not self._forks:
             return self._loaded(ChildProcess(CHILD_MODULE, self._arguments, threads=1))
         with self._launching:
             if self._fork_server is None or not self._fork_server.alive:
-                self._fork_server = self._loaded(ForkServer(CHILD_MODULE, self._arguments, threads=1))
+                self._fork_server = self._loaded(ForkServer(CHILD_MODULE, self._arguments))
             return self._fork_server.fork()
 
     def close(self) -> None:
@@ -49,6 +49,8 @@ class ChildStarter:
             self._closed = True
             for process in self._loading:
                 process.abort()
+            if self._fork_server is not None:
+                self._fork_server.abort()  # a fork that is under way ends, and with it the lock below
         with self._launching:
             if self._fork_server is not None:
                 self._fork_server.close()
@@ -61,7 +63,7 @@ class ChildStarter:
                 process.abort()
         try:
             process.wait_until_ready()
-        except ChildBroken:
+        except (ChildBroken, OSError):
             process.close()
             raise
         finally:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from marey_schemas.processes.child_process import BadMessage, ChildBroken, ConnectedChild
-from marey_schemas.processes.forking import FORKS
+from marey_schemas.processes.forking import FORKS, LOST
 from marey_schemas.sizes import MIB
 from marey_server.errors import ApiProblem, InvalidProblem, NotFoundProblem, TooLargeProblem, UnavailableProblem
 from marey_server.motions.child import ChildAnswer, ChildOrder, ChildRefusal
@@ -244,9 +244,9 @@ class Children:
         """Return a new child that is ready, or None if it cannot be started."""
         try:
             return self._starter.start()
-        except ChildBroken as error:
+        except (ChildBroken, OSError, RuntimeError) as error:  # no process, descriptor, memory or thread is left
             if not self._closed:
-                log.error("%s", error)
+                log.error("a child process cannot be started: %s", error)
             return None
 
     def _next_task(self, number: int) -> ChildTask[Any] | None:
@@ -314,6 +314,9 @@ class Children:
         """Return the error for a task whose child process ended while running it, and count the end in the metrics."""
         if task.stopped == "closing":
             return _stopping()
+        if status == LOST:
+            task.count_end("died")
+            return UnavailableProblem("The process that worked on this was lost; try again.")
         out_of_time = status == -signal.SIGXCPU
         task.count_end(task.stopped or ("time" if out_of_time else "died"))
         if task.stopped == "time":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ class StagedResults:
     def flush(self) -> None:
         """Send the results that are not yet sent."""
         if self._ready:
+            wait(self._ready)  # errors of results that are already there have one traceback, so one signature
             self._context.stage([encoding.result() for encoding in self._ready])
         self._ready, self._ready_bytes = [], 0
 
