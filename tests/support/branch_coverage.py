@@ -23,8 +23,8 @@ FLOORS = {
     "marey_server": 89,
     "marey_worker": 44,
 }
-"""Percent of branches, 2 to 3 below those of a whole run of `make test`. Most of the worker, and of the limits and the fork
-server in `marey_schemas.processes`, runs in child processes, which are not measured.
+"""Percent of branches, 2 to 3 below those of a whole run of `make test`. Most of the worker, and of the limits and the
+fork server in `marey_schemas.processes`, runs in child processes, which are not measured.
 """
 
 
