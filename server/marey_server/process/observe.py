@@ -6,13 +6,23 @@ metrics reveal no names, and their number grows neither with the data nor in an 
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import secrets
-from collections.abc import Mapping, Sized
+from collections.abc import Iterable, Mapping, Sized
+from dataclasses import dataclass
 from functools import partial
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Metric,
+    ProcessCollector,
+    disable_created_metrics,
+)
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from marey_schemas.queue.log_lines import LogForm, log_to_standard_error
@@ -30,6 +40,8 @@ _MALFORMED = (
     "no colon in header line",
 )
 """Beginnings of Tornado's messages about malformed requests; the rest may quote what was received."""
+
+disable_created_metrics()  # type: ignore[no-untyped-call]  # times of the first count, which would double the text
 
 access_log = logging.getLogger("marey_server.access_log")
 
@@ -67,6 +79,17 @@ def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
     Other records, such as those of the schema check in each readiness request, are dropped.
     """
     return record.levelno > logging.INFO or record.getMessage().startswith("Running")
+
+
+@dataclass(frozen=True)
+class _OneMetric:
+    """Registry of one metric."""
+
+    metric: Metric
+
+    def collect(self) -> Iterable[Metric]:
+        """Return the metric."""
+        return (self.metric,)
 
 
 class Metrics:
@@ -108,10 +131,29 @@ class Metrics:
         )  # fmt: skip
         self.imports = Counter("marey_imported_files", "Files imported.", ("status",), registry=self.registry)
         self.draining = Gauge("marey_draining", "1 while the server is stopping.", registry=self.registry)
+        self._rendering = asyncio.Lock()
+        self._renderings = 0
+        self._rendered = b""
 
-    def exposition(self) -> tuple[bytes, str]:
-        """Return all metrics in the text format of Prometheus, and its media type."""
-        return generate_latest(self.registry), CONTENT_TYPE_LATEST
+    async def exposition(self) -> tuple[bytes, str]:
+        """Return all metrics in the text format of Prometheus, and its media type.
+
+        Rendering thousands of lines takes the event loop 50 ms, so it goes on with other work after each metric, and
+        all who ask during one rendering share the next one.
+        """
+        wanted = self._renderings + 1
+        async with self._rendering:
+            if self._renderings < wanted:
+                self._renderings = wanted
+                self._rendered = await self._render()
+            return self._rendered, CONTENT_TYPE_LATEST
+
+    async def _render(self) -> bytes:
+        rendered = bytearray()
+        for metric in self.registry.collect():
+            rendered += generate_latest(_OneMetric(metric))
+            await asyncio.sleep(0)
+        return bytes(rendered)
 
     def count_request(self, method: str, route: str, status: int, duration_s: float, bytes_in: int) -> None:
         """Count one answered request."""

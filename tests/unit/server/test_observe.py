@@ -1,9 +1,11 @@
 """Logs, request ids and metrics."""
 
+import asyncio
 import json
 import logging
 
 import pytest
+from prometheus_client.exposition import generate_latest
 
 from marey_schemas.queue.log_lines import JsonFormatter, TextFormatter
 from marey_server.process.observe import Metrics, request_id
@@ -40,5 +42,38 @@ def test_a_sane_id_is_kept() -> None:
 def test_metrics_of_two_servers_in_one_process_are_their_own() -> None:
     one, two = Metrics(), Metrics()
     one.count_request("GET", "/healthz", 200, 0.1, 5)
-    assert b'route="/healthz"' in one.exposition()[0]
-    assert b'route="/healthz"' not in two.exposition()[0]
+    assert b'route="/healthz"' in shown(one)
+    assert b'route="/healthz"' not in shown(two)
+
+
+def shown(metrics: Metrics) -> bytes:
+    return asyncio.run(metrics.exposition())[0]
+
+
+def test_metrics_are_shown_as_the_library_shows_them_all_at_once() -> None:
+    metrics = Metrics()
+    metrics.count_request("GET", "/healthz", 200, 0.1, 5)
+    changing = (b"process_", b"# ")
+    lines = [line for line in generate_latest(metrics.registry).splitlines() if not line.startswith(changing)]
+    assert [line for line in shown(metrics).splitlines() if not line.startswith(changing)] == lines
+
+
+def test_metrics_that_are_asked_for_together_are_rendered_once_more_and_are_new() -> None:
+    """Rendering takes long, so a crowd that asks for metrics must not keep the event loop busy."""
+    metrics = Metrics()
+    rendered: list[int] = []
+
+    async def ask(number: int) -> bytes:
+        metrics.imports.labels("stored").inc()
+        answer = (await metrics.exposition())[0]
+        rendered.append(metrics._renderings)
+        assert float(answer.partition(b'marey_imported_files_total{status="stored"} ')[2].split()[0]) > number
+        return answer
+
+    async def crowd() -> None:
+        first = asyncio.create_task(ask(0))
+        await asyncio.sleep(0)
+        await asyncio.gather(first, *map(ask, range(1, 50)))
+
+    asyncio.run(crowd())
+    assert rendered == [1] + 49 * [2]
