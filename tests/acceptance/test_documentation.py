@@ -46,7 +46,7 @@ def test_metrics_that_a_page_names_exist_with_these_labels() -> None:
     metrics = {
         vars(metric)["_name"]: set(vars(metric)["_labelnames"])
         for metric in vars(Metrics()).values()
-        if "_labelnames" in vars(metric)
+        if hasattr(metric, "_labelnames")
     }
     named = re.findall(r"\b(marey_[a-z_]+?)(?:_total)?(?:\{(\w+))?\b", page)
     assert named
