@@ -1,4 +1,4 @@
-"""Fork server for tests: its children answer with their process id, or end, as they are told."""
+"""Fork server for tests: depending on the message, its children answer with process ids or end."""
 
 from __future__ import annotations
 

@@ -17,6 +17,8 @@ from tests.support.server_process import ServerProcess, serving
 from marey_client import Marey
 from marey_client.imports import find_files
 from marey_client.project import ProjectHandle
+from marey_motion.formats import write_bvh
+from marey_motion.gait import generate_gait
 from marey_schemas.access import ProjectCreate
 from marey_schemas.options.imports import ImportOptions
 
@@ -85,3 +87,17 @@ def lab_of(new_lab: Callable[[], ProjectHandle]) -> Callable[..., ProjectHandle]
 def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
     """A project with nine walks: at three speeds, straight ahead and turning both ways."""
     return lab_of(write_walks(tmp_path / "takes"))
+
+
+@pytest.fixture
+def project_with_version(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
+    """A project with two clips in `gaits/raw`, a skeleton `target`, and the version `v1` of the dataset `gaits`."""
+    for name, step in (("walk", 0.5), ("turn", 0.6)):
+        (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 3.0)))
+    project = lab_of(tmp_path / "walk.bvh", tmp_path / "turn.bvh", collection="gaits/raw")
+    (rig,) = project.skeletons.list()
+    project.skeletons.create("target", {"hierarchy": rig.part("hierarchy")}, collection="skeletons")
+    gaits = project.datasets.create("gaits", collection="gaits")
+    gaits.commit("First version")
+    gaits.create_tag("v1")
+    return project

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,8 +11,6 @@ from tests.support.command_line import CommandLine
 
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
-from marey_motion.formats import write_bvh
-from marey_motion.gait import generate_gait
 from marey_schemas.datasets.commits import PutEntry
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import CollectionInput, ItemInput, Job, JobCreate
@@ -25,17 +22,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "commit-results.md"
 
 
 @pytest.fixture
-def project(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
-    """A project with two clips in `gaits/raw`, a skeleton `target`, and the version `v1` of the dataset `gaits`."""
-    for name, step in (("walk", 0.5), ("turn", 0.6)):
-        (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 1.0)))
-    project = lab_of(tmp_path / "walk.bvh", tmp_path / "turn.bvh", collection="gaits/raw")
-    (rig,) = project.skeletons.list()
-    project.skeletons.create("target", {"hierarchy": rig.part("hierarchy")}, collection="skeletons")
-    gaits = project.datasets.create("gaits", collection="gaits")
-    gaits.commit("First version")
-    gaits.create_tag("v1")
-    return project
+def project(project_with_version: ProjectHandle) -> ProjectHandle:
+    return project_with_version
 
 
 def test_the_commands_of_the_page_commit_results(run: CommandLine, project: ProjectHandle) -> None:

@@ -6,15 +6,12 @@ import json
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from tests.support.command_line import CommandLine
 
 from marey_client.project import ProjectHandle
-from marey_motion.formats import write_bvh
-from marey_motion.gait import generate_gait
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -22,17 +19,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "trace-a-result.md"
 
 
 @pytest.fixture
-def project(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
-    """A project with two clips in `gaits/raw`, a skeleton `target`, and the version `v1` of the dataset `gaits`."""
-    for name, step in (("walk", 0.5), ("turn", 0.6)):
-        (tmp_path / f"{name}.bvh").write_bytes(write_bvh(generate_gait(1.3, step, 3.0)))
-    project = lab_of(tmp_path / "walk.bvh", tmp_path / "turn.bvh", collection="gaits/raw")
-    (rig,) = project.skeletons.list()
-    project.skeletons.create("target", {"hierarchy": rig.part("hierarchy")}, collection="skeletons")
-    gaits = project.datasets.create("gaits", collection="gaits")
-    gaits.commit("First version")
-    gaits.create_tag("v1")
-    return project
+def project(project_with_version: ProjectHandle) -> ProjectHandle:
+    return project_with_version
 
 
 def test_the_commands_of_the_page_trace_results_and_outdated_inputs(

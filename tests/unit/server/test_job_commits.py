@@ -116,14 +116,14 @@ def test_the_same_result_is_committed_once(gaits: CommittingDesk) -> None:
 
 
 def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) -> None:
-    """Somebody tags the entry while a job computes its content anew."""
+    """Somebody tags the entry while a job computes its content again."""
     first = gaits.submit(into="made")
     gaits.work("a")
     (made,) = gaits.desk.outputs(first)
     second = gaits.submit(into="made", cache="off")
     gaits.write(items.change_item, "lab", Kind.STUDY, made.item, ItemChange(tags=("seen",)), expected_rev=None)
     gaits.change(PutEntry(path="made/a", item=made.item))
-    gaits.work("a", facts={"anew": 1})
+    gaits.work("a", facts={"again": 1})
     assert gaits.job(second).publish_conflict is None
     (entry,) = gaits.read(datasets.list_entries, "lab", "gaits", "main", path="", cursor=None, limit=10).items
     assert (entry.tags, entry.revision) == (("seen",), 2)
