@@ -39,6 +39,8 @@ class PartSpec:
 
     schema: str
     required: bool
+    made_from: str | None = None
+    """Part that this part describes or was computed from. A merge takes both from the same side."""
 
 
 PARTS: dict[Kind, dict[str, PartSpec]] = {
@@ -48,19 +50,19 @@ PARTS: dict[Kind, dict[str, PartSpec]] = {
     },
     Kind.CLIP: {"motion": PartSpec("marey/motion@1", True), "info": PartSpec("marey/clip-info@1", False)},
     Kind.ANNOTATION: {"annotation": PartSpec("marey/annotation@1", True)},
-    Kind.PROCESSED: {"motion": PartSpec("marey/motion@1", True), "info": PartSpec("marey/alignment@1", True)},
+    Kind.PROCESSED: {"motion": PartSpec("marey/motion@1", True), "info": PartSpec("marey/alignment@1", True, "motion")},
     Kind.MODEL: {
         "model": PartSpec("marey/motion-primitive@1", True),
-        "tree": PartSpec("marey/sample-tree@1", False),
-        "report": PartSpec("marey/model-report@1", False),
+        "tree": PartSpec("marey/sample-tree@1", False, "model"),
+        "report": PartSpec("marey/model-report@1", False, "model"),
     },
     Kind.GRAPH: {"graph": PartSpec("marey/model-graph@1", True)},
     Kind.CHARACTER: {"character": PartSpec("marey/document@1", True)},
     Kind.EDIT: {"edit": PartSpec("marey/edit@1", True)},
     Kind.EVALUATION: {
         "evaluation": PartSpec("marey/evaluation@1", True),
-        "records": PartSpec("marey/evaluation-records@1", False),
-        "report": PartSpec("marey/evaluation-report@1", False),
+        "records": PartSpec("marey/evaluation-records@1", False, "evaluation"),
+        "report": PartSpec("marey/evaluation-report@1", False, "evaluation"),
     },
     Kind.METRIC: {"metric": PartSpec("marey/document@1", True)},
     Kind.STUDY: {"study": PartSpec("marey/document@1", True)},

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from sqlalchemy import update
+from sqlalchemy import func, select, update
 from tests.support.rest_server import Server
 
 from marey_schemas.access import Role
@@ -282,6 +282,59 @@ def test_a_merge_combines_changes_of_different_parts_of_an_entry(
     ok(owner.post(f"{GAITS}/checkout", json={}))
     joints = ok(owner.get(f"{LAB}/skeletons/{item_at(owner, 'gaits/c')['id']}/parts/hierarchy"))["joints"]
     assert [joint["name"] for joint in joints] == ["Pelvis"]
+
+
+def put_mapping(owner: httpx.Client, path: str, joint: str) -> None:
+    url = f"{LAB}/skeletons/{item_at(owner, path)['id']}/parts/mapping"
+    mapping = {"schema": "marey/skeleton-mapping@1", "joints": {joint: "hips"}}
+    ok(owner.put(url, json=mapping, headers={"If-Match": "*"}))
+
+
+def test_an_entry_with_parts_of_both_sides_can_be_checked_out(
+    owner: httpx.Client, two_branches: Callable[..., None], database: Database
+) -> None:
+    """No item has the two parts together before the merge stores them."""
+    two_branches(lambda: put_mapping(owner, "gaits/a", "Pelvis"), lambda: put(owner, "gaits/a", "Pelvis"))
+    before = ok(owner.get(f"{LAB}/skeletons"))
+    request = {"version": "trial", "write_id": "12345678"}
+    ok(owner.post(f"{GAITS}/merges", json={**request, "preview": True}))
+    assert database.read(SYSTEM, number_of_revisions) == 5
+    merged = ok(owner.post(f"{GAITS}/merges", json=request))["commit"]
+    assert ok(owner.post(f"{GAITS}/merges", json=request))["commit"] == merged
+    assert database.read(SYSTEM, number_of_revisions) == 6
+    entry = entries(owner)["a"]
+    assert entry["parts"] == {
+        "hierarchy": entries(owner, "main~1")["a"]["parts"]["hierarchy"],
+        "mapping": entries(owner, "trial")["a"]["parts"]["mapping"],
+    }
+    assert entry["item"] is not None
+    assert ok(owner.get(f"{LAB}/skeletons")) == before
+    assert ok(owner.post(f"{GAITS}/checkout", json={}))["changed"] == 1
+    found = item_at(owner, "gaits/a")
+    joints = ok(owner.get(f"{LAB}/skeletons/{found['id']}/parts/hierarchy"))["joints"]
+    mapping = ok(owner.get(f"{LAB}/skeletons/{found['id']}/parts/mapping"))["joints"]
+    assert ([joint["name"] for joint in joints], mapping) == (["Pelvis"], {"Pelvis": "hips"})
+    assert not list(check_store(database))
+
+
+def number_of_revisions(tx: Transaction) -> int:
+    return tx.execute(select(func.count()).select_from(revision)).scalar_one()
+
+
+def test_an_entry_whose_content_nobody_has_is_named(
+    owner: httpx.Client, gaits: Callable[..., Any], database: Database
+) -> None:
+    put(owner, "gaits/a", "Pelvis")
+    gaits("second")
+    database.write(SYSTEM, lose_contents)
+    assert {one.code for one in check_store(database)} == {"entry-lost"}
+    put(owner, "gaits/a", "Root")
+    answer = refused(owner.post(f"{GAITS}/checkout", json={"discard": True, "version": "main~1"}), 422, "no-content")
+    assert "'a'" in answer["detail"]
+
+
+def lose_contents(tx: Transaction) -> None:
+    tx.execute(update(revision).values(content="sha256:" + "0" * 64))
 
 
 def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Callable[..., None]) -> None:

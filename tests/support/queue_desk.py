@@ -86,7 +86,15 @@ SURVEY = KindDeclaration(
     task_count=lambda params: params.number,
     gathering="tests:gather",
 )
-KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY)}
+RIG = KindDeclaration(
+    name="rig",
+    description="Makes a skeleton with several parts.",
+    params=Params,
+    implementation="tests:rig",
+    version=1,
+    outputs={"rigs": Kind.SKELETON},
+)
+KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY, RIG)}
 
 
 @dataclass
@@ -177,7 +185,11 @@ class Desk:
 
     def stage(self, lease: Lease, *names: str, **fields: Any) -> int:
         """Stage a small document under each name."""
-        outputs = [staging.prepare_output(output(name, **fields)) for name in names]
+        return self.stage_outputs(lease, *(output(name, **fields) for name in names))
+
+    def stage_outputs(self, lease: Lease, *staged: StagedOutput) -> int:
+        """Stage results."""
+        outputs = [staging.prepare_output(one) for one in staged]
         return self.database.write(self._attempt_of(lease), staging.stage, lease.job, lease.fence, outputs)
 
     def complete(self, lease: Lease, *, write_id: str | None = None, **fields: Any) -> CompleteAnswer:

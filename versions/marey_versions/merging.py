@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from marey_schemas.datasets.merges import Side
+from marey_schemas.kinds import PARTS, Kind
 from marey_versions.compared import ComparedEntry
 from marey_versions.records import DatasetEntry
 from marey_versions.tree.chunks import Value
@@ -35,11 +36,21 @@ class MergeConflict(NamedTuple):
         return present.key
 
 
+class CombinedEntry(NamedTuple):
+    """Entry with parts of both sides, so that neither side has a revision with its content."""
+
+    entry: DatasetEntry
+    ours: DatasetEntry
+    theirs: DatasetEntry
+
+
 @dataclass
 class MergedEntries:
     """Result of a merge: changes to apply to our tree, and conflicts without a resolution."""
 
     changes: dict[str, Value | None] = field(default_factory=dict)
+    combined: list[CombinedEntry] = field(default_factory=list)
+    """The entries in `changes` that have parts of both sides."""
     conflicts: list[MergeConflict] = field(default_factory=list)
     decided: set[str] = field(default_factory=set)
     """Keys of the resolutions that decided a conflict."""
@@ -78,11 +89,20 @@ def merge_entries(
 
 
 class _Decided(NamedTuple):
-    """Outcome for one entry: the entry of our side, and the merged entry that replaces it."""
+    """Outcome for one entry: the entries of both sides, and the merged entry that replaces ours."""
 
     base: DatasetEntry | None
     ours: DatasetEntry | None
+    theirs: DatasetEntry | None
     merged: DatasetEntry | None
+
+    @property
+    def combined(self) -> CombinedEntry | None:
+        """The merged entry, if it has parts of both sides."""
+        if self.merged is None or self.ours is None or self.theirs is None:
+            return None
+        known = [one.parts for one in (self.base, self.ours, self.theirs) if one is not None]
+        return None if self.merged.parts in known else CombinedEntry(self.merged, self.ours, self.theirs)
 
     @property
     def moves(self) -> bool:
@@ -98,22 +118,22 @@ def _decide(
     used: set[str],
 ) -> _Decided | MergeConflict:
     if theirs in (ours, base):
-        return _Decided(base, ours, ours)
+        return _Decided(base, ours, theirs, ours)
     if ours == base:
-        return _Decided(base, ours, theirs)
+        return _Decided(base, ours, theirs, theirs)
     clashes = _clashes(base, ours, theirs)
     if not clashes:
-        return _Decided(base, ours, _combined(base, ours, theirs))
+        return _Decided(base, ours, theirs, _combined(base, ours, theirs))
     conflict = MergeConflict(base, ours, theirs, clashes)
     choice = resolutions.get(conflict.key)
     if choice is None:
         return conflict
     used.add(conflict.key)
     if choice is Side.BASE:
-        return _Decided(base, ours, base)
+        return _Decided(base, ours, theirs, base)
     whole = "entry" in clashes or base is None
-    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(base, ours, theirs, choice)
-    return _Decided(base, ours, chosen)
+    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(base, ours, theirs, clashes, choice)
+    return _Decided(base, ours, theirs, chosen)
 
 
 def _apply(
@@ -145,17 +165,33 @@ def _apply(
         if one.moves:
             occupied[key] = one.merged
         merged.changes[key] = one.merged.value
+        if (combined := one.combined) is not None:
+            merged.combined.append(combined)
 
 
 def _clashes(base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None) -> tuple[str, ...]:
-    """Return the parts that both sides have changed in different ways."""
+    """Return the parts that both sides have changed in different ways.
+
+    Parts that one side has changed also clash if they are made from each other and the other side has changed the other
+    part: the sample tree of a model is not the tree of another model.
+    """
     if ours is None or theirs is None:
         return ("entry",)
-    of_base: Mapping[str, Any] = {} if base is None else base.parts
+    of_base: Mapping[str, str] = {} if base is None else base.parts
     names = sorted(of_base.keys() | ours.parts.keys() | theirs.parts.keys())
-    parts = [name for name in names if _excludes(of_base.get(name), ours.parts.get(name), theirs.parts.get(name))]
+    clashing = {name for name in names if _excludes(of_base.get(name), ours.parts.get(name), theirs.parts.get(name))}
+    for pair in _made_together(ours.kind):
+        if _excludes(*(tuple(parts.get(name) for name in pair) for parts in (of_base, ours.parts, theirs.parts))):
+            clashing.update(pair)
     moved = base is not None and _excludes(base.path, ours.path, theirs.path)
-    return (*(("path",) if moved else ()), *parts)
+    return (*(("path",) if moved else ()), *sorted(clashing))
+
+
+def _made_together(kind: str) -> Iterator[tuple[str, str]]:
+    """Return the pairs of parts of which one is made from the other."""
+    for name, spec in PARTS[Kind(kind)].items():
+        if spec.made_from is not None:
+            yield spec.made_from, name
 
 
 def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
@@ -163,7 +199,11 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
 
 
 def _combined(
-    base: DatasetEntry | None, ours: DatasetEntry | None, theirs: DatasetEntry | None, choice: Side = Side.OURS
+    base: DatasetEntry | None,
+    ours: DatasetEntry | None,
+    theirs: DatasetEntry | None,
+    clashes: Collection[str] = (),
+    choice: Side = Side.OURS,
 ) -> DatasetEntry | None:
     """Return the entry with the changes of both sides; where these exclude each other, `choice` decides."""
     if ours is None or theirs is None:
@@ -173,13 +213,14 @@ def _combined(
     parts = {
         name: digest
         for name in sorted(ours.parts.keys() | theirs.parts.keys())
-        if (digest := _newer(of_base.get(name), preferred.parts.get(name), other.parts.get(name))) is not None
+        if (digest := _newer(name in clashes, of_base.get(name), preferred.parts.get(name), other.parts.get(name)))
+        is not None
     }
-    path = preferred.path if base is None else _newer(base.path, preferred.path, other.path)
+    path = preferred.path if base is None else _newer("path" in clashes, base.path, preferred.path, other.path)
     old = set() if base is None else set(base.tags)
     tags = (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))
     return DatasetEntry(path or preferred.path, ours.kind, parts, tuple(sorted(tags)))
 
 
-def _newer(base: str | None, preferred: str | None, other: str | None) -> str | None:
-    return preferred if preferred != base else other
+def _newer(clash: bool, base: str | None, preferred: str | None, other: str | None) -> str | None:
+    return preferred if clash or preferred != base else other

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,6 +25,8 @@ from marey_server.store import quotas
 from marey_server.store.blobs import digest_of, read_blob
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import schema_at_head
+from marey_server.store.datasets.chunks import StoredChunks
+from marey_server.store.datasets.history import revisions_with
 from marey_server.store.items.summaries import summarise
 from marey_server.store.tables import (
     blob,
@@ -45,7 +48,7 @@ from marey_server.store.tables import (
     user,
 )
 from marey_server.store.transaction import Transaction
-from marey_versions.records import CommitRecord
+from marey_versions.records import CommitRecord, entry_of
 from marey_versions.tree.chunks import Branch, DamagedChunk, decode
 
 PAGE = 100
@@ -279,7 +282,31 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         record = CommitRecord(one.tree, tuple(parents.get(one.digest, ())), one.author, one.message, one.at)
         if record.digest != one.digest:
             findings.append(StoreDefect("commit-corrupt", row.id, f"the commit {one.digest} has another digest"))
-    return findings + _check_proposals(tx, row)
+    return findings + _check_entries(tx, row) + _check_proposals(tx, row)
+
+
+def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
+    """Check that the project has a revision with the content of each entry of each version."""
+    trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
+    waiting = set(tx.execute(trees).scalars())
+    seen: set[str] = set()
+    entries: dict[str, str] = {}
+    while waiting:
+        seen |= waiting
+        found = StoredChunks(tx).load(waiting)
+        waiting = set()
+        for digest, data in found.items():
+            with suppress(DamagedChunk):  # which `_check_chunk` reports
+                chunk = decode(digest, data)
+                if isinstance(chunk, Branch):
+                    waiting |= {child.digest for child in chunk.children} - seen
+                else:
+                    entries |= {(one := entry_of(*entry)).content: one.path for entry in chunk.entries}
+    lacking = entries.keys() - revisions_with(tx, row.project_id, entries).keys()
+    return [
+        StoreDefect("entry-lost", row.id, f"no revision has the content {content} of {entries[content]!r}")
+        for content in sorted(lacking)
+    ]
 
 
 def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk, document
+from tests.support.store_fixtures import skeleton_tree
 
 from marey_schemas.access import MemberChange, Role, UserCreate
 from marey_schemas.datasets.commits import CommitCreate, PutEntry, RemoveEntry
@@ -20,6 +21,7 @@ from marey_schemas.queue.worker_protocol import BatchCompletion, StagedOutput
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ConflictProblem, ForbiddenProblem, InvalidProblem, LeaseLostProblem
 from marey_server.store import datasets, events, fsck, items, members, users
+from marey_server.store.items.drafts import Draft
 from marey_server.store.jobs import commits, completion, reading, retrying, staging
 from marey_server.store.retention import Retention, retire
 
@@ -127,6 +129,32 @@ def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) 
     assert gaits.job(second).publish_conflict is None
     (entry,) = gaits.read(datasets.list_entries, "lab", "gaits", "main", path="", cursor=None, limit=10).items
     assert (entry.tags, entry.revision) == (("seen",), 2)
+
+
+def test_an_entry_with_parts_of_the_job_and_of_somebody_else_has_a_revision(gaits: CommittingDesk) -> None:
+    """The job adds a mapping while somebody changes the bones; no item has both before the commit stores them."""
+    hierarchies = [skeleton_tree(2, bone_m=bone_m) for bone_m in (0.5, 0.6)]
+    (rig,) = gaits.desk.publish(Draft("d", Kind.SKELETON, "rig", {"hierarchy": hierarchies[0]}, "own"))
+    gaits.change(PutEntry(path="made/rig", item=rig.item))
+    made = gaits.submit("rig", into="made")
+    gaits.desk.publish(Draft("d", Kind.SKELETON, "rig", {"hierarchy": hierarchies[1]}, "own"))
+    gaits.change(PutEntry(path="made/rig", item=rig.item))
+    (theirs,) = gaits.listed()
+    parts = {"hierarchy": hierarchies[0], "mapping": {"schema": "marey/skeleton-mapping@1", "joints": {"j0": "hips"}}}
+    lease = gaits.desk.claim()
+    gaits.desk.stage_outputs(lease, StagedOutput(name="rig", kind=Kind.SKELETON, item_name="rig", parts=parts))
+    gaits.desk.complete(lease)
+    assert gaits.job(made).publish_conflict is None
+    (entry,) = gaits.listed()
+    (output,) = gaits.desk.outputs(made)
+    assert entry.item not in (None, rig.item, output.item)
+    digests = {
+        part: gaits.read(items.find_part, "lab", Kind.SKELETON, item, part, revision=revision).digest
+        for part, item, revision in [("hierarchy", rig.item, 2), ("mapping", output.item, output.revision)]
+    }
+    assert entry.parts == digests
+    assert entry.parts["hierarchy"] == theirs.parts["hierarchy"]
+    assert list(fsck.check_store(gaits.desk.database)) == []
 
 
 # -- once, or not at all ----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.tiers import examples
@@ -106,6 +107,61 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
             for part in one.parts:
                 if part in one.after.parts:
                     assert (part, one.after.parts[part]) in kept
+
+
+@settings(max_examples=examples(1000), deadline=None)
+@given(states, states, states, st.none() | st.sampled_from(Side))
+def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
+    base: State, ours: State, theirs: State, take: Side | None
+) -> None:
+    """Nobody has stored the content of a combined entry yet."""
+    _, undecided = merge(base, ours, theirs)
+    resolutions = {one.key: take for one in undecided.conflicts} if take else {}
+    result, merged = merge(base, ours, theirs, resolutions)
+    of_sides = [value["parts"] for side in (base, ours, theirs) for value in side.values()]
+    combined = {one.entry.key: one for one in merged.combined}
+    for key, value in result.items():
+        assert value["parts"] in of_sides or combined[key].entry.value == value
+    for one in combined.values():
+        assert all(
+            digest in (one.ours.parts.get(part), one.theirs.parts.get(part)) for part, digest in one.entry.parts.items()
+        )
+
+
+def model(model: str, tree: str | None, report: str | None = None) -> Value:
+    made = {"tree": tree, "report": report}
+    return {"parts": {"model": model} | {part: digest for part, digest in made.items() if digest}, "tags": []}
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "parts"),
+    [
+        (model("2", "1"), model("1", "2"), ["model", "tree"]),
+        (model("1", "2"), model("2", "1"), ["model", "tree"]),
+        (model("2", None), model("1", "2"), ["model", "tree"]),
+        (model("2", "2"), model("1", "1", "1"), ["model", "report"]),
+        (model("2", "1"), model("3", "1"), ["model"]),
+    ],
+)
+def test_a_part_is_not_combined_with_another_version_of_what_it_was_made_from(
+    ours: Value, theirs: Value, parts: list[str]
+) -> None:
+    key = key_of("a", "model")
+    sides = {key: model("1", "1")}, {key: ours}, {key: theirs}
+    _, merged = merge(*sides)
+    assert set(parts) <= {part for one in merged.conflicts for part in one.parts}
+    for side, value in ((Side.OURS, ours), (Side.THEIRS, theirs)):
+        assert (
+            merge(*sides, {key: side})[0][key]["parts"].items()
+            >= {part: value["parts"][part] for part in parts if part in value["parts"]}.items()
+        )
+
+
+def test_parts_that_were_made_from_one_model_are_combined() -> None:
+    key = key_of("a", "model")
+    result, merged = merge({key: model("1", "1")}, {key: model("1", "2")}, {key: model("1", "1", "2")})
+    assert result == {key: model("1", "2", "2")}
+    assert [one.entry.key for one in merged.combined] == [key]
 
 
 def test_renames_are_recognised_by_content() -> None:

@@ -107,8 +107,18 @@ class _Checkout:
             self._add(one, documents)
 
     def _documents(self, entries: Iterable[DatasetEntry]) -> dict[str, tuple[str, Mapping[str, str]]]:
-        """Return, for each content digest, an item and the documents of its revision with this content."""
-        held = revisions_with(self.tx, self.project.id, {entry.content for entry in entries})
+        """Return, for each content digest, an item and the documents of its revision with this content.
+
+        Raises `InvalidProblem` if the project does not have the content of an entry.
+        """
+        wanted = {entry.content: entry for entry in entries}
+        held = revisions_with(self.tx, self.project.id, wanted)
+        if lacking := sorted(wanted[content].path for content in wanted.keys() - held.keys()):
+            raise InvalidProblem(
+                f"The project has no item with the content of {counted(len(lacking), 'entry')} of the version, the "
+                f"first at {lacking[0]!r}. Commit another content to this path, or check out another version.",
+                code="no-content",
+            )
         parts = read_part_digests(self.tx, set(held.values()))
         return {content: (key[0], parts[key]) for content, key in held.items()}
 

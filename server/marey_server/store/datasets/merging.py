@@ -155,7 +155,8 @@ def _combine(
         }
     )
     entries = len(Tree(store, tree))
-    return PreparedMerge(answer, replace(commit, tree=tree, entries=entries, chunks=store.new))
+    commit = replace(commit, tree=tree, entries=entries, chunks=store.new, combined=merged.combined)
+    return PreparedMerge(answer, commit)
 
 
 def record_merge(

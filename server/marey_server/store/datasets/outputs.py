@@ -25,6 +25,8 @@ from marey_server.store.datasets.committing import PreparedCommit, insert_commit
 from marey_server.store.datasets.history import tree_of
 from marey_server.store.datasets.naming import MOST_REFS, find_ref, is_tag, new_ref
 from marey_server.store.datasets.protection import Mover, require_move
+from marey_server.store.datasets.revisions import store_combined
+from marey_server.store.projects import find_by_id
 from marey_server.store.tables import collection, dataset, dataset_commit, dataset_ref, item
 from marey_server.store.transaction import IN_LIST, Transaction
 from marey_versions.compared import ComparedEntry
@@ -54,6 +56,8 @@ class OutputEntries:
     """The revisions from which the entries were made, by key."""
     message: str
     job_id: str
+    author_id: str | None
+    """Author of the job."""
     replaced: str | None = None
     """Folder whose other entries are removed; None: nothing is removed."""
     kinds: Collection[str] = ()
@@ -105,6 +109,7 @@ def commit_outputs(tx: Transaction, wanted: OutputEntries, mover: Mover) -> Comm
     if tree == head:
         return CommittedOutputs()
     parents = () if ref.digest is None else (ref.digest,)
+    _store_combined(tx, wanted, merged)
     digest = _record(tx, wanted, mover, store, tree, parents)
     prepared = PreparedCommit(wanted.dataset_id, wanted.branch, ref.digest, parents, wanted.message, None)
     move_branch_to(tx, prepared, digest, mover)
@@ -173,6 +178,19 @@ def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> Compar
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
+def _store_combined(tx: Transaction, wanted: OutputEntries, merged: MergedEntries) -> None:
+    """Store the revisions of the entries of which the job and somebody else have changed different parts."""
+    if merged.combined:
+        folder = tx.execute(_FOLDER.where(dataset.c.id == wanted.dataset_id)).scalar()
+        store_combined(
+            tx, find_by_id(tx, wanted.project_id), folder, merged.combined, wanted.message,
+            author_id=wanted.author_id, job_id=wanted.job_id,
+        )  # fmt: skip
+
+
+_FOLDER = select(collection.c.path).join(dataset, dataset.c.collection_id == collection.c.id)
+
+
 def _record(
     tx: Transaction, wanted: OutputEntries, mover: Mover, store: StoredChunks, tree: str, parents: Sequence[str]
 ) -> str:
@@ -235,11 +253,8 @@ def _follow_in_folder(
     This is so if the folder followed the commit before, and each changed entry is the newest revision of an item at
     its path in the folder. Otherwise the folder is checked out first.
     """
-    folder = tx.execute(
-        select(collection.c.path)
-        .join(dataset, dataset.c.collection_id == collection.c.id)
-        .where(dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(before))
-    ).scalar()
+    followed = (dataset.c.id == wanted.dataset_id, dataset.c.folder_commit.is_not_distinct_from(before))
+    folder = tx.execute(_FOLDER.where(*followed)).scalar()
     if folder is None or not _is_in_folder(tx, folder, wanted, changes):
         return
     tx.execute(update(dataset).where(dataset.c.id == wanted.dataset_id).values(folder_commit=digest))

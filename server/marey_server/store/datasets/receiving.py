@@ -1,8 +1,7 @@
 """Versions from archives and other servers: their revisions and commits, which keep their digests.
 
-Every received revision belongs to an item. For a revision that is the content of an entry, a new item is created and
-deleted at once, so that no folder changes; a checkout restores this item at the path of the entry. For other revisions,
-such as the skeleton of clips, an item is created in the folder `IMPORTED`.
+The items of revisions that are the content of entries are in no folder. Those of other revisions, such as the skeleton
+of clips, are in the folder `IMPORTED`.
 """
 
 from __future__ import annotations
@@ -15,15 +14,14 @@ from sqlalchemy import Row, select
 
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.contents import ReceivedCommit, ReceivedRevision, StoredRevisions
-from marey_schemas.wording import counted
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items, projects
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import PreparedCommit, author_of, head_of, insert_commit, move_branch_to
-from marey_server.store.datasets.contents import find_contents_of, store_contents
 from marey_server.store.datasets.history import read_commit, revisions_with, tree_of
 from marey_server.store.datasets.naming import find_dataset
 from marey_server.store.datasets.protection import Mover
+from marey_server.store.datasets.revisions import item_name, publish_contents, require_contents
 from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import Draft, StoredDocument
 from marey_server.store.items.revisions import read_part_digests
@@ -35,10 +33,6 @@ from marey_versions.tree.building import build
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.editing import change
 from marey_versions.tree.reading import Tree
-
-MISSING_CONTENTS = "missing-contents"
-"""Code of the error for revisions that the project does not have; `context.contents` lists their digests."""
-
 
 IMPORTED = "imported"
 """Folder of the items of revisions that are not entries, with one folder for each kind."""
@@ -58,7 +52,7 @@ def find_local(tx: Transaction, project: str, received: Sequence[ReceivedRevisio
     project_row = projects.require(tx, project)
     wanted = {content for one in received for content in contents_in(one.parts)}
     found = revisions_with(tx, project_row.id, wanted | {one.content for one in received})
-    _require_all(wanted - found.keys())
+    require_contents(wanted - found.keys())
     parts = read_part_digests(tx, set(found.values()))
     held = {content: RevisionKey(*key) for content, key in found.items()}
     return LocalRevisions(held, {content: parts[key] for content, key in held.items()})
@@ -76,10 +70,9 @@ def _draft(one: ReceivedRevision, local: LocalRevisions) -> Draft:
             parts[part] = StoredDocument(_stored(one, part, str(tree["content"]), local))
         else:
             parts[part] = items.prepare_part(one.kind, part, local_document(tree, local.held.get))
-    shown = one.kind.value if one.path is None else one.path.rpartition("/")[2][:200]
     return Draft(
         name_in_batch=one.content, kind=one.kind, parts=dict(parts), reuse="new",
-        item_name=f"{shown} {one.content.removeprefix('sha256:')[:12]}",
+        item_name=item_name(one.path or one.kind.value, one.content),
         collection="" if one.path is not None else f"{IMPORTED}/{one.kind.plural}",
     )  # fmt: skip
 
@@ -88,7 +81,8 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
     digest = local.documents.get(content, {}).get(part)
     if digest is None:
         raise InvalidProblem(
-            f"The request takes the part {part!r} of {one.path!r} from the revision {content}, which has no such part.",
+            f"The request takes the part {part!r} of the {one.kind} {one.path or one.content!r} from the revision "
+            f"{content}, which has no such part.",
             code="no-part",
         )
     return digest
@@ -97,33 +91,18 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
 def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
     """Store received revisions; `drafts` maps the content digest of each to its draft.
 
-    The items of revisions that are the content of entries are deleted at once (see the module). Raises `InvalidProblem`
-    if the content digest of a stored revision is not the one that the request gives.
+    The items of revisions that are the content of entries are deleted at once. Raises `InvalidProblem` if the content
+    digest of a stored revision is not the one that the request gives.
     """
     project_row = projects.require(tx, project)
     folder = find_dataset(tx, project_row, name).path or ""
-    lacking = drafts.keys() - revisions_with(tx, project_row.id, drafts).keys()
-    of_entries = {content for content in lacking if not drafts[content].collection}
-    chosen = [
-        replace(draft, collection=folder) if content in of_entries else draft
+    of_entries = {content for content, draft in drafts.items() if not draft.collection}
+    placed = {
+        content: replace(draft, collection=folder) if content in of_entries else draft
         for content, draft in drafts.items()
-        if content in lacking
-    ]
-    made = items.publish(tx, project_row, chosen, author_id=tx.principal.user_id, refer_to_deleted=True)
-    keys = {one.name: RevisionKey(one.item, one.revision) for one in made}
-    contents = find_contents_of(tx, keys.values())
-    for content, key in keys.items():
-        if contents.revisions[key] != content:
-            raise InvalidProblem(
-                f"According to the request, a revision has the content digest {content}, but the documents of this "
-                f"revision have the content digest {contents.revisions[key]}.",
-                code="other-content",
-            )
-    store_contents(tx, contents)
-    for one in made:
-        if one.name in of_entries:
-            items.delete_item(tx, project, one.kind, one.item, expected_rev=None)
-    return StoredRevisions(added=len(made))
+    }
+    added = publish_contents(tx, project_row, placed, of_entries, author_id=tx.principal.user_id)
+    return StoredRevisions(added=added)
 
 
 @dataclass(frozen=True)
@@ -149,7 +128,7 @@ def prepare_receipt(tx: Transaction, project: str, name: str, request: ReceivedC
     _require_parents(tx, found, record)
     changes = {key_of(one.path, one.kind): _value(one.parts, one.tags) for one in request.changes}
     contents = {revision_content(one.kind, one.parts) for one in request.changes if one.parts is not None}
-    _require_all(contents - revisions_with(tx, project_row.id, contents).keys())
+    require_contents(contents - revisions_with(tx, project_row.id, contents).keys())
     store = StoredChunks(tx)
     before = tree_of(tx, found.id, record.parents[0]) if record.parents else build(store, ())
     tree = change(store, before, changes)
@@ -211,13 +190,3 @@ def _known(tx: Transaction, found: Row[Any], digests: Sequence[str]) -> set[str]
     """Return those of `digests` that are commits of a dataset."""
     of_dataset = (dataset_commit.c.dataset_id == found.id, dataset_commit.c.digest.in_(digests))
     return set(tx.execute(select(dataset_commit.c.digest).where(*of_dataset)).scalars())
-
-
-def _require_all(missing: Iterable[str]) -> None:
-    """Raise `ConflictProblem` if revisions are missing."""
-    if lacking := sorted(missing):
-        raise ConflictProblem(
-            f"The project lacks {counted(len(lacking), 'revision')} that the request refers to; send them first.",
-            code=MISSING_CONTENTS,
-            context={"contents": lacking[:1000]},
-        )

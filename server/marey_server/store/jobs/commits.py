@@ -244,7 +244,7 @@ def _entries_of(tx: Transaction, row: Any, outputs: Sequence[Mapping[str, Any]])
         entries[entry.key], revisions[entry.key] = entry, _revision(one)
     return OutputEntries(
         dataset_id=target["dataset_id"], project_id=row.project_id, branch=target["branch"], base=target["base"],
-        entries=entries, revisions=revisions, message=_message(row), job_id=row.id,
+        entries=entries, revisions=revisions, message=_message(row), job_id=row.id, author_id=row.author_id,
         replaced=_entry_folder(target, row.into_path) if target["replace"] else None, kinds=target["kinds"],
     )  # fmt: skip
 

@@ -1,0 +1,103 @@
+"""Revisions that entries need and no item has, because another server sent them or a merge combined them.
+
+Each gets a new item, which is deleted at once, so that no folder changes; a checkout restores the item at the path of
+its entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
+from marey_server.errors import ConflictProblem, InvalidProblem
+from marey_server.store import items
+from marey_server.store.datasets.contents import find_contents_of, store_contents
+from marey_server.store.datasets.history import revisions_with
+from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.projects import ProjectRow
+from marey_server.store.transaction import Transaction
+from marey_versions.merging import CombinedEntry
+from marey_versions.records import RevisionKey
+
+MISSING_CONTENTS = "missing-contents"
+"""Code of the error for revisions that the project does not have; `context.contents` lists their digests."""
+LONGEST_NAME = 200
+"""Greatest number of characters of a path's last name that the name of a new item begins with."""
+
+
+def require_contents(missing: Iterable[str]) -> None:
+    """Raise `ConflictProblem` if content digests are `missing` from the project."""
+    if lacking := sorted(missing):
+        raise ConflictProblem(
+            f"The project lacks {counted(len(lacking), 'revision')} that the request refers to; send them first.",
+            code=MISSING_CONTENTS,
+            context={"contents": lacking[:1000]},
+        )
+
+
+def item_name(shown: str, content: str) -> str:
+    """Return the name of a new item from a path or another text and its content digest."""
+    return f"{shown.rpartition('/')[2][:LONGEST_NAME]} {content.removeprefix('sha256:')[:12]}"
+
+
+def publish_contents(
+    tx: Transaction,
+    project_row: ProjectRow,
+    drafts: Mapping[str, Draft],
+    hidden: Collection[str],
+    *,
+    author_id: str | None,
+    job_id: str | None = None,
+) -> int:
+    """Publish drafts by their content digests, and delete the items of those in `hidden`; return how many were new.
+
+    Drafts whose content the project has already are left out. Raises `InvalidProblem` if the content digest of a
+    revision is not the one under which `drafts` has it.
+    """
+    held = revisions_with(tx, project_row.id, drafts)
+    lacking = [draft for content, draft in drafts.items() if content not in held]
+    made = items.publish(tx, project_row, lacking, author_id=author_id, job_id=job_id, refer_to_deleted=True)
+    keys = {one.name: RevisionKey(one.item, one.revision) for one in made}
+    contents = find_contents_of(tx, keys.values())
+    for content, key in keys.items():
+        if contents.revisions[key] != content:
+            raise InvalidProblem(
+                f"According to the request, a revision has the content digest {content}, but the documents of this "
+                f"revision have the content digest {contents.revisions[key]}.",
+                code="other-content",
+            )
+    store_contents(tx, contents)
+    for one in made:
+        if one.name in hidden:
+            items.hide_item(tx, project_row, one.kind, one.item)
+    return len(made)
+
+
+def store_combined(
+    tx: Transaction,
+    project_row: ProjectRow,
+    folder: str | None,
+    combined: Sequence[CombinedEntry],
+    message: str,
+    *,
+    author_id: str | None,
+    job_id: str | None = None,
+) -> None:
+    """Store the revisions of entries that have parts of both sides of a merge, unless the project has them already."""
+    sides = {side.content for one in combined for side in (one.ours, one.theirs)}
+    held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, sides).items()}
+    require_contents(sides - held.keys())
+    documents = read_part_digests(tx, set(held.values()))
+    drafts: dict[str, Draft] = {}
+    for entry, ours, theirs in combined:
+        parts = {}
+        for part, digest in entry.parts.items():
+            side = ours if ours.parts.get(part) == digest else theirs
+            parts[part] = StoredDocument(documents[held[side.content]][part])
+        drafts[entry.content] = Draft(
+            name_in_batch=entry.content, kind=Kind(entry.kind), parts=dict(parts), reuse="new", message=message,
+            item_name=item_name(entry.path, entry.content), collection=folder or "",
+        )  # fmt: skip
+    publish_contents(tx, project_row, drafts, drafts.keys(), author_id=author_id, job_id=job_id)
