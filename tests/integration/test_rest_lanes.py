@@ -48,6 +48,21 @@ def test_heartbeats_claims_readiness_and_callers_do_not_wait_behind_reads(server
     }  # fmt: skip
 
 
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_readiness_takes_a_reserved_turn(server: Server, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[bool] = []
+    turns = server.app.services.turns
+    take = turns.take
+
+    def note(client: Client, *, reserved: bool) -> Any:
+        taken.append(reserved)
+        return take(client, reserved=reserved)
+
+    monkeypatch.setattr(turns, "take", note)
+    assert httpx.request(method, f"{server.address}/readyz", timeout=PATIENCE_S).status_code == 200
+    assert taken == [True]
+
+
 def test_documents_are_rendered_after_their_transactions(
     server: Server, owner: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:

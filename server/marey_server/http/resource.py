@@ -205,7 +205,7 @@ class Resource(CallingExchange):
 
     def _turn(self) -> asyncio.Future[None] | None:
         """Return what the request must wait for before anything of it is checked, or None."""
-        operation = self.operations.get(self.request.method or "")
+        operation = self._declared()
         token = None
         with suppress(UnauthenticatedProblem):
             token = negotiation.bearer_token(self.request.headers.get("Authorization"))
@@ -232,9 +232,13 @@ class Resource(CallingExchange):
             await asyncio.wrap_future(self.services.database.queue_read(self.client, ANONYMOUS, check, reserved=True))
             self.services.admitted.put(admission, now)
 
-    def _check_head(self) -> None:
+    def _declared(self) -> Operation | None:
+        """Return the declaration of the method, or None without one; HEAD is declared as GET."""
         method = "GET" if self.request.method == "HEAD" else self.request.method
-        operation = self.operations.get(method or "")
+        return self.operations.get(method or "")
+
+    def _check_head(self) -> None:
+        operation = self._declared()
         if operation is None:
             raise self.method_not_allowed()
         self.operation = operation
