@@ -27,6 +27,8 @@ READY = b"ready"
 READY_S = 300.0
 """Longest wait in seconds for `READY`; after an installation, the child may have to compile its modules first."""
 TERMINATE_S = 10.0
+WAIT_EVERY_S = 0.005
+"""Time in seconds between two looks at whether a process that is waited for has ended."""
 MOST_MESSAGE_BYTES = 1 << 30
 ONE_DESCRIPTOR = b"\x01"
 """Number of descriptors in a message, as `multiprocessing.reduction.recv_handle` expects it."""
@@ -158,6 +160,7 @@ class ChildProcess(ConnectedChild):
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, threads: int, at_most: bool = False) -> None:
         """Start the process; with `at_most`, settings of numeric libraries cannot allow it more than `threads`."""
+        self._reaping = threading.Lock()
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
@@ -177,15 +180,46 @@ class ChildProcess(ConnectedChild):
     @property
     def alive(self) -> bool:
         """Whether the process is running."""
-        return self._process.poll() is None
+        return self._status() is None
 
     def wait(self) -> int:
         """Return the exit status of the process; a negative number is a signal."""
-        return self._process.wait()
+        while (status := self._status()) is None:
+            time.sleep(WAIT_EVERY_S)
+        return status
 
     def close(self) -> None:
         """Kill the process at once."""
         self.kill(grace_s=0.0)
+
+    def _status(self) -> int | None:
+        """Return the exit status of the process, and None while it is running.
+
+        On Linux, an ended process keeps its number until `_close`, so that its descendants can still be killed.
+        """
+        with self._reaping:
+            if sys.platform == "linux" and self._process.returncode is None:
+                return exit_status(self.pid)
+            return self._process.poll()
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Send a signal to the session of the process, unless its number may belong to another process by now."""
+        with self._reaping:
+            if self._process.returncode is None:
+                super()._signal(number)
+
+    def _close(self) -> None:
+        super()._close()
+        with self._reaping:
+            self._process.wait()
+
+
+def exit_status(pid: int) -> int | None:
+    """Return the exit status of a child that has ended, and None otherwise; the number of the child stays in use."""
+    ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if ended is None:
+        return None
+    return ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
 
 
 def connect_to_parent() -> Connection:

@@ -24,7 +24,14 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import recv_handle
 from queue import SimpleQueue
 
-from marey_schemas.processes.child_process import READY, TERMINATE_S, ChildBroken, ChildProcess, ConnectedChild
+from marey_schemas.processes.child_process import (
+    READY,
+    TERMINATE_S,
+    ChildBroken,
+    ChildProcess,
+    ConnectedChild,
+    exit_status,
+)
 from marey_schemas.processes.limits import die_with_parent
 
 FORKS = sys.platform == "linux"
@@ -238,7 +245,7 @@ def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None
             except EOFError:
                 return
         for pid in [*running]:
-            if (status := _exit_status(pid)) is not None:
+            if (status := exit_status(pid)) is not None:
                 running.discard(pid)
                 pipe.send_bytes(_NUMBER_AND_STATUS.pack(pid, status))
 
@@ -265,14 +272,6 @@ def _carry_out(
             _run_child(serve, connected, (pipe, *others))
     pipe.send_bytes(_NUMBER_AND_STATUS.pack(pid, STARTED))
     return {pid} - {NO_CHILD}
-
-
-def _exit_status(pid: int) -> int | None:
-    """Return the exit status of a child that has ended, and None otherwise; the number of the child stays in use."""
-    ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    if ended is None:
-        return None
-    return ended.si_status if ended.si_code == os.CLD_EXITED else -ended.si_status
 
 
 def _run_child(

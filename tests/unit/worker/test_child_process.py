@@ -2,8 +2,10 @@
 
 import os
 import signal
+import sys
 import threading
 
+import psutil
 import pytest
 
 from marey_schemas.processes.child_process import ChildProcess
@@ -28,3 +30,37 @@ def test_killing_a_child_ends_the_sending_of_a_message_that_it_does_not_read(chi
     child.kill(grace_s=0.0)
     sending.join(60)
     assert not sending.is_alive()
+
+
+@pytest.fixture
+def in_use(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """For each signal that was sent: whether its number still belonged to a child of this process."""
+    found: list[bool] = []
+    send = os.killpg
+
+    def note(number: int, sent: signal.Signals) -> None:
+        found.append(number in {child.pid for child in psutil.Process().children()})
+        send(number, sent)
+
+    monkeypatch.setattr(os, "killpg", note)
+    return found
+
+
+def test_a_child_that_was_killed_gets_no_further_signal(child: ChildProcess, in_use: list[bool]) -> None:
+    """Its number may belong to another process by then."""
+    child.kill(grace_s=0.0)
+    in_use.clear()
+    child.kill(grace_s=0.0)
+    child.abort()
+    assert in_use == []
+
+
+def test_a_child_that_ended_by_itself_is_signalled_only_while_its_number_is_its_own(
+    child: ChildProcess, in_use: list[bool]
+) -> None:
+    os.kill(child.pid, signal.SIGKILL)
+    assert child.wait() == -signal.SIGKILL
+    assert not child.alive
+    child.kill()
+    assert in_use == ([True] if sys.platform == "linux" else [])  # there, descendants may still have to be killed
+    assert child.wait() == -signal.SIGKILL
