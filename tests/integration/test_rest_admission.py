@@ -1,6 +1,8 @@
 """Bodies of callers who may not send them: refused before any of their bytes is decoded."""
 
+import gc
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from tests.support.rest_server import PATIENCE_S, Server, running
 from marey_schemas.access import Role
 from marey_schemas.encoding import blocks
 from marey_server.access.principal import SYSTEM
-from marey_server.http.resource import GUEST_BODY_BYTES
+from marey_server.http.resource import GUEST_BODY_BYTES, Resource
 from marey_server.store.database.connections import Database
 from marey_server.store.database.lanes import SERVER
 
@@ -127,3 +129,24 @@ def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_
     assert client.post("/logout").status_code == 204
     answer = client.post("/projects/lab/collections", json={"path": "after"})
     assert (answer.status_code, answer.json()["code"]) == (401, "bad-token")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b'{"name": "x", "password": ', b'{"name": 1}', b'{"name": "nobody", "password": "wrong wrong wrong"}'],
+    ids=["malformed", "invalid", "refused"],
+)
+@pytest.mark.parametrize("path", ["/login", "/projects/lab/clips", "/nowhere"])
+def test_a_refused_request_leaves_nothing_for_the_garbage_collector(server: Server, path: str, body: bytes) -> None:
+    """The collector stops all threads, the longer the more requests wait for it."""
+    client = server.client(server.make_project())
+    gc.collect()
+    gc.disable()
+    try:
+        assert client.post(path, content=body, headers={"Content-Type": "application/json"}).is_client_error
+        deadline = time.monotonic() + PATIENCE_S
+        while any(issubclass(type(one), Resource) for one in gc.get_objects()):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        gc.enable()

@@ -71,8 +71,8 @@ class CallingExchange(Exchange):
 
     def _client_with(self, token: str | None) -> Client:
         if token is not None and self.services.knows(token):
-            return Client(hash_secret(token), is_gone=self.is_gone)
-        return Client(limited_address(self.client_address), known=False, is_gone=self.is_gone)
+            return Client(hash_secret(token), is_gone=self.departure)
+        return Client(limited_address(self.client_address), known=False, is_gone=self.departure)
 
     async def compute(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run `function` in a thread, away from the event loop, and return its result."""
@@ -95,7 +95,7 @@ class CallingExchange(Exchange):
 
         If the client closes the connection, the child is killed and `ClientGoneProblem` is raised.
         """
-        if self._gone:
+        if self.departure.gone:
             raise ClientGoneProblem(CLIENT_GONE)
         count_stop = self.services.metrics.count_stopped_child
         task = self.services.children.submit(self._child_user, function, make, read, count_stop)
@@ -104,7 +104,7 @@ class CallingExchange(Exchange):
             return await asyncio.wrap_future(task.future)
         except asyncio.CancelledError:
             task.abandon()
-            if self._gone:
+            if self.departure.gone:
                 raise ClientGoneProblem(CLIENT_GONE) from None
             raise
         finally:

@@ -40,6 +40,18 @@ _SECURITY_HEADERS = {
 log = logging.getLogger(__name__)
 
 
+class Departure:
+    """Whether the client of a request has closed the connection; a call returns the answer.
+
+    It does not refer to the request, which refers to it: circles of references are freed only by the garbage collector.
+    """
+
+    gone = False
+
+    def __call__(self) -> bool:
+        return self.gone
+
+
 class Exchange(RequestHandler):
     """HTTP request and its answer."""
 
@@ -53,7 +65,8 @@ class Exchange(RequestHandler):
         self.set_header("X-Request-Id", self.request_id)
         self.received_bytes = 0
         self.problem_code: str | None = None
-        self.refused = self.performing = self._gone = False
+        self.refused = self.performing = False
+        self.departure = Departure()
 
     @classmethod
     def template(cls) -> str:
@@ -135,13 +148,9 @@ class Exchange(RequestHandler):
         """The stream of the request's connection, by which `Connections` identifies it."""
         return self.request.connection.stream  # type: ignore[union-attr]
 
-    def is_gone(self) -> bool:
-        """Return whether the client has closed the connection."""
-        return self._gone
-
     def is_awaited(self) -> bool:
         """Return whether the client is still connected and the server is not stopping."""
-        return not self._gone and not self.services.draining.is_set()
+        return not self.departure.gone and not self.services.draining.is_set()
 
     async def pause(self, seconds: float) -> bool:
         """Wait for a time; if the server is stopping, return True at once."""
@@ -213,7 +222,7 @@ class Exchange(RequestHandler):
     def on_connection_close(self) -> None:
         """Note that the client has closed the connection."""
         super().on_connection_close()
-        self._gone = True
+        self.departure.gone = True
         if not self.performing:  # a method that runs ends by itself, and a draining server waits for it
             self.services.in_flight.discard(self)
 
