@@ -1,0 +1,79 @@
+"""Tables of users, tokens, projects, and who may do what in them."""
+
+from sqlalchemy import BigInteger, Boolean, Column, ForeignKey, Index, Integer, String, Table, Text, false, text
+
+from marey_server.store.tables.columns import ID, Document, Micros, metadata, unique_alive
+
+user = Table(
+    "user",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("name", String(64), nullable=False, unique=True),
+    Column("display_name", String(255)),
+    Column("password_hash", Text),
+    Column("administrator", Boolean, nullable=False, default=False),
+    Column("disabled", Boolean, nullable=False, default=False),
+    Column("created_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+)
+
+token = Table(
+    "token",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), nullable=False, index=True),
+    Column("name", String(255), nullable=False),
+    Column("prefix", String(16), nullable=False, unique=True),
+    Column("secret_hash", String(64), nullable=False),
+    Column("scopes", Document, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("expires_us", Micros),
+    Column("last_used_us", Micros),
+    Column("session", Boolean, nullable=False, default=False, server_default=false()),  # made by a sign-in
+    Column("created_by", ID),  # the token whose bearer created it
+    Column("labels", Document),  # that its workers may announce; null: any
+    Column("rotation_hash", String(64)),  # hash of the id of the rotation that replaced it
+    Column("successor_of", ID),  # the token that it replaced
+    Index("uq_token_successor_of", "successor_of", unique=True),
+)
+
+sign_in_limit = Table(  # sign-ins, and other things that are limited in the same way
+    "sign_in_limit",
+    metadata,
+    Column("key", String(64), primary_key=True),  # hash of a limit's name, and of what it is for
+    Column("until_us", Micros, nullable=False, index=True),  # from then on the row says nothing
+)
+
+project = Table(
+    "project",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("name", String(64), nullable=False),
+    Column("title", String(255)),
+    Column("description", Text, nullable=False, default=""),
+    Column("visibility", String(16), nullable=False),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    unique_alive("project", "name"),
+)
+
+holding = Table(  # what a project or a user holds, and limits other than those of the settings
+    "holding",
+    metadata,
+    Column("owner_id", ID, primary_key=True),  # of a project, or of a user
+    Column("items", BigInteger, nullable=False, default=0, server_default=text("0")),
+    Column("stored_bytes", BigInteger, nullable=False, default=0, server_default=text("0")),
+    Column("limits", Document, nullable=False),  # by the name of the quota
+)
+
+member = Table(
+    "member",
+    metadata,
+    Column("project_id", ID, ForeignKey("project.id"), primary_key=True),
+    Column("user_id", ID, ForeignKey("user.id"), primary_key=True, index=True),
+    Column("role", String(16), nullable=False),
+    Column("since_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+)

@@ -1,0 +1,173 @@
+"""Tables of datasets, their commits, branches and proposals."""
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    LargeBinary,
+    String,
+    Table,
+    Text,
+)
+
+from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, Name, metadata, unique_alive
+
+dataset = Table(
+    "dataset",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("name", String(64), nullable=False),
+    Column("description", Text, nullable=False, default=""),
+    Column("collection_id", ID, ForeignKey("collection.id")),  # folder whose content commits record
+    Column("folder_commit", DIGEST),  # commit whose entries the folder has, apart from later changes of its items
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("deleted_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    unique_alive("dataset", "project_id", "name"),
+)
+
+dataset_commit = Table(
+    "dataset_commit",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("digest", DIGEST, primary_key=True),
+    Column("tree", DIGEST, ForeignKey("tree_chunk.digest"), nullable=False),
+    Column("author", String(255), nullable=False),
+    Column("message", Text, nullable=False),
+    Column("at", String(32), nullable=False),  # in the form that the digest covers
+    Column("entries", BigInteger, nullable=False),
+    Column("generation", Integer, nullable=False),  # 0, or 1 more than the greatest generation of a parent
+    Column("write_id", String(64)),  # the name that the client gave to the commit
+    Column("job_id", ID, ForeignKey("job.id")),  # the job that committed its outputs; it commits once
+    Index("uq_dataset_commit_write", "dataset_id", "write_id", unique=True),
+    Index("uq_dataset_commit_job", "job_id", unique=True),
+)
+
+fast_forward = Table(  # merges that moved a branch to an existing commit; other merges are commits with a `write_id`
+    "fast_forward",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("write_id", String(64), primary_key=True),
+    Column("digest", DIGEST, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+commit_parent = Table(
+    "commit_parent",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("digest", DIGEST, primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("parent", DIGEST, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+    ForeignKeyConstraint(
+        ["dataset_id", "parent"],
+        ["dataset_commit.dataset_id", "dataset_commit.digest"],
+        name="fk_commit_parent_parent",
+    ),
+)
+
+dataset_ref = Table(  # a branch or a tag
+    "dataset_ref",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("name", Name, primary_key=True),
+    Column("kind", String(8), nullable=False),
+    Column("digest", DIGEST),  # null: a branch without commits
+    Column("protection", Document),  # rule of a protected branch
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("rev", Integer, nullable=False, default=1),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal = Table(  # to merge a version into a branch
+    "proposal",
+    metadata,
+    Column("dataset_id", ID, ForeignKey("dataset.id"), primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("title", String(255), nullable=False),
+    Column("description", Text, nullable=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("source", String(255), nullable=False),
+    Column("target", Name, nullable=False),
+    Column("state", String(8), nullable=False),
+    Column("head", DIGEST),  # null: that of the branch `source`, while the proposal is open
+    Column("target_commit", DIGEST),  # null: that of the branch `target`, while the proposal is open
+    Column("merged", DIGEST),
+    Column("when_green_id", ID, ForeignKey("user.id")),  # user for whom it is merged when nothing is missing
+    Column("when_green_head", DIGEST),  # commit that this user has asked to merge
+    Column("ended_id", ID, ForeignKey("user.id")),
+    Column("created_us", Micros, nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    Column("ended_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    *(
+        ForeignKeyConstraint(["dataset_id", column], ["dataset_commit.dataset_id", "dataset_commit.digest"])
+        for column in ("head", "target_commit", "merged", "when_green_head")
+    ),
+    Index("ix_proposal_state", "dataset_id", "state", "number"),
+)
+
+proposal_comment = Table(
+    "proposal_comment",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("path", Text),
+    Column("kind", String(32)),
+    Column("first_frame", Integer),
+    Column("end_frame", Integer),  # the frame after the last one
+    Column("digest", DIGEST, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal_review = Table(
+    "proposal_review",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("author_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("verdict", String(16), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("digest", DIGEST, nullable=False),
+    Column("created_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+proposal_check = Table(
+    "proposal_check",
+    metadata,
+    Column("dataset_id", ID, primary_key=True),
+    Column("proposal", Integer, primary_key=True, autoincrement=False),
+    Column("digest", DIGEST, primary_key=True),
+    Column("name", Name, primary_key=True),
+    Column("state", String(16), nullable=False),
+    Column("job_id", ID),
+    Column("link", Text),
+    Column("text", Text, nullable=False),
+    Column("reporter_id", ID, ForeignKey("user.id"), nullable=False),
+    Column("updated_us", Micros, nullable=False),
+    ForeignKeyConstraint(["dataset_id", "proposal"], ["proposal.dataset_id", "proposal.number"]),
+    ForeignKeyConstraint(["dataset_id", "digest"], ["dataset_commit.dataset_id", "dataset_commit.digest"]),
+)
+
+tree_chunk = Table(  # pieces of the trees of entries, which versions share
+    "tree_chunk",
+    metadata,
+    Column("digest", DIGEST, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    Column("created_us", Micros, nullable=False),
+)

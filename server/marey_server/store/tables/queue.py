@@ -1,0 +1,192 @@
+"""Tables of jobs, their attempts, logs and results."""
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    LargeBinary,
+    String,
+    Table,
+    Text,
+    false,
+    text,
+)
+
+from marey_server.store.tables.columns import DIGEST, ID, Document, Micros, metadata
+
+UNFINISHED = text("state IN ('waiting', 'queued', 'running')")
+"""Condition of `ix_job_unfinished`, written in the form in which SQLite uses this index."""
+
+ONE_RUNS_PER_KEY = "uq_job_concurrency"
+"""Index that refuses a second running job of a concurrency key; a concurrent claim that violates it picks again."""
+
+job = Table(
+    "job",
+    metadata,
+    Column("id", ID, primary_key=True),
+    Column("project_id", ID, ForeignKey("project.id"), nullable=False),
+    Column("kind", String(64), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("params", Document, nullable=False),
+    Column("inputs", Document, nullable=False),  # {name: [{item, revision, kind, name, collection}]}, pinned
+    Column("unbound", Boolean, nullable=False, default=False, server_default=false()),  # some inputs are still {job}
+    Column("into_path", String(1024), nullable=False, default=""),
+    Column("priority", Integer, nullable=False, default=0),
+    Column("seed", BigInteger, nullable=False, default=0),
+    Column("labels_key", String(512), nullable=False, default=""),  # "a=1,b=2", sorted; a worker enumerates its subsets
+    Column("time_limit_s", Integer, nullable=False),
+    Column("memory_limit_mb", Integer, nullable=False),
+    Column("max_attempts", Integer, nullable=False, default=3),
+    Column("attempt", Integer, nullable=False, default=0),
+    Column("interruptions", Integer, nullable=False, default=0),
+    Column("unstarted", Integer, nullable=False, default=0, server_default=text("0")),  # claims lost before any write
+    Column("fence", Integer, nullable=False, default=0),
+    Column("counted_fence", Integer, nullable=False, default=0, server_default=text("0")),  # last one in `attempt`
+    Column("run_at_us", Micros, nullable=False),
+    Column("lease_expires_us", Micros),
+    Column("deadline_us", Micros),
+    Column("cancel_requested_us", Micros),
+    Column("result", Document),
+    Column("outputs", Document),  # [{name, item, kind, revision, created}], what the job published
+    Column("failure", Document),
+    Column("progress", Document),
+    Column("publish_conflict", Document),  # why the outputs are not on the branch that `commit_to` names
+    Column("commit_to", Document),  # where the job commits its outputs, as `store.jobs.commits` describes it
+    Column("committed", DIGEST),  # commit that has the outputs
+    Column("parent_id", ID, ForeignKey("job.id"), index=True),
+    Column("position", Integer),
+    Column("size", Integer),  # set for the parent job of a fan-out, which depends on its tasks
+    Column("gathers", Boolean, nullable=False, default=False, server_default=false()),  # it is worked on after them
+    Column("dependencies_left", Integer, nullable=False, default=0),
+    Column("on_failure", String(8), nullable=False, default="fail"),
+    Column("concurrency_key", String(255)),
+    Column("cache_mode", String(8), nullable=False, default="use"),
+    Column("cache_key", DIGEST),
+    Column("cached_from", ID),  # the job whose result this one shares, or waits to share
+    Column("retry_of", ID),
+    Column("code_version", String(255)),
+    Column("environment", Document),
+    Column("author_id", ID, ForeignKey("user.id")),
+    Column("message", Text, nullable=False, default=""),
+    Column("created_us", Micros, nullable=False),
+    Column("started_us", Micros),
+    Column("finished_us", Micros),
+    Column("rev", Integer, nullable=False, default=1),
+    Index("ix_job_listing", "project_id", "id"),
+    Index(
+        "ix_job_claim",  # in pick order; what follows the id lets the scan pass over jobs for other workers
+        text("priority DESC"),
+        "run_at_us",
+        "id",
+        "kind",
+        "labels_key",
+        sqlite_where=text("state = 'queued'"),
+        postgresql_where=text("state = 'queued'"),
+    ),
+    Index(
+        "ix_job_concurrency",
+        "project_id",
+        "concurrency_key",
+        text("priority DESC"),
+        "run_at_us",
+        "id",
+        sqlite_where=text("state = 'queued' AND concurrency_key IS NOT NULL"),
+        postgresql_where=text("state = 'queued' AND concurrency_key IS NOT NULL"),
+    ),
+    Index(
+        "ix_job_sharing",
+        "cached_from",
+        sqlite_where=text("state = 'waiting' AND cached_from IS NOT NULL"),
+        postgresql_where=text("state = 'waiting' AND cached_from IS NOT NULL"),
+    ),
+    Index(
+        "ix_job_expiry",
+        "lease_expires_us",
+        sqlite_where=text("state = 'running'"),
+        postgresql_where=text("state = 'running'"),
+    ),
+    Index(
+        ONE_RUNS_PER_KEY,
+        "project_id",
+        "concurrency_key",
+        unique=True,
+        sqlite_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
+        postgresql_where=text("state = 'running' AND concurrency_key IS NOT NULL"),
+    ),
+    Index("ix_job_unfinished", "author_id", sqlite_where=UNFINISHED, postgresql_where=UNFINISHED),
+    Index("ix_job_cache", "project_id", "cache_key"),
+    Index(
+        "ix_job_retry",
+        "retry_of",
+        sqlite_where=text("retry_of IS NOT NULL"),
+        postgresql_where=text("retry_of IS NOT NULL"),
+    ),
+)
+
+job_dependency = Table(
+    "job_dependency",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("on_job_id", ID, ForeignKey("job.id"), primary_key=True, index=True),
+    Column("satisfied", Boolean, nullable=False, default=False),
+)
+
+attempt = Table(
+    "attempt",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("worker", String(255), nullable=False),
+    Column("claimed_by", ID),  # the token that claimed
+    Column("claim_id", String(64)),  # the name that the worker gave to its claim
+    Column("token_hash", String(64), nullable=False, unique=True),
+    Column("started_us", Micros, nullable=False),
+    Column("ended_us", Micros),
+    Column("outcome", String(16)),
+    Column("detail", Text),
+    Column("signature", String(255)),
+    Column("write_id", String(64)),  # of the final answer
+    Column("answer", Document),  # what it was answered, for the same write_id again
+    Column("log_bytes", BigInteger, nullable=False, default=0),
+    Index(
+        "ix_attempt_claim",
+        "claimed_by",
+        "claim_id",
+        sqlite_where=text("claim_id IS NOT NULL"),
+        postgresql_where=text("claim_id IS NOT NULL"),
+    ),
+)
+
+job_log = Table(
+    "job_log",
+    metadata,
+    Column("job_id", ID, primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("offset", BigInteger, primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
+)
+
+job_blob = Table(  # blobs that a job's parameters or result name
+    "job_blob",
+    metadata,
+    Column("job_id", ID, ForeignKey("job.id"), primary_key=True),
+    Column("blob_digest", DIGEST, ForeignKey("blob.digest"), primary_key=True, index=True),
+)
+
+staged_output = Table(
+    "staged_output",
+    metadata,
+    Column("job_id", ID, primary_key=True),
+    Column("fence", Integer, primary_key=True),
+    Column("name", String(1500), primary_key=True),
+    Column("position", Integer, nullable=False),
+    Column(
+        "draft", Document, nullable=False
+    ),  # a store draft: documents by digest, or bodies that refer to other outputs
+    ForeignKeyConstraint(["job_id", "fence"], ["attempt.job_id", "attempt.fence"]),
+)
