@@ -9,7 +9,7 @@ from typing import Any
 from marey_motion.formats.predecessor.clips import motion_of_document
 from marey_motion.formats.predecessor.encoding import decode_document
 from marey_motion.formats.predecessor.graph import is_graph
-from marey_motion.formats.predecessor.model import layout_of
+from marey_motion.formats.predecessor.model_layouts import layout_of
 from marey_motion.formats.predecessor.tree import is_tree
 from marey_motion.importing.source import SourceDocument, SourceMotion, Subject
 from marey_schemas.formats import format_named

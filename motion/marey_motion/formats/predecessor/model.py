@@ -1,16 +1,12 @@
-"""The predecessor's motion primitives, in the four layouts that were published.
+"""The predecessor's motion primitives, in the four layouts that were published (see `model_layouts`).
 
-Layout 3 has the parts `sspm` (space), `tspm` (time) and `gmm`; layouts 1 and 2 are flat, with fields
-`eigen_vectors_spatial` for space and `*_temporal_semantic*` or `*_time*` for time; a static primitive has
-`spatial_coeffs` alone. Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's
-offset. Arrays of coefficients have the shape (coefficient, channel).
+Right-handed, centimetres, quaternions w, x, y, z; the root's translation is added to the root's offset. Arrays of
+coefficients have the shape (coefficient, channel).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +14,16 @@ from numpy.typing import NDArray
 from marey_motion.arrays import Floats
 from marey_motion.errors import FormatError, FormatLimit, MotionError
 from marey_motion.formats.conversion import convert
-from marey_motion.formats.document_fields import field_of, number_array, text_list
+from marey_motion.formats.document_fields import field_of
 from marey_motion.formats.predecessor.encoding import decode_document
+from marey_motion.formats.predecessor.model_layouts import (
+    Document,
+    Layout,
+    ModelParts,
+    layout_of,
+    model_numbers,
+    parts_of_model,
+)
 from marey_motion.formats.predecessor.skeleton import CENTIMETRE_M, read_skeleton_document
 from marey_motion.formats.predecessor.time_functions import (
     DRAWN,
@@ -35,13 +39,8 @@ from marey_motion.modelling.splines import DEGREE, SplineBasis
 from marey_motion.skeleton import Skeleton
 from marey_schemas.options.imports import ImportOptions
 
-Layout = Literal["1", "2", "3", "static"]
-Document = Mapping[str, Any]
-
-DEFAULT_FRAME_TIME_S = 1.0 / 30.0
 MOST_COMPONENTS, MOST_DIMENSIONS, MOST_FRAMES = 100, 2000, 20_000
 MOST_VALUES = 10_000_000
-LARGEST = 1e12
 WEIGHTS_TOLERANCE = 1e-3
 
 
@@ -63,24 +62,6 @@ class PredecessorModel:
     animated_joints: tuple[str, ...]
     time_form: TimeForm | None
     time_error_frames: float
-
-
-def layout_of(document: Document) -> Layout | None:
-    """Detect the layout of a document.
-
-    Parameters
-    ----------
-    document : mapping    the document
-
-    Returns
-    -------
-    str or None    "1", "2", "3" or "static"; None if it is not a model
-    """
-    if isinstance(document.get("sspm"), dict) and "gmm" in document:
-        return "3"
-    if "eigen_vectors_spatial" in document:
-        return "1" if "mean_temporal_semantic_vector" in document else "2"
-    return "static" if "spatial_coeffs" in document else None
 
 
 def read_predecessor_model(data: bytes, file: str, *, skeleton: Skeleton | None = None) -> PredecessorModel:
@@ -129,7 +110,7 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
         message = "the file does not contain the skeleton of the model; choose a skeleton of the project"
         raise FormatError(message, code="skeleton-missing", file=file)
     try:
-        return _read(_as_parts(document, layout, file), layout, own, file)
+        return _read(parts_of_model(document, layout, file), layout, own, file)
     except FormatError:
         raise
     except MotionError as error:
@@ -138,129 +119,13 @@ def model_of_document(document: Document, file: str, *, skeleton: Skeleton | Non
         ) from error
 
 
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """Contents of a model document, with the same names for all layouts."""
-
-    name: str
-    space: Document
-    translation_maxima: Floats
-    time: Document | None
-    time_form: TimeForm
-    mixture: Document | None
-    animated_joints: list[str] | None
-    frame_time_s: float
-    keyframes: Mapping[str, int]
-
-
-def _as_parts(document: Document, layout: Layout, file: str) -> _Parts:
-    if layout == "3":
-        space = field_of(document, "sspm", dict, file)
-        time: Document | None = field_of(document, "tspm", dict, file) if document.get("tspm") else None
-        mixture: Document | None = field_of(document, "gmm", dict, file)
-    elif layout == "static":
-        space = {
-            "mean": field_of(document, "spatial_coeffs", list, file),
-            "knots": field_of(document, "knots", list, file),
-        }
-        time, mixture = None, None
-    else:
-        space = _renamed(document, _FLAT_SPACE)
-        time = _renamed(document, _FLAT_TIME if layout == "2" else _FLAT_TIME_SEMANTIC)
-        mixture = _renamed(document, _FLAT_MIXTURE)
-    time, form = _time_part(time, layout, file)
-    skeleton = document.get("skeleton")
-    rate_sources = (time or {}, document, skeleton if isinstance(skeleton, dict) else {})
-    frame_time_s = next((one["frame_time"] for one in rate_sources if one.get("frame_time")), DEFAULT_FRAME_TIME_S)
-    if not isinstance(frame_time_s, int | float) or not 1e-5 < frame_time_s < 10.0:
-        message = f"field 'frame_time' must be a number of seconds above 1e-5 and below 10, not {frame_time_s!r}"
-        raise FormatError(message, code="bad-number", file=file)
-    joints = next((one for one in (space, document) if "animated_joints" in one), None)
-    if joints is None and isinstance(skeleton, dict) and isinstance(skeleton.get("animated_joints"), list):
-        joints = skeleton
-    maxima = _numbers(
-        document.get("translation_maxima", space.get("translation_maxima", [1, 1, 1])), file, "translation_maxima"
-    )
-    if maxima.shape != (3,):
-        raise FormatError("field 'translation_maxima' must be three numbers", code="bad-number", file=file)
-    return _Parts(
-        name=str(document.get("name") or ""),
-        space=space,
-        translation_maxima=maxima,
-        time=time,
-        time_form=form,
-        mixture=mixture,
-        animated_joints=None if joints is None else text_list(joints, "animated_joints", file),
-        frame_time_s=float(frame_time_s),
-        keyframes=_keyframes(document, file),
-    )
-
-
-_FLAT_SPACE = {
-    "eigen": "eigen_vectors_spatial",
-    "mean": "mean_spatial_vector",
-    "n_coeffs": "n_basis_spatial",
-    "n_dims": "n_dim_spatial",
-    "knots": "b_spline_knots_spatial",
-    "n_frames": "n_canonical_frames",
-}
-_FLAT_TIME = {
-    "eigen": "eigen_vectors_time",
-    "mean": "mean_time_vector",
-    "n_coeffs": "n_basis_time",
-    "n_dims": "n_dim_time",
-    "knots": "b_spline_knots_time",
-    "n_frames": "n_canonical_frames",
-}
-_FLAT_TIME_SEMANTIC = {
-    "eigen": "eigen_vectors_temporal_semantic",
-    "mean": "mean_temporal_semantic_vector",
-    "n_coeffs": "n_basis_temporal_semantic",
-    "n_dims": "n_dim_temporal_semantic",
-    "knots": "b_spline_knots_temporal_semantic",
-    "n_frames": "n_canonical_frames",
-}
-_FLAT_MIXTURE = {"weights": "gmm_weights", "means": "gmm_means", "covars": "gmm_covars"}
-
-
-def _renamed(document: Document, names: Mapping[str, str]) -> dict[str, Any]:
-    return {ours: document[theirs] for ours, theirs in names.items() if theirs in document}
-
-
-def _time_part(time: Document | None, layout: Layout, file: str) -> tuple[Document | None, TimeForm]:
-    """Return the time part of a model, with one component per row, and its form; None if the model has no time part.
-
-    Layout 2 was written by two training programs. The first stores components as columns and uses the form
-    `increments`; the later one stores them as rows and uses the form `coefficients`, as layout 3 does.
-    """
-    if time is None or not time.get("mean"):
-        return None, "coefficients"
-    count = len(field_of(time, "mean", list, file))
-    if layout != "2":
-        return time, "coefficients"
-    vectors = _numbers(time.get("eigen", []), file, _FLAT_TIME["eigen"])
-    if vectors.ndim == 2 and vectors.shape[1] != count and vectors.shape[0] == count:
-        return {**time, "eigen": vectors.T.tolist()}, "increments"
-    return time, "coefficients"
-
-
-def _keyframes(document: Document, file: str) -> dict[str, int]:
-    if "keyframes" not in document:
-        return {}
-    given = field_of(document, "keyframes", dict, file)
-    for label, frame in given.items():
-        if not isinstance(frame, int) or isinstance(frame, bool) or frame < 0:
-            raise FormatError(f"field 'keyframes': {label!r} must be the number of a frame, not {frame!r}", file=file)
-    return dict(given)
-
-
 def _skeleton(document: Document, file: str) -> Skeleton | None:
     if not isinstance(document.get("skeleton"), dict):
         return None
     return convert(read_skeleton_document(document["skeleton"], file), file, ImportOptions()).skeleton
 
 
-def _read(parts: _Parts, layout: Layout, skeleton: Skeleton, file: str) -> PredecessorModel:
+def _read(parts: ModelParts, layout: Layout, skeleton: Skeleton, file: str) -> PredecessorModel:
     basis, mean, vectors = _functions(parts.space, "space", file)
     animated = _animated(parts, basis, mean, skeleton, file)
     spatial_mean, spatial_vectors = _on_skeleton(mean, vectors, parts.translation_maxima, animated, skeleton)
@@ -298,7 +163,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
             "to the number of the last frame",
             file=file,
         )
-    mean = _numbers(field_of(part, "mean", list, file), file, f"{what}: mean")
+    mean = model_numbers(field_of(part, "mean", list, file), file, f"{what}: mean")
     if mean.size % basis.count or mean.size == 0:
         raise FormatError(
             f"{what}: the mean has {mean.size} numbers, which is not a multiple of the "
@@ -314,7 +179,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
             f"{what}: the field n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file
         )
     given = part.get("eigen") or []
-    vectors = _numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
+    vectors = model_numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))
     if vectors.ndim == 2 and vectors.shape[1] != mean.size and vectors.shape[0] == mean.size:
         vectors = vectors.T
     if vectors.ndim != 2 or vectors.shape[1] != mean.size:
@@ -339,7 +204,7 @@ def _basis(part: Document, what: str, file: str) -> SplineBasis:
             )
         _check_size(frames, count, what, file)
         return SplineBasis.clamped(frames, count)
-    knots = _numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
+    knots = model_numbers(field_of(part, "knots", list, file), file, f"{what}: knots")
     if knots.ndim != 1 or not 0 < len(knots) <= MOST_FRAMES or np.abs(knots).max() > MOST_FRAMES:
         raise FormatError(
             f"{what}: there may be at most {MOST_FRAMES} knots, and no knot may be above {MOST_FRAMES}", file=file
@@ -363,7 +228,7 @@ def _check_size(frames: int, coefficients: int, what: str, file: str) -> None:
         raise FormatLimit(message, file=file)
 
 
-def _animated(parts: _Parts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
+def _animated(parts: ModelParts, basis: SplineBasis, mean: Floats, skeleton: Skeleton, file: str) -> list[str]:
     """List the joints that the model rotates. Raises `FormatError` if the skeleton lacks them."""
     animated = parts.animated_joints or list(skeleton.joint_names)
     if mean.shape[1] != 3 + 4 * len(animated):
@@ -411,7 +276,7 @@ def columns_of(animated: list[str] | tuple[str, ...], skeleton: Skeleton) -> NDA
     return np.concatenate((np.arange(3), (3 + 4 * joints[:, None] + np.arange(4)).ravel()))
 
 
-def _time(parts: _Parts, frames: int, file: str) -> PredecessorTime:
+def _time(parts: ModelParts, frames: int, file: str) -> PredecessorTime:
     """Read the time function from the first channel; further channels contain semantic annotations and are ignored."""
     assert parts.time is not None
     basis, mean, vectors = _functions(parts.time, "time", file)
@@ -427,7 +292,7 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
         dimensions = spatial + temporal
         return LatentMixture(np.ones(1), np.zeros((1, dimensions)), np.eye(dimensions)[None]), temporal
     weights, means, covariances = (
-        _numbers(field_of(part, name, list, file), file, f"gmm: {name}") for name in ("weights", "means", "covars")
+        model_numbers(field_of(part, name, list, file), file, f"gmm: {name}") for name in ("weights", "means", "covars")
     )
     if means.ndim == 2 and not means.size and not covariances.size:
         covariances = np.zeros((len(means), 0, 0))  # lists of nothing do not tell how many there are
@@ -455,16 +320,6 @@ def _mixture(part: Document | None, spatial: int, temporal: int, file: str) -> t
     if means.shape[1]:
         _ = mixture.cholesky  # refuses what is no covariance
     return mixture, covered
-
-
-def _numbers(values: Any, file: str, name: str) -> Floats:
-    """Convert nested lists to an array. Raises `FormatError` if a number is too large for the motion of a body."""
-    numbers = number_array(values, file, name)
-    if np.abs(numbers).max(initial=0.0) > LARGEST:
-        raise FormatError(
-            f"field {name!r} contains numbers that are larger than {LARGEST:g}", code="bad-number", file=file
-        )
-    return numbers
 
 
 def _variances(mixture: LatentMixture) -> Floats:
