@@ -157,6 +157,10 @@ def test_constants_of_other_names_values_or_made_by_calls_are_no_offence() -> No
     assert not list(constants.find(house(fine)))
 
 
+def test_a_constant_that_cannot_be_evaluated_is_no_offence() -> None:
+    assert not list(constants.find(house(dict.fromkeys(("marey_x.a", "marey_y.b"), "MOST = {[]: 1}\n"))))
+
+
 @pytest.mark.parametrize(
     "text",
     [
