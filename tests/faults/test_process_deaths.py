@@ -206,13 +206,11 @@ def test_a_server_killed_among_200_uploads_keeps_what_it_acknowledged(
 def test_a_server_killed_at_a_write_leaves_it_whole_or_not_at_all(
     server: ServerProcess, takes: list[LocalFile], place: str
 ) -> None:
-    server.start()
-    with server.client() as marey:
-        make_lab(marey)
-    server.stop()
     server.start(fault=f"{place}@3:kill")
-    with server.client(patient=False) as marey, pytest.raises(MareyError):
-        _upload_one_by_one(marey, takes[:8])
+    with server.client(patient=False) as marey:
+        make_lab(marey)
+        with pytest.raises(MareyError):
+            _upload_one_by_one(marey, takes[:8])
     assert server.wait_until_dead() == -signal.SIGKILL
 
     server.start()
@@ -233,15 +231,12 @@ def test_a_server_killed_among_50_completes_publishes_each_result_once(
     start_worker: Callable[..., WorkerProcess],
     place: str,
 ) -> None:
-    server.start()
+    server.start(fault=f"{place}:kill")
     with server.client() as marey:
         lab = make_lab(marey)
         entries = lab.imports.upload(takes[:50])
         skeleton = import_game_skeleton(lab, tmp_path)
-    server.stop()
-    server.start(fault=f"{place}:kill")
-    with server.client() as marey:
-        jobs = submit_retargets(marey.project("lab"), entries, skeleton, into="game")
+        jobs = submit_retargets(lab, entries, skeleton, into="game")
     start_worker("steady")
     assert server.wait_until_dead() == -signal.SIGKILL
 
@@ -317,15 +312,11 @@ def test_jobs_of_a_worker_killed_while_it_stores_one_and_runs_another_are_publis
 def test_a_server_killed_while_a_worker_stores_one_job_and_runs_another_publishes_each_once(
     server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
 ) -> None:
-    server.start()
+    server.start(fault="stage.before_commit@2:kill")
     with server.client() as marey:
         lab = make_lab(marey)
         entries = lab.imports.upload(takes[:4])
-        skeleton = import_game_skeleton(lab, tmp_path)
-    server.stop()
-    server.start(fault="stage.before_commit@2:kill")
-    with server.client() as marey:
-        jobs = submit_retargets(marey.project("lab"), entries, skeleton, into="game")
+        jobs = submit_retargets(lab, entries, import_game_skeleton(lab, tmp_path), into="game")
     start_worker("steady")
     assert server.wait_until_dead() == -signal.SIGKILL
     server.start()
@@ -389,13 +380,29 @@ def test_a_lost_answer_to_complete_is_asked_for_again(
         lab = make_lab(marey)
         entries = lab.imports.upload(takes[:10])
         skeleton = import_game_skeleton(lab, tmp_path)
+        proxy.lose_answers(b"/complete ", 5)
         start_worker("behind-proxy", port=proxy.port)
+        finished = ended(marey, submit_retargets(lab, entries, skeleton, into="game"))
+        assert proxy.lost == 5
+        assert_published_once(lab, finished)
+    server.check_database()
+
+
+def test_a_lost_answer_to_a_claim_is_asked_for_again(
+    server: ServerProcess, takes: list[LocalFile], tmp_path: Path, start_worker: Callable[..., WorkerProcess]
+) -> None:
+    """The worker gets the same job again at its first attempt."""
+    server.start()
+    with server.client() as marey, TcpProxy(server.port) as proxy:
+        lab = make_lab(marey)
+        entries = lab.imports.upload(takes[:3])
+        skeleton = import_game_skeleton(lab, tmp_path)
         jobs = submit_retargets(lab, entries, skeleton, into="game")
-        cutting = threading.Thread(target=_cut, args=(proxy, 5))
-        cutting.start()
+        proxy.lose_answers(b"/claim ", 2)
+        start_worker("behind-proxy", port=proxy.port)
         finished = ended(marey, jobs)
-        cutting.join(60)
-        assert proxy.cuts == 5
+        assert proxy.lost == 2
+        assert {job.fence for job in finished} == {1}
         assert_published_once(lab, finished)
     server.check_database()
 
@@ -423,12 +430,9 @@ def test_a_worker_cut_off_from_the_server_loses_its_job_to_another(
 
 
 def test_a_full_disk_is_a_507_and_leaves_nothing_behind(server: ServerProcess, takes: list[LocalFile]) -> None:
-    server.start()
-    with server.client() as marey:
-        make_lab(marey)
-    server.stop()
     server.start(fault="blob.put.before_commit:error")
     with server.client(patient=False) as marey:
+        make_lab(marey)
         content = takes[0].path.read_bytes()
         answer = httpx.put(
             f"{server.url}/api/v1/blobs/{digest_of(content)}",
@@ -485,15 +489,6 @@ def _disturb(database_url: str, seconds: float) -> None:
 def _upload_one_by_one(marey: Marey, takes: list[LocalFile]) -> None:
     for take in takes:
         marey.project("lab").imports.upload([take])
-
-
-def _cut(proxy: TcpProxy, count: int) -> None:
-    """Lose so many answers, now and then."""
-    deadline = time.monotonic() + 60
-    while proxy.cuts < count and time.monotonic() < deadline:
-        proxy.cut_after_request.set()
-        time.sleep(0.2)
-    proxy.cut_after_request.clear()
 
 
 def _is_stopped(pid: int) -> bool:

@@ -12,17 +12,17 @@ from typing import Self
 class TcpProxy:
     """Forwards connections to `target_port` on loopback.
 
-    `drop_requests` and `drop_answers` swallow bytes of that direction while set; `cut_after_request` closes the
-    connection of the next exchange as soon as the server starts to answer, so that the server has done the work and the
-    client never hears of it.
+    `drop_requests` and `drop_answers` swallow bytes of that direction while set. `lose_answers` closes connections when
+    the server starts to answer, so that the server has done the work and the client never hears of it.
     """
 
     def __init__(self, target_port: int) -> None:
         self.target_port = target_port
         self.drop_requests = threading.Event()
         self.drop_answers = threading.Event()
-        self.cut_after_request = threading.Event()
-        self.cuts = 0
+        self.lost = 0
+        self._lose: tuple[bytes, int] = (b"", 0)
+        self._losing = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._stopping = threading.Event()
@@ -39,6 +39,18 @@ class TcpProxy:
         self._listener.close()
         for thread in self._threads:
             thread.join(5)
+
+    def lose_answers(self, text: bytes, count: int) -> None:
+        """Lose the next `count` answers to requests that contain `text`; `lost` counts them."""
+        with self._losing:
+            self._lose = text, self.lost + count
+
+    def _loses(self, request: bytes) -> bool:
+        with self._losing:
+            text, most = self._lose
+            loses = self.lost < most and text in request
+            self.lost += loses
+            return loses
 
     def _accept(self) -> None:
         self._listener.settimeout(0.2)
@@ -62,15 +74,18 @@ class TcpProxy:
             selector = selectors.DefaultSelector()
             selector.register(client, selectors.EVENT_READ, (server, self.drop_requests))
             selector.register(server, selectors.EVENT_READ, (client, self.drop_answers))
+            request = b""
             while not self._stopping.is_set():
                 for key, _ in selector.select(0.2):
                     peer, dropping = key.data
                     data = key.fileobj.recv(65536)  # type: ignore[union-attr]
                     if not data:
                         return
-                    if key.fileobj is server and self.cut_after_request.is_set():
-                        self.cut_after_request.clear()
-                        self.cuts += 1
+                    if key.fileobj is client:
+                        request += data
+                    elif self._loses(request):
                         return
+                    else:
+                        request = b""
                     if not dropping.is_set():
                         peer.sendall(data)

@@ -131,8 +131,9 @@ class Supervisor:
                     break
                 except (MareyError, ChildBroken) as error:
                     failures += 1
-                    if isinstance(error, LeaseLost):  # the answer was lost for too long
+                    if isinstance(error, LeaseLost):  # the answer was lost for too long; the server answers again
                         opened = self._open_claim()
+                        failures = 1
                     log.warning("no work: %s", error)
                     self._stopping.wait(PAUSES.delay_s(failures))
                     continue
