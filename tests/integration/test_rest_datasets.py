@@ -350,6 +350,41 @@ def test_a_conflict_is_listed_and_decided(owner: httpx.Client, two_branches: Cal
     assert entries(owner)["a"]["parts"] == entries(owner, "trial")["a"]["parts"]
 
 
+def put_labels(owner: httpx.Client, path: str, *segments: tuple[str, int, int]) -> None:
+    """Replace the segments of an annotation."""
+    (found,) = ok(owner.get(f"{LAB}/annotations", params={"path": path}))["items"]
+    url = f"{LAB}/annotations/{found['id']}/parts/annotation"
+    document = ok(owner.get(url))
+    document["segments"] = [dict(zip(("label", "start", "end"), one, strict=True)) for one in segments]
+    ok(owner.put(url, json=document, headers={"If-Match": "*"}))
+
+
+def test_segments_that_exclude_each_other_are_listed(
+    owner: httpx.Client, gaits: Callable[..., Any], two_branches: Callable[..., None]
+) -> None:
+    rig = ok(owner.post(f"{LAB}/skeletons", json=skeleton("rig", folder="raw")), 201)
+    made = ok(owner.post(f"{LAB}/clips", json={"name": "walk", "parts": clip(rig["id"], 0)}), 201)
+    document = {"schema": "marey/annotation@1", "clip": {"item": made["id"], "revision": 1}}
+    body = {"name": "labels", "collection": "gaits", "parts": {"annotation": document}}
+    ok(owner.post(f"{LAB}/annotations", json=body), 201)
+    gaits("labels")
+    two_branches(
+        lambda: put_labels(owner, "gaits/labels", ("left", 0, 1)),
+        lambda: put_labels(owner, "gaits/labels", ("right", 0, 1)),
+    )
+    refusal = refused(owner.post(f"{GAITS}/merges", json={"version": "trial"}), 409, "merge-conflicts")
+    (conflict,) = refusal["context"]["conflicts"]
+    assert (conflict["path"], conflict["parts"]) == ("labels", ["annotation"])
+    assert conflict["reason"] == (
+        "Both sides have labelled the same frames in different ways, the first in 'left' at 0:1."
+    )
+    assert conflict["segments"] == {
+        "base": [],
+        "ours": [{"label": "right", "start": 0, "end": 1}],
+        "theirs": [{"label": "left", "start": 0, "end": 1}],
+    }
+
+
 def test_a_branch_that_has_not_moved_is_moved_by_a_merge(owner: httpx.Client, gaits: Callable[..., Any]) -> None:
     ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)
     change(owner, "gaits/a", tags=["slow"])

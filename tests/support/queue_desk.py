@@ -94,7 +94,15 @@ RIG = KindDeclaration(
     version=1,
     outputs={"rigs": Kind.SKELETON},
 )
-KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY, RIG)}
+LABEL = KindDeclaration(
+    name="label",
+    description="Makes annotations.",
+    params=Params,
+    implementation="tests:label",
+    version=1,
+    outputs={"labels": Kind.ANNOTATION},
+)
+KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, SURVEY, RIG, LABEL)}
 
 
 @dataclass

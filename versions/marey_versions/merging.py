@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from marey_schemas.datasets.merges import Side
 from marey_schemas.kinds import PARTS, Kind
+from marey_versions.annotations import AnnotationClash
 from marey_versions.compared import ComparedEntry
 from marey_versions.records import DatasetEntry
 from marey_versions.tree.chunks import Value
@@ -27,6 +28,8 @@ class MergeConflict(NamedTuple):
     """Parts that both sides have changed; `path` if both have moved the entry or want the same path, `entry` if one
     side has removed it.
     """
+    clash: AnnotationClash | None = None
+    """The reason why an annotation could not be merged segment by segment."""
 
     @property
     def key(self) -> str:
@@ -36,8 +39,23 @@ class MergeConflict(NamedTuple):
         return present.key
 
 
+class ChangedPart(NamedTuple):
+    """Part of an entry that both sides have changed in different ways. `base` is None if both have added the entry."""
+
+    part: str
+    base: DatasetEntry | None
+    ours: DatasetEntry
+    theirs: DatasetEntry
+
+
+MergeParts = Callable[[Sequence[ChangedPart]], Sequence[str | AnnotationClash | None]]
+"""Function that merges the documents of parts. For each part, it returns the content digest of the merged document, the
+reason why the changes exclude each other, or None if parts of this kind are not merged.
+"""
+
+
 class CombinedEntry(NamedTuple):
-    """Entry with parts of both sides, so that neither side has a revision with its content."""
+    """Entry with changes of both sides, so that neither side has a revision with its content."""
 
     entry: DatasetEntry
     ours: DatasetEntry
@@ -50,14 +68,17 @@ class MergedEntries:
 
     changes: dict[str, Value | None] = field(default_factory=dict)
     combined: list[CombinedEntry] = field(default_factory=list)
-    """The entries in `changes` that have parts of both sides."""
+    """The entries in `changes` that have parts of both sides, or parts that were merged."""
     conflicts: list[MergeConflict] = field(default_factory=list)
     decided: set[str] = field(default_factory=set)
     """Keys of the resolutions that decided a conflict."""
 
 
 def merge_entries(
-    ours: Iterable[ComparedEntry], theirs: Iterable[ComparedEntry], resolutions: Mapping[str, Side]
+    ours: Iterable[ComparedEntry],
+    theirs: Iterable[ComparedEntry],
+    resolutions: Mapping[str, Side],
+    merge_parts: MergeParts | None = None,
 ) -> MergedEntries:
     """Merge the changes that two sides have made since their base.
 
@@ -65,6 +86,7 @@ def merge_entries(
     ----------
     ours, theirs : the entries that differ between the base and each side
     resolutions : the side to take for each conflict, by the key of the conflict
+    merge_parts : merges the parts that both sides have changed; None: such parts are in conflict
 
     Returns
     -------
@@ -74,12 +96,17 @@ def merge_entries(
     mine = list(ours)
     of_base = {one.before.key: one.after for one in mine if one.before is not None}
     added = {one.after.key: one.after for one in mine if one.before is None and one.after is not None}
-    merged = MergedEntries()
-    decided: list[_Decided] = []
+    sides: list[_Sides] = []
     for one in theirs:
         at = one.present.key if one.before is None else one.before.key
         our_entry = added.get(at) if one.before is None else of_base.get(at, one.before)
-        found = _decide(one.before, our_entry, one.after, resolutions, merged.decided)
+        sides.append(_Sides(one.before, our_entry, one.after))
+    if merge_parts is not None:
+        _merge_documents(sides, merge_parts)
+    merged = MergedEntries()
+    decided: list[_Decided] = []
+    for three in sides:
+        found = _decide(three, resolutions, merged.decided)
         if isinstance(found, MergeConflict):
             merged.conflicts.append(found)
         else:
@@ -110,29 +137,60 @@ class _Decided(NamedTuple):
         return self.merged is not None and (self.ours is None or self.ours.key != self.merged.key)
 
 
-def _decide(
-    base: DatasetEntry | None,
-    ours: DatasetEntry | None,
-    theirs: DatasetEntry | None,
-    resolutions: Mapping[str, Side],
-    used: set[str],
-) -> _Decided | MergeConflict:
+@dataclass
+class _Sides:
+    """Entry in the base, on our side and on their side."""
+
+    base: DatasetEntry | None
+    ours: DatasetEntry | None
+    theirs: DatasetEntry | None
+    clashes: tuple[str, ...] = ()
+    """Parts that both sides have changed in ways that exclude each other."""
+    merged: dict[str, str] = field(default_factory=dict)
+    """Content digests of the parts whose documents were merged."""
+    clash: AnnotationClash | None = None
+
+    def __post_init__(self) -> None:
+        if _excludes(self.base, self.ours, self.theirs):
+            self.clashes = _clashes(self.base, self.ours, self.theirs)
+
+    @property
+    def changed_parts(self) -> Iterator[ChangedPart]:
+        """The clashing parts, if both sides have the entry."""
+        for part in self.clashes:
+            if self.ours is not None and self.theirs is not None and part in self.ours.parts.keys() & self.theirs.parts:
+                yield ChangedPart(part, self.base, self.ours, self.theirs)
+
+
+def _merge_documents(sides: Sequence[_Sides], merge_parts: MergeParts) -> None:
+    """Merge the documents of clashing parts; a merged part no longer clashes."""
+    changed = [(one, part) for one in sides for part in one.changed_parts]
+    outcomes = merge_parts([part for _, part in changed]) if changed else ()
+    for (one, part), outcome in zip(changed, outcomes, strict=True):
+        if isinstance(outcome, AnnotationClash):
+            one.clash = outcome
+        elif outcome is not None:
+            one.merged[part.part] = outcome
+            one.clashes = tuple(name for name in one.clashes if name != part.part)
+
+
+def _decide(sides: _Sides, resolutions: Mapping[str, Side], used: set[str]) -> _Decided | MergeConflict:
+    base, ours, theirs = sides.base, sides.ours, sides.theirs
     if theirs in (ours, base):
         return _Decided(base, ours, theirs, ours)
     if ours == base:
         return _Decided(base, ours, theirs, theirs)
-    clashes = _clashes(base, ours, theirs)
-    if not clashes:
-        return _Decided(base, ours, theirs, _combined(base, ours, theirs))
-    conflict = MergeConflict(base, ours, theirs, clashes)
+    if not sides.clashes:
+        return _Decided(base, ours, theirs, _combined(sides))
+    conflict = MergeConflict(base, ours, theirs, sides.clashes, sides.clash)
     choice = resolutions.get(conflict.key)
     if choice is None:
         return conflict
     used.add(conflict.key)
     if choice is Side.BASE:
         return _Decided(base, ours, theirs, base)
-    whole = "entry" in clashes or base is None
-    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(base, ours, theirs, clashes, choice)
+    whole = "entry" in sides.clashes or base is None
+    chosen = (ours if choice is Side.OURS else theirs) if whole else _combined(sides, choice)
     return _Decided(base, ours, theirs, chosen)
 
 
@@ -198,14 +256,9 @@ def _excludes(base: Any, ours: Any, theirs: Any) -> bool:
     return ours not in (base, theirs) and theirs != base
 
 
-def _combined(
-    base: DatasetEntry | None,
-    ours: DatasetEntry | None,
-    theirs: DatasetEntry | None,
-    clashes: Collection[str] = (),
-    choice: Side = Side.OURS,
-) -> DatasetEntry | None:
+def _combined(sides: _Sides, choice: Side = Side.OURS) -> DatasetEntry | None:
     """Return the entry with the changes of both sides; where these exclude each other, `choice` decides."""
+    base, ours, theirs, clashes = sides.base, sides.ours, sides.theirs, sides.clashes
     if ours is None or theirs is None:
         return None
     of_base: Mapping[str, str] = {} if base is None else base.parts
@@ -215,7 +268,7 @@ def _combined(
         for name in sorted(ours.parts.keys() | theirs.parts.keys())
         if (digest := _newer(name in clashes, of_base.get(name), preferred.parts.get(name), other.parts.get(name)))
         is not None
-    }
+    } | sides.merged
     path = preferred.path if base is None else _newer("path" in clashes, base.path, preferred.path, other.path)
     old = set() if base is None else set(base.tags)
     tags = (old | set(ours.tags) | set(theirs.tags)) - (old - set(ours.tags)) - (old - set(theirs.tags))

@@ -261,6 +261,8 @@ class DatasetHandle:
     ) -> MergeAnswer:
         """Merge a version into a branch, entry by entry and part by part; with `preview`, only compute the result.
 
+        Annotations that both sides have changed are merged segment by segment.
+
         Raises `Conflict` with the code `merge-conflicts` if both sides have changed the same part of an entry and
         `resolutions` do not decide it; the `context` of the error then has the fields of `MergeAnswer`.
         """

@@ -17,6 +17,10 @@ MOST_CONFLICTS = 1000
 """Greatest number of conflicts that an answer lists."""
 
 
+MOST_CONFLICTING_SEGMENTS = 100
+"""Greatest number of segments that a conflict of an annotation lists for each side."""
+
+
 class Side(StrEnum):
     """Side that wins a conflict: the branch, the version that is merged into it, or the common base of both."""
 
@@ -67,6 +71,24 @@ class PickRequest(CombineRequest):
     )
 
 
+class ConflictingSegment(Answer):
+    """Segment of an annotation: a label of the frames from `start` up to, but not including, `end`."""
+
+    label: str
+    start: int
+    end: int
+
+
+class ConflictingSegments(Answer):
+    """Segments of an annotation that exclude each other, at most 100 of each side, in the order of their frames."""
+
+    base: tuple[ConflictingSegment, ...] = Field(
+        description="Segments of the base that both sides have removed; empty if both have only added segments."
+    )
+    ours: tuple[ConflictingSegment, ...]
+    theirs: tuple[ConflictingSegment, ...]
+
+
 class EntryConflict(Answer):
     """Entry that both sides have changed in ways that cannot be combined."""
 
@@ -79,6 +101,12 @@ class EntryConflict(Answer):
     base: Entry | None
     ours: Entry | None
     theirs: Entry | None
+    reason: str = Field(
+        "", description="Reason why the changes of an annotation cannot be combined; empty for other parts."
+    )
+    segments: ConflictingSegments | None = Field(
+        None, description="Segments of an annotation that exclude each other; null if the reason is another one."
+    )
 
 
 class MergeAnswer(Answer):

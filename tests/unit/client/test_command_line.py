@@ -24,6 +24,7 @@ from marey_client.cli import projects, tokens, with_global_options_first
 from marey_client.cli.addresses import Address, require_item, the_thing
 from marey_client.cli.app import app
 from marey_client.cli.clip_jobs import _print_aligned, _print_warnings, print_labelled
+from marey_client.cli.datasets import combining
 from marey_client.cli.files import uploading
 from marey_client.cli.files.listing import _items_in
 from marey_client.cli.files.uploading import _print_entries
@@ -418,6 +419,36 @@ def test_warnings_about_results_are_counted_by_code(capsys: pytest.CaptureFixtur
     printed = capsys.readouterr()
     assert printed.err.startswith("warning bones-moved-by-translations: 2 clips; ")
     assert printed.out == ""
+
+
+def test_a_refused_merge_prints_the_segments_that_exclude_each_other(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    conflict = {
+        "path": "labels", "kind": "annotation", "parts": ["annotation"], "base": None, "ours": None, "theirs": None,
+        "reason": "Both sides have labelled the same frames.",
+        "segments": {
+            "base": [],
+            "ours": [{"label": "left", "start": 0, "end": 30}, {"label": "left", "start": 40, "end": 50}],
+            "theirs": [{"label": "right", "start": 0, "end": 60}],
+        },
+    }  # fmt: skip
+    answer = {
+        "commit": None, "base": None, "ours": "o", "theirs": "t", "changes": 0, "conflicts": [conflict],
+        "conflict_count": 1,
+    }  # fmt: skip
+    monkeypatch.setattr(combining, "connect", lambda context: script.marey())
+    script.answers = [problem(409, "merge-conflicts", context=answer)]
+    with pytest.raises(typer.Exit):
+        combining.merge(NO_OPTIONS, "lab/gaits@trial")
+    printed = capsys.readouterr()
+    assert re.search("labels +annotation +annotation", printed.out)
+    assert printed.err.startswith(
+        "labels: Both sides have labelled the same frames.\n"
+        "  ours: left 0:30, left 40:50\n"
+        "  theirs: right 0:60\n"
+        "  base: none\n"
+    )
 
 
 def test_an_upload_tells_a_new_revision_from_a_new_clip(capsys: pytest.CaptureFixture[str]) -> None:

@@ -374,7 +374,7 @@ def test_a_dataset_behaves_as_its_model(lab: Lab, known_items: dict[str, str]) -
 
 
 def drop_their_side(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(merging, "merge_entries", lambda ours, _theirs, take: merge_entries(ours, [], take))
+    patch.setattr(merging, "merge_entries", lambda ours, _theirs, take, _merge: merge_entries(ours, [], take))
 
 
 def move_whatever_the_head_is(patch: pytest.MonkeyPatch) -> None:

@@ -238,11 +238,11 @@ def test_jobs_that_commit_behave_as_their_model(desk: Desk) -> None:
 
 
 def overwrite_what_others_changed(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(outputs, "merge_entries", lambda _others, own, take: merge_entries([], own, take))
+    patch.setattr(outputs, "merge_entries", lambda _others, own, take, _merge: merge_entries([], own, take))
 
 
 def forget_what_the_job_made(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(outputs, "merge_entries", lambda others, _own, take: merge_entries(others, [], take))
+    patch.setattr(outputs, "merge_entries", lambda others, _own, take, _merge: merge_entries(others, [], take))
 
 
 def ignore_the_rule(patch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pytest
 from hypothesis import given, settings
@@ -11,8 +11,9 @@ from tests.support.tiers import examples
 
 from marey_schemas.datasets.differences import ChangeKind
 from marey_schemas.datasets.merges import Side
+from marey_versions.annotations import ADDED_TWICE, AnnotationClash
 from marey_versions.compared import ComparedEntry, compare_entries
-from marey_versions.merging import MergedEntries, merge_entries
+from marey_versions.merging import ChangedPart, MergedEntries, merge_entries
 from marey_versions.records import DatasetEntry, key_of
 from marey_versions.tree.chunks import Value
 from marey_versions.tree.difference import Changed
@@ -213,6 +214,39 @@ def test_two_entries_that_come_to_one_place_are_a_conflict() -> None:
     ours, theirs = state(z=entry("1"), b=entry("2")), state(a=entry("1"), z=entry("2"))
     _, merged = merge(base, ours, theirs)
     assert [(one.key, one.parts) for one in merged.conflicts] == [(key_of("z", "clip"), ("path",))]
+
+
+def test_documents_of_parts_that_both_sides_have_changed_are_merged() -> None:
+    """The other parts, the tags and the paths of the entry are merged as always."""
+    base, key = state(a=entry("1", "1"), b=entry("5")), key_of("b", "clip")
+    ours, theirs = state(a=entry("2", "1", "x"), b=entry("6")), state(a=entry("3", "2"), b=entry("7"))
+    asked: list[ChangedPart] = []
+
+    def merge_parts(changed: Sequence[ChangedPart]) -> list[str | AnnotationClash | None]:
+        asked.extend(changed)
+        return ["23" if one.ours.path == "a" else ADDED_TWICE for one in changed]
+
+    merged = merge_entries(compared(base, ours), compared(base, theirs), {}, merge_parts)
+    assert [(one.part, one.ours.path) for one in asked] == [("motion", "a"), ("motion", "b")]
+    assert merged.changes == {key_of("a", "clip"): entry("23", "2", "x")}
+    assert [one.entry.path for one in merged.combined] == ["a"]
+    assert [(one.key, one.parts, one.clash) for one in merged.conflicts] == [(key, ("motion",), ADDED_TWICE)]
+
+
+@pytest.mark.parametrize(
+    ("take", "path", "motion"), [(Side.OURS, "y", "23"), (Side.THEIRS, "z", "23"), (Side.BASE, "a", "1")]
+)
+def test_a_merged_document_is_kept_where_a_side_decides_the_path(take: Side, path: str, motion: str) -> None:
+    base, ours, theirs = (
+        DatasetEntry(at, "clip", {"motion": digest, "info": "1"}, ())
+        for at, digest in (("a", "1"), ("y", "2"), ("z", "3"))
+    )
+    sides = [ComparedEntry(base, ours)], [ComparedEntry(base, theirs)]
+    undecided = merge_entries(*sides, {}, lambda changed: ["23" for _ in changed])
+    assert [one.parts for one in undecided.conflicts] == [("path",)]
+    merged = merge_entries(*sides, {ours.key: take}, lambda changed: ["23" for _ in changed])
+    expected = {key_of(path, "clip"): {"parts": {"motion": motion, "info": "1"}, "tags": []}}
+    assert {key: value for key, value in merged.changes.items() if value is not None} == expected
 
 
 def test_an_entry_is_what_its_key_and_value_say() -> None:

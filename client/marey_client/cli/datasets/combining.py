@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from marey_client.handles.datasets import DatasetHandle, PickOptions
-    from marey_schemas.datasets.merges import MergeAnswer, Resolution
+    from marey_schemas.datasets.merges import EntryConflict, MergeAnswer, Resolution
 
 Into = Annotated[str, typer.Option(help="Branch that gets the changes.")]
 CommitMessage = Annotated[str, typer.Option("--message", "-m", help="Message of the commit.")]
@@ -66,7 +66,8 @@ def merge(
     base: Base = None,
     as_json: AsJson = False,
 ) -> None:
-    """Merge a version into a branch. Changes of different parts of one entry are combined.
+    """Merge a version into a branch. Changes of different parts of one entry are combined, and so are labels of
+    different frames in one annotation.
 
     If both sides have changed the same part of an entry, nothing is merged until each such conflict is decided by
     --ours, --theirs or --base. The exit status is 1 while a conflict is left.
@@ -188,6 +189,8 @@ def _print_result(found: MergeAnswer, into: str) -> None:
     if found.conflict_count:
         rows = [(one.path, one.kind, ", ".join(one.parts)) for one in found.conflicts]
         print_table(("conflict", "kind", "changed on both sides"), rows)
+        for one in found.conflicts:
+            _print_reason(one)
         print_message(
             f"{counted(found.conflict_count, 'conflict')}; nothing is recorded. Decide each by --ours, "
             "--theirs or --base"
@@ -199,3 +202,16 @@ def _print_result(found: MergeAnswer, into: str) -> None:
             f"{into} is at {short(found.commit.digest)} now; {counted(found.changes, 'entry')} changed. "
             "marey dataset checkout gives the folder its entries"
         )
+
+
+def _print_reason(conflict: EntryConflict) -> None:
+    """Print why an annotation could not be merged, and the segments of each side that exclude each other."""
+    from marey_schemas.datasets.merges import Side
+
+    if conflict.reason:
+        print_message(f"{conflict.path}: {conflict.reason}")
+    if conflict.segments is not None:
+        for side in Side:
+            segments = getattr(conflict.segments, side)
+            shown = ", ".join(f"{one.label} {one.start}:{one.end}" for one in segments)
+            print_message(f"  {side}: {shown or 'none'}")

@@ -180,6 +180,7 @@ class DatasetMerges(Resource):
     async def post(self, project: str, dataset: str, body: MergeRequest) -> Rendered:
         """Merge a version into a branch, entry by entry and part by part, or preview the result.
 
+        Annotations that both sides have changed are merged segment by segment.
         Conflicts without a resolution are answered with 409 and listed in `context`; then nothing changes.
         """
         merge = await self.look_up(datasets.prepare_merge, project, dataset, body)

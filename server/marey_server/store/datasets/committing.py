@@ -34,6 +34,7 @@ from marey_server.store.datasets.history import read_commit, tree_of
 from marey_server.store.datasets.naming import find_dataset, find_ref, is_tag
 from marey_server.store.datasets.protection import Mover, require_move
 from marey_server.store.datasets.revisions import store_combined
+from marey_server.store.documents import PreparedDocument
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset, dataset_commit, dataset_ref, fast_forward, item, user
 from marey_server.store.transaction import IN_LIST, Transaction
@@ -64,7 +65,9 @@ class PreparedCommit:
     chunks: Mapping[str, bytes] = field(default_factory=dict)
     contents: Contents = field(default_factory=Contents)
     combined: Sequence[CombinedEntry] = ()
-    """Entries that have parts of both sides of a merge; no item may have their revisions yet."""
+    """Entries that have changes of both sides of a merge; no item may have their revisions yet."""
+    documents: Mapping[str, PreparedDocument] = field(default_factory=dict)
+    """Documents in these entries that are not stored yet, by content digest."""
     of_folder: bool = False
     existing: str | None = None
     """Existing commit to which the branch moves, in place of a new one."""
@@ -122,7 +125,7 @@ def record_commit(
     store_contents(tx, prepared.contents)
     if prepared.combined:
         author_id, message = tx.principal.user_id, prepared.message
-        store_combined(tx, project_row, found.path, prepared.combined, message, author_id=author_id)
+        store_combined(tx, project_row, found.path, prepared.combined, prepared.documents, message, author_id=author_id)
     digest = prepared.existing or _insert(tx, prepared, mover.name)
     if prepared.existing is not None and prepared.write_id is not None:
         tx.execute(insert(fast_forward).values(dataset_id=found.id, write_id=prepared.write_id, digest=digest))

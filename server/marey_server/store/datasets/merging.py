@@ -11,8 +11,11 @@ from sqlalchemy import Row
 
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.merges import (
+    MOST_CONFLICTING_SEGMENTS,
     MOST_CONFLICTS,
     CombineRequest,
+    ConflictingSegment,
+    ConflictingSegments,
     EntryConflict,
     MergeAnswer,
     MergeRequest,
@@ -22,6 +25,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
 from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import projects
+from marey_server.store.datasets.annotations import AnnotationMerger
 from marey_server.store.datasets.chunks import StoredChunks
 from marey_server.store.datasets.committing import PreparedCommit, head_of, record_commit, recorded_as
 from marey_server.store.datasets.history import CommitReader, read_commit, revisions_with, shown_entry, tree_of
@@ -29,6 +33,7 @@ from marey_server.store.datasets.naming import find_dataset, resolve
 from marey_server.store.datasets.protection import Mover
 from marey_server.store.transaction import Transaction
 from marey_versions.ancestry import nearest_common
+from marey_versions.annotations import LabelClash, LabelledRange
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.merging import MergeConflict, merge_entries
 from marey_versions.records import key_of, path_and_kind
@@ -138,7 +143,8 @@ def _combine(
     )
     resolutions = {key_of(one.path, one.kind): one.take for one in request.resolutions}
     mine, their = (_changed(store, base, side, most) for side in (ours, theirs))
-    merged = merge_entries(mine, their, resolutions)
+    annotations = AnnotationMerger(tx, project_id)
+    merged = merge_entries(mine, their, resolutions, annotations.merge)
     if unknown := sorted(resolutions.keys() - merged.decided):
         path, kind = path_and_kind(unknown[0])
         raise InvalidProblem(
@@ -154,8 +160,10 @@ def _combine(
             "conflict_count": len(conflicts),
         }
     )
-    entries = len(Tree(store, tree))
-    commit = replace(commit, tree=tree, entries=entries, chunks=store.new, combined=merged.combined)
+    commit = replace(
+        commit, tree=tree, entries=len(Tree(store, tree)), chunks=store.new, combined=merged.combined,
+        documents=annotations.documents,
+    )  # fmt: skip
     return PreparedMerge(answer, commit)
 
 
@@ -205,7 +213,19 @@ def _shown(one: MergeConflict, held: Mapping[str, tuple[str, int]]) -> EntryConf
         None if side is None else shown_entry(side, held) for side in (one.base, one.ours, one.theirs)
     )
     path, kind = path_and_kind(one.key)
-    return EntryConflict(path=path, kind=Kind(kind), parts=one.parts, base=base, ours=ours, theirs=theirs)
+    return EntryConflict(
+        path=path, kind=Kind(kind), parts=one.parts, base=base, ours=ours, theirs=theirs,
+        reason=one.clash.reason if one.clash else "",
+        segments=_shown_segments(one.clash.segments) if one.clash and one.clash.segments else None,
+    )  # fmt: skip
+
+
+def _shown_segments(clash: LabelClash[LabelledRange]) -> ConflictingSegments:
+    base, ours, theirs = (
+        tuple(ConflictingSegment(**one._asdict()) for one in side[:MOST_CONFLICTING_SEGMENTS])
+        for side in (clash.base, clash.ours, clash.theirs)
+    )
+    return ConflictingSegments(base=base, ours=ours, theirs=theirs)
 
 
 def _common(tx: Transaction, dataset_id: str, ours: str, theirs: str) -> str | None:

@@ -20,6 +20,7 @@ from marey_schemas.wording import counted
 from marey_server import faults
 from marey_server.errors import NotFoundProblem
 from marey_server.store.database.clock import datetime_of
+from marey_server.store.datasets.annotations import AnnotationMerger
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import PreparedCommit, insert_commit, move_branch_to
 from marey_server.store.datasets.history import tree_of
@@ -101,7 +102,8 @@ def commit_outputs(tx: Transaction, wanted: OutputEntries, mover: Mover) -> Comm
     entries = _with_removals(Tree(reader, base), wanted)
     if (refused := _unfit(entries)) is not None:
         return CommittedOutputs(conflict=refused)
-    merged = _merged(reader, base, head, entries)
+    annotations = AnnotationMerger(tx, wanted.project_id)
+    merged = _merged(reader, base, head, entries, annotations)
     if merged.conflicts:
         tree = change(store, base, _values(entries))
         return _on_own_branch(tx, wanted, mover, store, tree, merged)
@@ -109,7 +111,7 @@ def commit_outputs(tx: Transaction, wanted: OutputEntries, mover: Mover) -> Comm
     if tree == head:
         return CommittedOutputs()
     parents = () if ref.digest is None else (ref.digest,)
-    _store_combined(tx, wanted, merged)
+    _store_combined(tx, wanted, merged, annotations)
     digest = _record(tx, wanted, mover, store, tree, parents)
     prepared = PreparedCommit(wanted.dataset_id, wanted.branch, ref.digest, parents, wanted.message, None)
     move_branch_to(tx, prepared, digest, mover)
@@ -159,7 +161,13 @@ def too_many_changes() -> CommitConflict:
     )
 
 
-def _merged(reader: ChunkReader, base: str, head: str, entries: Mapping[str, DatasetEntry | None]) -> MergedEntries:
+def _merged(
+    reader: ChunkReader,
+    base: str,
+    head: str,
+    entries: Mapping[str, DatasetEntry | None],
+    annotations: AnnotationMerger,
+) -> MergedEntries:
     """Merge the entries of a job with what others have changed at the same paths since `base`, part by part."""
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:
@@ -168,7 +176,7 @@ def _merged(reader: ChunkReader, base: str, head: str, entries: Mapping[str, Dat
         now = {key: entry_of(key, value) for key, value in Tree(reader, head).get_several(entries).items()}
     others = [_compared(before.get(key), now.get(key)) for key in entries if before.get(key) != now.get(key)]
     own = [_compared(before.get(key), one) for key, one in entries.items() if before.get(key) != one]
-    return merge_entries(others, own, {})
+    return merge_entries(others, own, {}, annotations.merge)
 
 
 def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> ComparedEntry:
@@ -178,12 +186,14 @@ def _compared(before: DatasetEntry | None, after: DatasetEntry | None) -> Compar
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _store_combined(tx: Transaction, wanted: OutputEntries, merged: MergedEntries) -> None:
-    """Store the revisions of the entries of which the job and somebody else have changed different parts."""
+def _store_combined(
+    tx: Transaction, wanted: OutputEntries, merged: MergedEntries, annotations: AnnotationMerger
+) -> None:
+    """Store the revisions of the entries that have changes of the job and of somebody else."""
     if merged.combined:
         folder = tx.execute(_FOLDER.where(dataset.c.id == wanted.dataset_id)).scalar()
         store_combined(
-            tx, find_by_id(tx, wanted.project_id), folder, merged.combined, wanted.message,
+            tx, find_by_id(tx, wanted.project_id), folder, merged.combined, annotations.documents, wanted.message,
             author_id=wanted.author_id, job_id=wanted.job_id,
         )  # fmt: skip
 

@@ -14,7 +14,9 @@ from marey_server.errors import ConflictProblem, InvalidProblem
 from marey_server.store import items
 from marey_server.store.datasets.contents import find_contents_of, store_contents
 from marey_server.store.datasets.history import revisions_with
+from marey_server.store.documents import PreparedDocument
 from marey_server.store.items import Draft, StoredDocument
+from marey_server.store.items.drafts import PartContent
 from marey_server.store.items.revisions import read_part_digests
 from marey_server.store.projects import ProjectRow
 from marey_server.store.transaction import Transaction
@@ -80,24 +82,28 @@ def store_combined(
     project_row: ProjectRow,
     folder: str | None,
     combined: Sequence[CombinedEntry],
+    merged: Mapping[str, PreparedDocument],
     message: str,
     *,
     author_id: str | None,
     job_id: str | None = None,
 ) -> None:
-    """Store the revisions of entries that have parts of both sides of a merge, unless the project has them already."""
+    """Store the revisions of entries that have changes of both sides of a merge, unless the project has them already.
+
+    `merged` maps the content digests of parts that were merged to their documents.
+    """
     sides = {side.content for one in combined for side in (one.ours, one.theirs)}
     held = {content: RevisionKey(*key) for content, key in revisions_with(tx, project_row.id, sides).items()}
     require_contents(sides - held.keys())
-    documents = read_part_digests(tx, set(held.values()))
+    stored = read_part_digests(tx, set(held.values()))
     drafts: dict[str, Draft] = {}
     for entry, ours, theirs in combined:
-        parts = {}
+        parts: dict[str, PartContent] = {}
         for part, digest in entry.parts.items():
-            side = ours if ours.parts.get(part) == digest else theirs
-            parts[part] = StoredDocument(documents[held[side.content]][part])
+            side = next((one for one in (ours, theirs) if one.parts.get(part) == digest), None)
+            parts[part] = merged[digest] if side is None else StoredDocument(stored[held[side.content]][part])
         drafts[entry.content] = Draft(
-            name_in_batch=entry.content, kind=Kind(entry.kind), parts=dict(parts), reuse="new", message=message,
+            name_in_batch=entry.content, kind=Kind(entry.kind), parts=parts, reuse="new", message=message,
             item_name=item_name(entry.path, entry.content), collection=folder or "",
         )  # fmt: skip
     publish_contents(tx, project_row, drafts, drafts.keys(), author_id=author_id, job_id=job_id)

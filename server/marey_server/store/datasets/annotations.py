@@ -1,0 +1,112 @@
+"""Merges of annotations that both sides of a merge have changed: their documents are loaded, merged and prepared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from marey_schemas.kinds import Kind
+from marey_server.store import documents, items
+from marey_server.store.datasets.contents import Contents, find_contents_of
+from marey_server.store.datasets.history import revisions_with
+from marey_server.store.documents import PreparedDocument
+from marey_server.store.items.revisions import read_part_digests
+from marey_server.store.transaction import Transaction
+from marey_versions.annotations import ADDED_TWICE, AnnotationClash, AnnotationVersion, merge_annotations
+from marey_versions.merging import ChangedPart
+from marey_versions.records import document_content, local_document, portable_document, references_in
+
+PART = "annotation"
+AT_ONCE = 100
+"""Greatest number of annotations whose versions are loaded by the same statements."""
+MOST_MERGED = 1_000
+"""Greatest number of annotations that one merge combines. It limits how long other writers wait for the commit."""
+MOST_BYTES = 8 * 1024**2
+"""Greatest total size of the documents that one merge loads."""
+
+NO_CONTENT = AnnotationClash("The project has no revision with the content of one of the versions.")
+TOO_LARGE = AnnotationClash(
+    f"Both sides have changed more than {MOST_MERGED:,} annotations, or annotations of more than "
+    f"{MOST_BYTES // 1024**2} MiB in total, so this one was not merged segment by segment."
+)
+
+
+class AnnotationMerger:
+    """Merges annotations of one project, and keeps the resulting documents until a commit stores them."""
+
+    def __init__(self, tx: Transaction, project_id: str) -> None:
+        self._tx = tx
+        self._project_id = project_id
+        self._loaded = 0
+        self._loaded_bytes = 0
+        self.documents: dict[str, PreparedDocument] = {}
+        """Merged documents by content digest."""
+
+    def merge(self, changed: Sequence[ChangedPart]) -> list[str | AnnotationClash | None]:
+        """Merge the documents of parts, as `merge_entries` needs it; only annotations are merged."""
+        outcomes: list[str | AnnotationClash | None] = [None] * len(changed)
+        places = [at for at, one in enumerate(changed) if one.ours.kind == Kind.ANNOTATION.value and one.part == PART]
+        for start in range(0, len(places), AT_ONCE):
+            some = places[start : start + AT_ONCE]
+            for at, outcome in zip(some, self._merge_some([changed[at] for at in some]), strict=True):
+                outcomes[at] = outcome
+        return outcomes
+
+    def _merge_some(self, changed: Sequence[ChangedPart]) -> list[str | AnnotationClash]:
+        versions = [_contents_of(one) for one in changed]
+        digests = self._find_documents({content for three in versions for content in three})
+        sizes = documents.stored_bytes_of(self._tx, digests.values())
+        refused = [self._refusal(three, digests, sizes) for three in versions]
+        chosen = {
+            digests[content]
+            for three, refusal in zip(versions, refused, strict=True)
+            if refusal is None
+            for content in three
+        }
+        bodies = documents.load_bodies(self._tx, chosen)
+        contents = find_contents_of(self._tx, {one for body in bodies.values() for one in references_in(body["clip"])})
+        return [
+            refusal or self._merge_versions([bodies[digests[content]] for content in three], contents)
+            for three, refusal in zip(versions, refused, strict=True)
+        ]
+
+    def _find_documents(self, wanted: Iterable[str]) -> dict[str, str]:
+        """Return the digest of the annotation in each revision with a wanted content digest, if the project has it."""
+        held = revisions_with(self._tx, self._project_id, wanted)
+        parts = read_part_digests(self._tx, set(held.values()))
+        return {content: parts[key][PART] for content, key in held.items()}
+
+    def _refusal(
+        self, three: Sequence[str], digests: Mapping[str, str], sizes: Mapping[str, int]
+    ) -> AnnotationClash | None:
+        """Return the reason for which versions of an annotation are not loaded, None if they are."""
+        if not three:
+            return ADDED_TWICE
+        if any(content not in digests for content in three):
+            return NO_CONTENT
+        self._loaded += 1
+        self._loaded_bytes += sum(sizes[digests[content]] for content in three)
+        return TOO_LARGE if self._loaded > MOST_MERGED or self._loaded_bytes > MOST_BYTES else None
+
+    def _merge_versions(self, bodies: Sequence[Mapping[str, Any]], contents: Contents) -> str | AnnotationClash:
+        """Merge the documents of the base, our side and their side; return the content digest of the result."""
+        merged = merge_annotations(*(_version(body, contents) for body in bodies))
+        if isinstance(merged, AnnotationClash):
+            return merged
+        clips = {contents.revisions.get(one): one for body in bodies for one in references_in(body["clip"])}
+        local = {**merged, "clip": local_document(merged["clip"], clips.get)}
+        prepared = items.prepare_part(Kind.ANNOTATION, PART, local)
+        digest = document_content(prepared.body, contents.revisions.get)
+        self.documents[digest] = prepared
+        return digest
+
+
+def _contents_of(one: ChangedPart) -> tuple[str, ...]:
+    """Return the content digests of the three revisions with versions of a part; none if there is no base."""
+    return () if one.base is None else (one.base.content, one.ours.content, one.theirs.content)
+
+
+def _version(body: Mapping[str, Any], contents: Contents) -> AnnotationVersion:
+    """Return a version of an annotation from its stored document, in which the clip is the only reference."""
+    motion = next((contents.parts.get(one, {}).get("motion") for one in references_in(body["clip"])), None)
+    return AnnotationVersion({**body, "clip": portable_document(body["clip"], contents.revisions.get)}, motion)
