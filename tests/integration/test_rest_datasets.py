@@ -80,6 +80,11 @@ def change(owner: httpx.Client, path: str, **fields: Any) -> Any:
     return ok(owner.patch(url, json=fields, headers={"If-Match": "*"}))
 
 
+def delete(owner: httpx.Client, path: str) -> None:
+    url = f"{LAB}/skeletons/{item_at(owner, path)['id']}"
+    assert owner.delete(url, headers={"If-Match": "*"}).status_code == 204
+
+
 def put(owner: httpx.Client, path: str, joint: str) -> Any:
     """Replace the only joint of a skeleton."""
     url = f"{LAB}/skeletons/{item_at(owner, path)['id']}/parts/hierarchy"
@@ -497,6 +502,41 @@ def test_the_commits_that_changed_a_path_are_listed(
     assert (log("a"), log("a b"), log("b")) == (["untag a", "tag a", "first"], ["add a b/a"], ["first"])
 
 
+def test_a_list_of_commits_says_what_each_did_at_the_path(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def log(path: str) -> list[tuple[Any, ...]]:
+        found = ok(owner.get(f"{GAITS}/commits", params={"path": path}))["items"]
+        return [(one["message"], one["changes"], one["moved_from"], one["moved_to"]) for one in found]
+
+    change(owner, "gaits/a", tags=["slow"])
+    gaits("tag a")
+    change(owner, "gaits/a", name="c")
+    gaits("rename a")
+    change(owner, "gaits/c", collection="gaits/old")
+    gaits("move c")
+    delete(owner, "gaits/b")
+    gaits("drop b")
+    tagged, first = ("tag a", {"changed": 1}, None, None), ("first", {"added": 1}, None, None)
+    assert log("a") == [("rename a", {"moved": 1}, None, "c"), tagged, first]
+    assert log("c") == [("move c", {"moved": 1}, None, "old/c"), ("rename a", {"moved": 1}, "a", None)]
+    assert log("old") == [("move c", {"moved": 1}, "c", None)]
+    assert log("b") == [("drop b", {"removed": 1}, None, None), first]
+    assert {one["changes"] for one in ok(owner.get(f"{GAITS}/commits"))["items"]} == {None}
+    # Moved entries are searched for among a limited number of changes, and a page compares a limited number.
+    monkeypatch.setattr("marey_server.store.datasets.history.MOST_DIFFERENCES", 1)
+    assert log("a") == [("rename a", {"removed": 1}, None, None)]
+
+
+def test_a_merge_is_listed_with_what_it_changed_on_its_branch(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: delete(owner, "gaits/b"), lambda: change(owner, "gaits/a", tags=["slow"]))
+    ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "message": "merge"}))
+    found = ok(owner.get(f"{GAITS}/commits", params={"path": "b"}))["items"]
+    assert [(one["message"], one["changes"]) for one in found] == [("merge", {"removed": 1}), ("first", {"added": 1})]
+
+
 def test_the_origin_of_each_part_is_shown(owner: httpx.Client, two_branches: Callable[..., None]) -> None:
     two_branches(lambda: put(owner, "gaits/a", "Pelvis"), lambda: change(owner, "gaits/a", name="c", tags=["slow"]))
     ok(owner.post(f"{GAITS}/merges", json={"version": "trial"}))
@@ -504,7 +544,42 @@ def test_the_origin_of_each_part_is_shown(owner: httpx.Client, two_branches: Cal
     assert (found["tags"]["commit"]["message"], found["place"]["commit"]["message"]) == ("on main", "on main")
     origin = found["parts"]["hierarchy"]
     assert (origin["commit"]["message"], origin["path"], origin["certain"]) == ("on trial", "a", True)
-    refused(owner.get(f"{GAITS}/blame", params={"entry": "a", "kind": "skeleton"}), 404, "no-entry")
+
+
+def test_an_entry_without_origins_is_named_with_the_commit_that_removed_it(
+    owner: httpx.Client, gaits: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(entry: str, version: str = "main") -> Any:
+        params = {"entry": entry, "kind": "skeleton", "version": version}
+        answer = refused(owner.get(f"{GAITS}/blame", params=params), 404, "no-entry")
+        return answer["detail"], answer["context"]
+
+    delete(owner, "gaits/b")
+    dropped = gaits("Leave out what slides\n\nSeen by Ada.")
+    change(owner, "gaits/a", name="c")
+    renamed = gaits("x" * 500)
+    detail, context = missing("b")
+    assert detail == (
+        f"The version has no skeleton at 'b'; it was removed by the commit {dropped['digest']} "
+        "('Leave out what slides')."
+    )
+    assert context == {"removed_by": dropped, "moved_to": None}
+    detail, context = missing("a")
+    assert f"at 'a'; it was moved to 'c' by the commit {renamed['digest']} ('{'x' * 200}…')." in detail
+    assert context == {"removed_by": renamed, "moved_to": "c"}
+    assert missing("c", "main~1") == ("The version has no skeleton at 'c'.", {})  # only a later version has it
+    monkeypatch.setattr("marey_server.store.datasets.history.MOST_EXAMINED", 1)
+    assert missing("b") == ("The version has no skeleton at 'b', nor do the 1 versions before it.", {})
+
+
+def test_an_entry_that_a_merge_removed_is_named_with_the_merge(
+    owner: httpx.Client, two_branches: Callable[..., None]
+) -> None:
+    two_branches(lambda: delete(owner, "gaits/b"), lambda: change(owner, "gaits/a", tags=["slow"]))
+    merge = ok(owner.post(f"{GAITS}/merges", json={"version": "trial", "message": "merge"}))["commit"]
+    params = {"entry": "b", "kind": "skeleton"}
+    answer = refused(owner.get(f"{GAITS}/blame", params=params), 404, "no-entry")
+    assert answer["context"]["removed_by"] == merge
 
 
 def test_readers_read_and_contributors_commit(server: Server, gaits: Callable[..., Any]) -> None:

@@ -14,7 +14,7 @@ from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.transport import Params, Transport, as_json, read_model
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
-from marey_schemas.datasets.differences import DatasetDifference
+from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
 from marey_schemas.datasets.merges import (
     CheckoutAnswer,
     CheckoutRequest,
@@ -217,12 +217,13 @@ class DatasetHandle:
         )
         return self.transport.post(Commit, f"{self.url}/commits", request)
 
-    def log(self, version: str = MAIN, *, path: str = "") -> Iterator[Commit]:
-        """List a version and the versions before it, newest first.
+    def log(self, version: str = MAIN, *, path: str = "") -> Iterator[ListedCommit]:
+        """List a version and the versions before it, newest first; of a merge, only the first parent is followed.
 
-        With `path`, list only the commits that changed the entry or the folder at this path.
+        With `path`, list only the commits that changed the entry or the folder at this path, with the number of entries
+        that each of them added, removed, moved and changed there.
         """
-        return pages(self.transport, Commit, f"{self.url}/commits", {"version": version, "path": path})
+        return pages(self.transport, ListedCommit, f"{self.url}/commits", {"version": version, "path": path})
 
     def at(self, version: str = MAIN) -> Commit:
         """Return the commit that a version names."""

@@ -14,6 +14,23 @@ ChangeKind = Literal["added", "removed", "moved", "changed"]
 """Kind of change of an entry, or of a part of an entry, between two versions; only entries are moved."""
 
 
+class ListedCommit(Commit):
+    """Commit in a list of commits. In the list of a path, it says what it did with the entries at this path."""
+
+    changes: dict[ChangeKind, int] | None = Field(
+        None,
+        description="Number of entries at the path of the list or below it that the commit added, removed, moved or "
+        "changed, compared with its first parent; null: the list has no path. At most 100,000 entries are counted; if "
+        "the commit changes more entries than that in all folders, moved entries count as added or removed.",
+    )
+    moved_from: str | None = Field(
+        None, description="If the commit moved a single entry to the path of the list: the path before."
+    )
+    moved_to: str | None = Field(
+        None, description="If the commit moved a single entry away from the path of the list: the path after."
+    )
+
+
 class EntryDifference(Answer):
     """Difference of one entry between two versions."""
 

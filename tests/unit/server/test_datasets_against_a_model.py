@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import secrets
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from marey_schemas.datasets.merges import MergeRequest, PickRequest, Resolution,
 from marey_schemas.datasets.naming import DatasetCreate, RefCreate, RefKind, RefMove
 from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
-from marey_server.errors import ApiProblem
+from marey_server.errors import ApiProblem, NotFoundProblem
 from marey_server.store import datasets, items
 from marey_server.store.datasets import committing, merging
 from marey_server.store.fsck import check_store
@@ -261,13 +262,26 @@ class DatasetMachine(RuleBasedStateMachine):
         chain = self.model.first_parents(at)
         assert [one.digest for one in log] == chain
         of_b = self.lab.read(datasets.list_commits, "lab", self.name, at, path="b", **page).items
-        assert [one.digest for one in of_b] == [one for one in chain if self._changes_b(one)]
+        changes = [(one, self._changes_of_b(one)) for one in chain]
+        assert [(one.digest, one.changes) for one in of_b] == [one for one in changes if one[1]]
         found = self.lab.read(datasets.compare_versions, "lab", self.name, at, after, path="", limit=1_000)
         later = self.model.state(after)
         assert {one.path for one in found.entries} == {path for path in PATHS if state.get(path) != later.get(path)}
-        for path in state:
+        for path in PATHS:
+            if path not in state:
+                self._look_for_removal(at, path)
+                continue
             origins = self.lab.read(datasets.read_origins, "lab", self.name, at, path=path, kind=Kind.SKELETON)
             assert origins.parts["hierarchy"].commit.digest == self.model.origin(at, path)
+
+    def _look_for_removal(self, at: str, path: str) -> None:
+        """Expect that the error for a missing entry names the commit that removed it, or none if it never existed."""
+        chain = self.model.first_parents(at)
+        had = [path in self.model.state(one) for one in chain]
+        removed_by = chain[had.index(True) - 1] if any(had) else None
+        with pytest.raises(NotFoundProblem) as caught:
+            self.lab.read(datasets.read_origins, "lab", self.name, at, path=path, kind=Kind.SKELETON)
+        assert caught.value.context.get("removed_by", {"digest": None})["digest"] == removed_by
 
     def teardown(self) -> None:
         assert list(check_store(self.lab.database)) == []
@@ -316,10 +330,15 @@ class DatasetMachine(RuleBasedStateMachine):
     def _branch_with_commits(self, name: str) -> str | None:
         return None if name in self.model.tags else self.model.refs.get(name)
 
-    def _changes_b(self, digest: str) -> bool:
+    def _changes_of_b(self, digest: str) -> dict[str, int]:
         made = self.model.commits[digest]
         before = self.model.state(made.parents[0]) if made.parents else {}
-        return any(before.get(path) != made.state.get(path) for path in ("b", "b/c"))
+        sides = [(before.get(path), made.state.get(path)) for path in ("b", "b/c")]
+        return dict(
+            Counter(
+                "added" if old is None else "removed" if new is None else "changed" for old, new in sides if old != new
+            )
+        )
 
     @staticmethod
     def _resolutions(conflicts: set[str], take: Side | None) -> tuple[Resolution, ...]:

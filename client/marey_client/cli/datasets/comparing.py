@@ -56,7 +56,8 @@ def diff(
             return print_json(found)
         if by_folder:
             print_table(
-                ("folder", "changes"), [(name or "/", _counts(counts)) for name, counts in found.folders.items()]
+                ("folder", "changes"),
+                [(name or "/", counts_in_words(counts)) for name, counts in found.folders.items()],
             )
         else:
             rows = [(one.change, one.kind, one.path, _what(one)) for one in found.entries]
@@ -65,10 +66,11 @@ def diff(
             for line in _detailed(marey, at, found):
                 typer.echo(line)
     heading = f"{short(found.before.digest)} to {short(found.after.digest)}"
-    return print_message(f"{heading}: {_counts(found.counts) or 'no difference'}")
+    return print_message(f"{heading}: {counts_in_words(found.counts) or 'no difference'}")
 
 
-def _counts(counts: Mapping[ChangeKind, int]) -> str:
+def counts_in_words(counts: Mapping[ChangeKind, int]) -> str:
+    """Return the numbers of entries by kind of change, such as `2 added, 1 removed`."""
     return ", ".join(f"{count:,} {change}" for change, count in sorted(counts.items()))
 
 

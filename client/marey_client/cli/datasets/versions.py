@@ -16,6 +16,7 @@ from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_schemas.datasets.commits import Commit, Origin
+    from marey_schemas.datasets.differences import ListedCommit
     from marey_schemas.datasets.protection import Protection
 
 dataset = typer.Typer(
@@ -90,19 +91,37 @@ def log(
     context: typer.Context,
     place: VersionPlace,
     path: Annotated[
-        str, typer.Option(help="Entry or folder: list only versions that changed it or anything below it.")
+        str,
+        typer.Option(
+            help="Entry or folder: list only versions that changed it or anything below it, and how many entries each "
+            "of them added, removed, moved or changed there, compared with its first parent."
+        ),
     ] = "",
     most: Annotated[int, typer.Option("--limit", "-n", min=1, help="Greatest number of versions to list.")] = 20,
     as_json: AsJson = False,
 ) -> None:
-    """List a version and the versions before it, newest first."""
+    """List a version and the versions before it, newest first.
+
+    Of a merge, only the first parent is followed: the branch that the merge changed. So the list of this branch has the
+    merge itself, but not the versions that it merged.
+    """
     at = parse(place, version=True)
     with connect(context) as marey:
         found = list(islice(at.on(marey).log(at.version, path=path.strip("/")), most))
     if as_json:
         return print_json(found)
-    rows = [(short(one.digest), one.at, one.author, one.entries, one.job, one.message) for one in found]
-    return print_table(("commit", "time", "author", "entries", "job", "message"), rows, right=("entries",))
+    columns = ("commit", "time", "author", "entries", *(("changes",) if path else ()), "job", "message")
+    rows = [
+        (short(one.digest), one.at, one.author, one.entries, *((_at_path(one),) if path else ()), one.job, one.message)
+        for one in found
+    ]
+    return print_table(columns, rows, right=("entries",))
+
+
+def _at_path(one: ListedCommit) -> str:
+    """Return what a commit did at the path of the list, such as `1 moved to raw/stroll`."""
+    where = [f" {way} {path}" for way, path in (("from", one.moved_from), ("to", one.moved_to)) if path]
+    return "".join([comparing.counts_in_words(one.changes or {}), *where])
 
 
 @dataset.command("show")

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from marey_schemas.base import Request
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryOrigins, EntryPath
-from marey_schemas.datasets.differences import DatasetDifference
+from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
 from marey_schemas.datasets.merges import CheckoutAnswer, CheckoutRequest, MergeAnswer, MergeRequest, PickRequest
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefCreate, RefMove, Version
 from marey_schemas.datasets.protection import ProtectionRule
@@ -128,8 +128,8 @@ class CommitsQuery(PageQuery):
     version: Version = Field(MAIN, description="Version at which the list begins.")
     path: CollectionPath = Field(
         "",
-        description="Entry or folder: only commits that changed it or anything below it are listed. A page may then "
-        "be shorter than its limit although others follow.",
+        description="Entry or folder: only commits that changed it or anything below it are listed, each with the "
+        "number of entries by kind of change. A page may then be shorter than its limit although others follow.",
     )
 
 
@@ -139,9 +139,9 @@ class DatasetCommits(Resource):
     path = "/projects/{project}/datasets/{dataset}/commits"
     tag = "ProjectDatasets"
 
-    @reads(access=Access.READER, query=CommitsQuery, answer=Commit, paged=True)
+    @reads(access=Access.READER, query=CommitsQuery, answer=ListedCommit, paged=True)
     async def get(self, project: str, dataset: str, query: CommitsQuery) -> Rendered:
-        """List a version and the versions before it, newest first."""
+        """List a version and the versions before it, newest first; of a merge, only the first parent is followed."""
         return await self.answer(
             datasets.list_commits,
             project,
@@ -300,7 +300,10 @@ class EntryBlame(Resource):
 
     @reads(access=Access.READER, query=BlameQuery, answer=EntryOrigins)
     async def get(self, project: str, dataset: str, query: BlameQuery) -> Rendered:
-        """Return the commits that last changed the parts, the path and the tags of an entry."""
+        """Return the commits that last changed the parts, the path and the tags of an entry.
+
+        If the version does not have the entry, the error `no-entry` names the commit that removed it.
+        """
         return await self.answer(
             datasets.read_origins, project, dataset, query.version, path=query.entry, kind=query.kind
         )

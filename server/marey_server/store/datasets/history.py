@@ -6,13 +6,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import Any, NamedTuple
 
 from sqlalchemy import Row, literal, select
 
 from marey_schemas.datasets.commits import Commit, Entry, EntryOrigins, Origin
-from marey_schemas.datasets.differences import ChangeKind, DatasetDifference, EntryDifference
+from marey_schemas.datasets.differences import ChangeKind, DatasetDifference, EntryDifference, ListedCommit
 from marey_schemas.items import Page
 from marey_schemas.kinds import Kind
 from marey_server.errors import BadRequestProblem, NotFoundProblem
@@ -22,17 +22,19 @@ from marey_server.store.datasets.naming import find_dataset, first_parents, reso
 from marey_server.store.projects import ProjectRow
 from marey_server.store.tables import commit_parent, dataset_commit, item, revision
 from marey_server.store.transaction import IN_LIST, Transaction
+from marey_versions.at_path import ChangeAtPath, PathComparer, changes_at, path_after, prefixes_of
 from marey_versions.compared import ComparedEntry, compare_entries
 from marey_versions.origins import PATH, TAGS, find_origins
 from marey_versions.records import DatasetEntry, entry_of, key_of, path_and_kind
 from marey_versions.tree.chunks import Value
-from marey_versions.tree.difference import Changed, difference
 from marey_versions.tree.reading import ChunkReader, Tree
 
 MOST_EXAMINED = 1000
 """Greatest number of commits that one request reads to find those that changed a path."""
 MOST_DIFFERENCES = 100_000
 """Greatest number of differing entries that are counted in one answer."""
+MOST_QUOTED = 200
+"""Greatest number of characters of the message of a commit that an error quotes."""
 
 
 def read_commit(tx: Transaction, project: str, name: str, version: str) -> Commit:
@@ -80,71 +82,72 @@ def list_commits(
     """List a commit and the commits before it, newest first; of the parents of a merge, only the first is followed.
 
     With `path`, list only the commits that changed the entries at this path or below it, compared with their first
-    parent. A page ends after `MOST_EXAMINED` commits, so it may have fewer than `limit` commits although more follow.
+    parent, and say what each of them did there. A page ends after `MOST_EXAMINED` commits or `MOST_DIFFERENCES`
+    compared entries, so it may have fewer than `limit` commits although more follow.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
     order = listing.parse_order("place", {"place": literal(0)}, unique="place")
     identity = ["commits", row.id, version, path]
     start = resolve(tx, row.id, version) if cursor is None else listing.read_cursor(tx, cursor, order, identity)[0]
-    earlier = first_parents(row.id, start, MOST_EXAMINED if path else limit)
-    found = tx.execute(
-        select(dataset_commit)
-        .join(earlier, earlier.c.digest == dataset_commit.c.digest)
-        .where(dataset_commit.c.dataset_id == row.id)
-        .order_by(earlier.c.place)
-    ).all()
-    chosen, following = _changing(tx, found, path, limit) if path else (found[:limit], found[limit:][:1])
-    parents = _parents(tx, row.id, [one.digest for one in chosen])
+    found = _along_first_parents(tx, row.id, start, MOST_EXAMINED if path else limit)
+    chosen: list[tuple[Row[Any], ChangeAtPath | None]] = [(one, None) for one in found[:limit]]
+    following = found[limit:][:1]
+    if path:
+        chosen, following = _changing(tx, found, path, limit)
+    parents = _parents(tx, row.id, [one.digest for one, _ in chosen])
     return Page(
-        items=tuple(_shown(one, parents.get(one.digest, ())) for one in chosen),
+        items=tuple(_listed(one, parents.get(one.digest, ()), change) for one, change in chosen),
         next_cursor=listing.make_cursor(tx, order, identity, [following[0].digest]) if following else None,
     )
 
 
+def _along_first_parents(tx: Transaction, dataset_id: str, start: str, steps: int) -> Sequence[Row[Any]]:
+    """Return the rows of a commit, its first parent, the first parent of that, and so on, up to the place `steps`."""
+    earlier = first_parents(dataset_id, start, steps)
+    return tx.execute(
+        select(dataset_commit)
+        .join(earlier, earlier.c.digest == dataset_commit.c.digest)
+        .where(dataset_commit.c.dataset_id == dataset_id)
+        .order_by(earlier.c.place)
+    ).all()
+
+
+def _listed(row: Row[Any], parents: Sequence[str], change: ChangeAtPath | None) -> ListedCommit:
+    made = dict(_shown(row, parents))
+    if change is None:
+        return ListedCommit(**made)
+    return ListedCommit(**made, changes=dict(change.counts), moved_from=change.moved_from, moved_to=change.moved_to)
+
+
 def _changing(
     tx: Transaction, commits: Sequence[Row[Any]], path: str, limit: int
-) -> tuple[list[Row[Any]], Sequence[Row[Any]]]:
+) -> tuple[list[tuple[Row[Any], ChangeAtPath | None]], Sequence[Row[Any]]]:
     """Return the commits that changed a path, at most `limit`, and the commit, if any, at which the next page begins.
 
     In `commits`, each commit is followed by its first parent.
     """
-    reader = ChunkReader(StoredChunks(tx))
-    found: list[Row[Any]] = []
+    comparer = PathComparer(ChunkReader(StoredChunks(tx)), path, MOST_DIFFERENCES)
+    found: list[tuple[Row[Any], ChangeAtPath | None]] = []
     for place, one in enumerate(commits[:MOST_EXAMINED]):
-        if len(found) == limit:
+        if len(found) == limit or comparer.compared > MOST_DIFFERENCES:
             return found, [one]
         before = commits[place + 1].tree if place + 1 < len(commits) else None
-        if _path_differs(reader, before, one.tree, path):
-            found.append(one)
+        change = comparer.change(before, one.tree)
+        if change is not None:
+            found.append((one, change))
     return found, commits[MOST_EXAMINED:]
-
-
-def _path_differs(reader: ChunkReader, before: str | None, after: str, path: str) -> bool:
-    if before is None:
-        return any(Tree(reader, after).count(prefix) for prefix in _prefixes_of(path))
-    return next(_changes_at(reader, before, after, path), None) is not None
-
-
-def _changes_at(reader: ChunkReader, before: str, after: str, path: str) -> Iterator[Changed]:
-    """Return the differences of two trees at a path and below it, or all for an empty path."""
-    return chain.from_iterable(difference(reader, before, after, prefix=prefix) for prefix in _prefixes_of(path))
-
-
-def _prefixes_of(path: str) -> tuple[str, ...]:
-    """Return key prefixes that match exactly the entries at a path and below it, in key order."""
-    return (key_of(path, ""), f"{path}/") if path else ("",)
 
 
 def read_origins(tx: Transaction, project: str, name: str, version: str, *, path: str, kind: Kind) -> EntryOrigins:
     """Return the commits that last changed the parts, the path and the tags of an entry.
 
-    Raises `NotFoundProblem` if the version does not have the entry.
+    Raises `NotFoundProblem` if the version does not have the entry; the error names the commit that removed it.
     """
     row = find_dataset(tx, projects.require(tx, project), name)
     start, key = resolve(tx, row.id, version), key_of(path, kind)
     reader = ChunkReader(StoredChunks(tx))
     if Tree(reader, tree_of(tx, row.id, start)).get(key) is None:
-        raise NotFoundProblem(f"The version has no {kind.value} at {path!r}.", code="no-entry")
+        raise _no_entry(tx, row.id, start, path, kind)
     commits = CommitReader(tx, row.id)
     found = {
         part: Origin(
@@ -155,6 +158,34 @@ def read_origins(tx: Transaction, project: str, name: str, version: str, *, path
         for part, one in find_origins(reader, commits.read, start, key, most=MOST_EXAMINED).items()
     }
     return EntryOrigins(path=path, kind=kind, place=found.pop(PATH), tags=found.pop(TAGS), parts=found)
+
+
+def _no_entry(tx: Transaction, dataset_id: str, start: str, path: str, kind: Kind) -> NotFoundProblem:
+    """Return the error for an entry that a version does not have; it names the commit that removed or moved the entry.
+
+    The commit is searched along the first parents, through `MOST_EXAMINED` commits.
+    """
+    reader, missing = ChunkReader(StoredChunks(tx)), f"The version has no {kind.value} at {path!r}"
+    commits = _along_first_parents(tx, dataset_id, start, MOST_EXAMINED)
+    for later, earlier in pairwise(commits):
+        if Tree(reader, earlier.tree).get(key_of(path, kind)) is None:
+            continue
+        to = path_after(reader, earlier.tree, later.tree, key_of(path, kind), most=MOST_DIFFERENCES)
+        done = "removed" if to is None else f"moved to {to!r}"
+        removed_by = _shown(later, _parents(tx, dataset_id, [later.digest]).get(later.digest, ()))
+        return NotFoundProblem(
+            f"{missing}; it was {done} by the commit {later.digest} ({_first_line(later.message)!r}).",
+            code="no-entry",
+            context={"removed_by": removed_by.model_dump(mode="json"), "moved_to": to},
+        )
+    searched = f", nor do the {MOST_EXAMINED:,} versions before it" if len(commits) > MOST_EXAMINED else ""
+    return NotFoundProblem(f"{missing}{searched}.", code="no-entry")
+
+
+def _first_line(message: str) -> str:
+    """Return the first line of the message of a commit, shortened to `MOST_QUOTED` characters."""
+    line = message.strip().partition("\n")[0]
+    return line if len(line) <= MOST_QUOTED else f"{line[:MOST_QUOTED]}…"
 
 
 @dataclass(frozen=True)
@@ -212,7 +243,7 @@ def list_entries(
 
 def _entries_at(tx: Transaction, tree: str, path: str, *, after: str = "") -> Iterator[tuple[str, Value]]:
     stored = Tree(StoredChunks(tx), tree)
-    return chain.from_iterable(stored.entries(after=after, prefix=prefix) for prefix in _prefixes_of(path))
+    return chain.from_iterable(stored.entries(after=after, prefix=prefix) for prefix in prefixes_of(path))
 
 
 class EntryRevision(NamedTuple):
@@ -296,7 +327,7 @@ def compare_versions(
     project_row = projects.require(tx, project)
     row = find_dataset(tx, project_row, name)
     old, new = (_commit(tx, row.id, resolve(tx, row.id, version)) for version in (before, after))
-    changes = _changes_at(ChunkReader(StoredChunks(tx)), old.tree, new.tree, path)
+    changes = changes_at(ChunkReader(StoredChunks(tx)), old.tree, new.tree, path)
     found = list(islice(changes, MOST_DIFFERENCES + 1))
     if len(found) > MOST_DIFFERENCES:
         raise BadRequestProblem(
