@@ -244,6 +244,31 @@ def the_thing(marey: Marey, text: str, kind: str | None, *, deleted: bool = Fals
     return found[0]
 
 
+def items_selected(marey: Marey, places: Sequence[str], query: str, kind: str | None) -> list[SingleItem]:
+    """Return the items of a kind, by default clips, that a query selects in projects or folders, and in their
+    subfolders; by path in each place, and no item twice.
+
+    Raises `WrongUsage` if a place is not a project or folder, or if the query selects nothing.
+    """
+    if kind == FOLDER:
+        raise WrongUsage("--query selects items, not folders; give another kind with --kind, or none for clips")
+    wanted = kind_named(kind or "clip")
+    found: dict[str, ItemHandle] = {}
+    for place in places:
+        address = Address.parse(place)
+        project = marey.project(address.project)
+        if address.path and project.collections.at(address.path) is None:
+            raise WrongUsage(f"there is no folder at {address}; --query selects items in projects and folders")
+        items = project.items(wanted).list(query=query, collection=address.path)
+        found.update((one.id, one) for one in sorted(items, key=lambda one: one.path))
+    if not found:
+        raise WrongUsage(
+            f"the query selects no item of the kind {wanted} in {', '.join(places)}; "
+            "`marey ls PLACE --query … --explain` counts the items that each condition hides"
+        )
+    return list(map(SingleItem, found.values()))
+
+
 def require_apart(things: Sequence[Thing]) -> None:
     """Raise `WrongUsage` if an address is given twice, or is inside a folder that is also given."""
     for place, one in enumerate(things):

@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from marey_client.cli.addresses import FOLDER, Address, Thing, require_apart, the_thing
+from marey_client.cli.addresses import (
+    FOLDER,
+    REQUESTS_AT_ONCE,
+    Address,
+    SingleItem,
+    Thing,
+    items_selected,
+    require_apart,
+    the_thing,
+)
 from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
-from marey_client.cli.terminal.invocation import AsJson, connect
-from marey_client.cli.terminal.output import print_json, print_message
+from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
+from marey_client.cli.terminal.output import print_json, print_message, print_table, progress
 from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
-    from marey_client.items import ItemHandle
     from marey_client.marey import Marey
+    from marey_schemas.items import ItemChange
 
+AnyThing = TypeVar("AnyThing", bound=Thing)
 Places = Annotated[
     list[str], typer.Argument(help="One or more items or folders: project/folder/name, project/folder/ or project/id.")
 ]
@@ -28,6 +39,22 @@ KindOf = Annotated[
         "--kind", help="Kind of the item, needed if items of several kinds have this name; `collection` means a folder."
     ),
 ]
+PlacesOrFolders = Annotated[
+    list[str],
+    typer.Argument(
+        help="One or more items or folders: project/folder/name, project/folder/ or project/id. With --query: the "
+        "projects or folders in which items are selected."
+    ),
+]
+KindOrClips = Annotated[
+    str | None,
+    typer.Option(
+        "--kind",
+        help="Kind of the item, needed if items of several kinds have this name; `collection` means a folder. With "
+        "--query: kind of the items that are selected; default: clip.",
+    ),
+]
+Preview = Annotated[bool, typer.Option("--preview", help="List what the command would change, but change nothing.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -72,25 +99,33 @@ def mv(
 
 def rm(
     context: typer.Context,
-    places: Places,
-    kind: KindOf = None,
+    places: PlacesOrFolders,
+    kind: KindOrClips = None,
+    query: QueryText = None,
+    preview: Preview = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove items, and folders with their contents; `marey restore` restores them."""
+    """Remove items, and folders with their contents; `marey restore` restores them.
+
+    Each item or folder is removed by a request of its own. If the server refuses one, for example because somebody has
+    changed it since it was selected, the others are removed, and the exit status is 1.
+    """
     with connect(context) as marey:
-        things = [the_thing(marey, place, kind) for place in places]
-        require_apart(things)
+        things = _named_or_selected(marey, places, kind, query)
         count = sum(thing.count() for thing in things)
-        if count > 1 and not yes:
+        if preview:
+            return _preview(("name", "kind"), [(one.place, one.kind) for one in things], things, "removed", as_json)
+        if (count > 1 or query is not None) and not yes:
             _ask(f"remove {counted(count, 'item')} ({_named(things)})?")
 
         def remove(thing: Thing) -> Any:
             thing.delete()
-            print_message(f"{thing.place} is removed; to undo this, run marey restore {_typed(thing)}")
-            return {"id": thing.id, "kind": thing.kind, "place": thing.place}
+            if query is None:
+                print_message(f"{thing.place} is removed; to undo this, run marey restore {_typed(thing)}")
+            return _identified(thing)
 
-        _do_each(things, remove, "removed", as_json)
+        return _do_each(things, remove, "removed", as_json, selected=query is not None)
 
 
 def restore(context: typer.Context, places: Places, kind: KindOf = None, as_json: AsJson = False) -> None:
@@ -137,34 +172,95 @@ def revert(
 
 def tag(
     context: typer.Context,
-    places: Annotated[list[str], typer.Argument(help="One or more items: project/folder/name, or project/id.")],
+    places: Annotated[
+        list[str],
+        typer.Argument(
+            help="One or more items: project/folder/name, or project/id. With --query: the projects or folders in "
+            "which items are selected."
+        ),
+    ],
     add: Annotated[list[str] | None, typer.Option(help="A tag to add; may be repeated.")] = None,
     remove: Annotated[list[str] | None, typer.Option(help="A tag to remove; may be repeated.")] = None,
-    kind: KindOf = None,
+    kind: KindOrClips = None,
+    query: QueryText = None,
+    preview: Preview = False,
     as_json: AsJson = False,
 ) -> None:
-    """Add tags to items, and remove others; `marey ls --tag` lists items by tag."""
+    """Add tags to items, and remove others; `marey ls --tag` lists items by tag.
+
+    Each item is changed by a request of its own. If the server refuses one, for example because somebody has changed
+    it since it was selected, the others are changed, and the exit status is 1.
+    """
     from marey_schemas.items import ItemChange
 
     added, removed = tuple(add or ()), frozenset(remove or ())
     if not added and not removed:
         raise WrongUsage("no tags to change; give them with --add NAME or --remove NAME")
-    ItemChange(tags=added)  # a tag that is none is told before anything changes
+    ItemChange(tags=added)  # an invalid tag is refused before anything changes
     with connect(context) as marey:
-        things = [the_thing(marey, place, kind) for place in places]
-        require_apart(things)
-        for thing in things:
-            if thing.kind == FOLDER:
-                raise WrongUsage(f"{thing.place} is a folder, and folders have no tags; give the items in it")
+        things = _named_or_selected(marey, places, kind, query)
+        wanted = {one.id: _with_tags(one, added, removed) for one in things}
+        items = [one for one in things if isinstance(one, SingleItem)]
+        if query is not None:
+            items = [one for one in items if wanted[one.id].tags != one.handle.item.tags]
+            if len(items) < len(things):
+                print_message(f"{len(things) - len(items):,} of {counted(len(things), 'item')} need no change")
+        if preview:
+            rows = [(one.place, " ".join(one.handle.item.tags), " ".join(wanted[one.id].tags or ())) for one in items]
+            return _preview(("name", "tags", "tags then"), rows, items, "tagged", as_json)
 
-        def put_tags(thing: Any) -> Any:
-            handle: ItemHandle = thing.handle
-            kept = (one for one in (*handle.item.tags, *added) if one not in removed)
-            changed = handle.change(ItemChange(tags=tuple(dict.fromkeys(kept))))
-            print_message(f"{thing.place}: {' '.join(changed.tags) or 'no tags'}")
+        def put_tags(item: SingleItem) -> Any:
+            changed = item.handle.change(wanted[item.id])
+            if query is None:
+                print_message(f"{item.place}: {' '.join(changed.tags) or 'no tags'}")
             return changed
 
-        _do_each(things, put_tags, "changed", as_json)
+        return _do_each(items, put_tags, "changed", as_json, selected=query is not None)
+
+
+def _with_tags(thing: Thing, added: Sequence[str], removed: Set[str]) -> ItemChange:
+    """Return the change that adds and removes tags of an item.
+
+    Raises `WrongUsage` for a folder, and for more tags than an item can have.
+    """
+    from pydantic import ValidationError
+
+    from marey_schemas.items import ItemChange
+
+    if not isinstance(thing, SingleItem):
+        raise WrongUsage(f"{thing.place} is a folder, and folders have no tags; give the items in it")
+    tags = dict.fromkeys(one for one in (*thing.handle.item.tags, *added) if one not in removed)
+    try:
+        return ItemChange(tags=tuple(tags))
+    except ValidationError as error:
+        reason = error.errors(include_url=False)[0]["msg"]
+        raise WrongUsage(
+            f"{thing.place} cannot have {counted(len(tags), 'tag')}: {reason}; nothing was changed"
+        ) from None
+
+
+def _named_or_selected(marey: Marey, places: Sequence[str], kind: str | None, query: str | None) -> Sequence[Thing]:
+    """Return the folders and items at addresses, or the items that a query selects there."""
+    if query is not None:
+        return items_selected(marey, places, query, kind)
+    things = [the_thing(marey, place, kind) for place in places]
+    require_apart(things)
+    return things
+
+
+def _identified(thing: Thing) -> dict[str, str]:
+    return {"id": thing.id, "kind": thing.kind, "place": thing.place}
+
+
+def _preview(
+    columns: Sequence[str], rows: Sequence[Sequence[object]], things: Sequence[Thing], done: str, as_json: bool
+) -> None:
+    """Print what a command would change."""
+    if as_json:
+        return print_json({"preview": list(map(_identified, things))})
+    print_table(columns, rows)
+    count = sum(thing.count() for thing in things)
+    return print_message(f"{counted(count, 'item')} would be {done}; nothing was changed")
 
 
 def _is_folder(marey: Marey, address: Address) -> bool:
@@ -198,21 +294,37 @@ def _ask(question: str) -> None:
         raise Refused
 
 
-def _do_each(things: Sequence[Thing], do: Callable[[Thing], Any], done: str, as_json: bool) -> None:
-    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were any."""
+def _do_each(
+    things: Sequence[AnyThing], do: Callable[[AnyThing], Any], done: str, as_json: bool, *, selected: bool = False
+) -> None:
+    """Apply a function to each folder or item, and print refusals. Raises `Refused` at the end if there were any.
+
+    Items that a query has selected do not depend on each other and may be many: then several requests are sent at a
+    time, and the number of items is printed.
+    """
     from marey_client.errors import RequestFailed
 
-    results: list[Any] = []
-    refused: dict[str, str] = {}
-    for thing in things:
-        place = thing.place
+    def attempt(thing: AnyThing) -> tuple[Any, str | None]:
         try:
-            results.append(do(thing))
+            return do(thing), None
         except RequestFailed as error:
             if error.status >= 500 or error.status == 401:
                 raise
-            refused[place] = sentence(error)
-            print_message(f"{place}: {refused[place]}")
+            print_message(f"{thing.place}: {sentence(error)}")
+            return None, sentence(error)
+
+    results: list[Any] = []
+    refused: dict[str, str] = {}
+    with progress() as advance, ThreadPoolExecutor(REQUESTS_AT_ONCE if selected else 1) as pool:
+        for number, (thing, (result, refusal)) in enumerate(zip(things, pool.map(attempt, things), strict=True), 1):
+            if refusal is None:
+                results.append(result)
+            else:
+                refused[thing.place] = refusal
+            if selected:
+                advance(f"items {done}", number, len(things))
+    if selected:
+        print_message(f"{counted(len(results), 'item')} {done}" + (f", {len(refused)} refused" if refused else ""))
     if as_json:
         report: Mapping[str, Any] = {done: results, "refused": refused}
         print_json(report)

@@ -1,5 +1,6 @@
 """A project is put in order: moved, renamed, tagged, removed and brought back, by the command line on a real server."""
 
+import functools
 import io
 import itertools
 import json
@@ -10,12 +11,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import typer
 from tests.support.server_process import ServerProcess
 from tests.support.store_fixtures import skeleton_tree
 
 from marey_client.cli import main
 from marey_client.errors import Conflict
 from marey_client.imports import find_files
+from marey_client.items import Items
 from marey_client.marey import Marey
 from marey_client.project import ProjectHandle
 from marey_motion.formats import write_bvh
@@ -112,6 +115,10 @@ def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, la
         (["tag", "lab/raw/a"], 2, "give them with --add"),
         (["tag", "lab/raw", "--add", "x"], 2, "lab/raw is a folder, and folders have no tags"),
         (["rm", "lab/raw/a", "--kind", "stone"], 2, "'stone' is not a kind of item"),
+        (["rm", "lab", "--query", "name = nobody", "--yes"], 2, "the query selects no item of the kind clip in lab;"),
+        (["rm", "lab/raw/a", "--query", "name = a", "--yes"], 2, "there is no folder at lab/raw/a; --query selects"),
+        (["rm", "lab", "--query", "name = a", "--kind", "collection", "--yes"], 2, "items, not folders"),
+        (["rm", "lab", "--query", "name =", "--yes"], 1, "the query ends too early"),
     ],
 )
 def test_what_cannot_be_is_told_and_changes_nothing(
@@ -199,6 +206,62 @@ def test_take_records_come_from_a_table_and_are_found_by_queries(
     run("record", "lab/raw/a", "--set", "select=", "--set", "licence=CC0")
     record = lab.clips.get(next(lab.clips.list(path="raw/a")).id).info()
     assert (record.subject, record.select, record.licence) == ("02", None, "CC0")
+
+
+def test_what_a_query_selects_is_previewed_removed_after_a_yes_and_counted(run: Command, lab: ProjectHandle) -> None:
+    run("record", "lab/raw/b", "--set", "action=run")
+    rule = ("lab/raw", "--query", "not action = run")
+    listed = run("ls", "lab/raw", "--kind", "clip", *rule[1:]).stdout
+    previewed = run("rm", *rule, "--preview")
+    assert [name in listed for name in ("raw/a", "raw/b", "raw/c")] == [True, False, True]
+    assert [f"lab/raw/{name}" in previewed.stdout for name in "abc"] == [True, False, True]
+    assert previewed.stderr == "2 items would be removed; nothing was changed\n"
+    assert "remove 2 items (lab/raw/a and 1 more)? This needs a confirmation" in run("rm", *rule, status=2).stderr
+    assert "remove 1 item (lab/raw/b)?" in run("rm", "lab", "-q", "action = run", terminal="n\n", status=1).stderr
+    assert clips(lab) == ["raw/a", "raw/b", "raw/c"]
+    done = run("rm", *rule, "--yes", "--json")
+    assert [one["place"] for one in json.loads(done.stdout)["removed"]] == ["lab/raw/a", "lab/raw/c"]
+    assert done.stderr == "2 items removed\n"
+    assert clips(lab) == ["raw/b"]
+    assert [one.name for one in lab.skeletons.list()] != []  # they have no action, but a query selects clips
+
+
+def test_what_a_query_selects_is_tagged_from_several_pages(
+    run: Command, lab: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Items, "list", functools.partialmethod(Items.list, page_size=1))
+    run("tag", "lab/raw/a", "--add", "slow")
+    previewed = json.loads(run("tag", "lab", "--query", "frames > 1", "--add", "slow", "--preview", "--json").stdout)
+    assert [one["place"] for one in previewed["preview"]] == ["lab/raw/b", "lab/raw/c"]  # a has the tag already
+    assert "slow" in run("tag", "lab/raw", "--query", "name = b", "--add", "slow", "--preview").stdout
+    assert {clip.name: clip.item.tags for clip in lab.clips.list()} == {"a": ("slow",), "b": (), "c": ()}
+    done = run("tag", "lab", "lab/raw", "--query", "frames > 1", "--add", "slow")
+    assert done.stderr == "1 of 3 items need no change\n2 items changed\n"
+    assert {clip.item.tags for clip in lab.clips.list()} == {("slow",)}
+    run("tag", "lab", "--query", "name in (b, c)", "--remove", "slow")
+    run("rm", "lab", "--query", "tag = slow", "--yes")
+    assert clips(lab) == ["raw/b", "raw/c"]
+
+
+def test_an_item_that_was_changed_since_a_query_selected_it_is_not_removed(
+    run: Command, lab: ProjectHandle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def answer(_question: str, **_options: object) -> bool:
+        next(lab.clips.list(path="raw/b")).change(ItemChange(tags=("keep",)))
+        return True
+
+    monkeypatch.setattr(typer, "confirm", answer)
+    done = run("rm", "lab", "--query", "not tag = keep", terminal="", status=1)
+    assert "lab/raw/b: " in done.stderr
+    assert "2 items removed, 1 refused" in done.stderr
+    assert clips(lab) == ["raw/b"]
+
+
+def test_no_item_is_tagged_if_one_would_have_too_many_tags(run: Command, lab: ProjectHandle) -> None:
+    next(lab.clips.list(path="raw/c")).change(ItemChange(tags=tuple(f"t{number}" for number in range(64))))
+    told = run("tag", "lab", "--query", "frames > 1", "--add", "slow", status=2).stderr
+    assert "lab/raw/c cannot have 65 tags" in told
+    assert all("slow" not in clip.item.tags for clip in lab.clips.list())
 
 
 def test_a_query_is_explained_by_what_each_condition_hides(run: Command) -> None:

@@ -10,7 +10,7 @@ import typer
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address, find_item, kind_named
 from marey_client.cli.revisions import require_revision
 from marey_client.cli.terminal.failures import WrongUsage
-from marey_client.cli.terminal.invocation import AsJson, connect
+from marey_client.cli.terminal.invocation import AsJson, QueryText, connect
 from marey_client.cli.terminal.output import print_json, print_message, print_pairs, print_table
 from marey_schemas.wording import counted
 
@@ -68,15 +68,7 @@ def ls(
     find: Annotated[
         str, typer.Option(help="List only items whose names contain this text, also those in subfolders.")
     ] = "",
-    query: Annotated[
-        str | None,
-        typer.Option(
-            "--query",
-            "-q",
-            help="List only items that a query selects, also those in subfolders, as in "
-            "'subject = 02 and frames > 120'; the reference of queries lists the fields.",
-        ),
-    ] = None,
+    query: QueryText = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Instead of a list, count the items that each condition of --query hides.")
     ] = False,

@@ -11,7 +11,7 @@ import typer
 
 from marey_client.cli.addresses import REQUESTS_AT_ONCE, Address
 from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
-from marey_client.cli.terminal.invocation import connect
+from marey_client.cli.terminal.invocation import QueryText, connect
 from marey_client.cli.terminal.output import print_message, progress
 from marey_schemas.wording import counted
 
@@ -56,7 +56,7 @@ def record(
         list[str] | None,
         typer.Option(help="Column of the table and the field that it fills, as in 'Shoot Date=shoot_day'; repeatable."),
     ] = None,
-    query: Annotated[str | None, typer.Option("--query", "-q", help="Change only clips that a query selects.")] = None,
+    query: QueryText = None,
 ) -> None:
     """Set the take records of clips: performer, action, take, day, choice, licence, capture system, consent.
 

@@ -19,6 +19,15 @@ ProjectName = Annotated[str, typer.Argument(help="Name of the project; marey pro
 UserName = Annotated[str, typer.Argument(help="Name of the user; marey user ls lists all names.")]
 JobId = Annotated[str, typer.Argument(help="Id of the job; marey job ls lists the ids.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+QueryText = Annotated[
+    str | None,
+    typer.Option(
+        "--query",
+        "-q",
+        help="Select only items that meet a query, also those in subfolders, as in 'subject = 02 and frames > 120'; "
+        "the reference of queries lists the fields.",
+    ),
+]
 
 
 @dataclass(frozen=True)
