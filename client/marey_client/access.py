@@ -32,7 +32,7 @@ ANY_STATE = {"If-Match": "*"}
 
 
 def change_quotas(transport: Transport, path: str, change: QuotaChange) -> QuotasInUse:
-    """Change the quotas of a project or a user."""
+    """Change the quotas at `path`, those of a project or of a user; return all of its quotas and their use."""
     return read_model(QuotasInUse, transport.send("PATCH", path, content=as_json(change), repeatable=True))
 
 
@@ -73,7 +73,7 @@ class Users:
         return self.transport.get(QuotasInUse, f"/users/{name}/quotas")
 
     def change_quotas(self, name: str, change: QuotaChange) -> QuotasInUse:
-        """Change the limits of a user; None means the limit in the server's settings. For administrators."""
+        """Change the quotas of a user; None restores the limit of the server's settings. For administrators."""
         return change_quotas(self.transport, f"/users/{name}/quotas", change)
 
     def enable(self, name: str) -> User:

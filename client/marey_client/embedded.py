@@ -33,7 +33,7 @@ def serve(**settings: Any) -> None:
 
 
 def database(action: str, *, data: Path | None, database_url: str | None, **options: Any) -> None:
-    """Run one of the database commands."""
+    """Run the database command `action`, a function of `marey_server.commands`, with the options that are given."""
     commands = room("marey_server.commands", "server")
     with _refusals_of(commands):
         getattr(commands, action)(**_given({"data": data, "database_url": database_url}), **options)

@@ -74,7 +74,7 @@ class SameName(MareyError):
 
 
 class NoAnnotations(MareyError):
-    """Clips have no annotations where some were expected."""
+    """None of the given clips has an annotation that the request needs."""
 
 
 # How jobs end

@@ -20,7 +20,10 @@ def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> li
 
 
 def explain(job: Job, attempts: list[Attempt], running: list[Job], now: datetime) -> list[str]:
-    """Explain a job, given its attempts and the project's running jobs."""
+    """Return sentences that explain the state of a job, the main reason first.
+
+    `running` are the running jobs of the project.
+    """
     if job.size is not None and not job.state.terminal and job.children != {"succeeded": job.size}:
         counts = ", ".join(f"{count} {state}" for state, count in sorted(job.children.items()))
         return [f"{job.state}: it gathers {job.size} tasks, of which {counts or 'none has begun'}."]

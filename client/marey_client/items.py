@@ -51,7 +51,7 @@ class ItemHandle:
 
     @property
     def path(self) -> str:
-        """Collection and name."""
+        """The collection and the name, joined by `/`."""
         return self.item.path
 
     @property
@@ -69,9 +69,10 @@ class ItemHandle:
         return dict(tree)
 
     def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
-        """Create a revision with `document` as `part`.
+        """Replace the document of a part by `document`; the item gets a new revision.
 
-        Raises `PreconditionFailed` if the item was changed since it was read."""
+        Raises `PreconditionFailed` if the item was changed since it was read.
+        """
         response = self.transport.send_tree(
             "PUT", f"{self.url}/parts/{part}", document, params={"message": message}, headers=self._if_match()
         )

@@ -77,7 +77,7 @@ class ProjectHandle(ProjectItems):
         return self.transport.get(QuotasInUse, f"{self.url}/quotas")
 
     def change_quotas(self, change: QuotaChange) -> QuotasInUse:
-        """Change the limits of the project; None means the limit in the server's settings. For administrators."""
+        """Change the quotas of the project; None restores the limit of the server's settings. For administrators."""
         return change_quotas(self.transport, f"{self.url}/quotas", change)
 
     def delete(self) -> None:

@@ -34,7 +34,7 @@ class ProjectItems:
 
     @cached_property
     def imports(self) -> Imports:
-        """Imports of files."""
+        """Imports of files into the project."""
         return Imports(self.transport, self.name, Blobs(self.transport), Jobs(self.transport))
 
     @cached_property

@@ -49,7 +49,7 @@ class BearerToken(httpx.Auth):
         return self._source.token if isinstance(self._source, TokenFile) else self._source
 
     def auth_flow(self, request: httpx.Request) -> Iterator[httpx.Request]:  # type: ignore[override]
-        """Set the header."""
+        """Set the header `Authorization` of a request to the current token."""
         request.headers["Authorization"] = f"Bearer {self.token}"
         yield request
 
@@ -180,7 +180,10 @@ class Transport:
         return self.repeat(once, repeatable=repeatable, what=f"{method} {path}")
 
     def repeat(self, once: Callable[[], T], *, repeatable: bool, what: str) -> T:
-        """Call `once` until it succeeds or fails with an error that a retry cannot solve."""
+        """Call `once` until it succeeds, at most `retries.tries` times, and return its result.
+
+        An error that a retry cannot solve is raised at once.
+        """
         started = time.monotonic()
         for tried in range(1, self.retries.tries + 1):
             try:

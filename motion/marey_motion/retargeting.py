@@ -357,7 +357,7 @@ def _heights(
 
 
 def _are_same_rig(source: Skeleton, target: Skeleton) -> bool:
-    """Check that both skeletons have the same joint names, hierarchy and rest rotations; lengths may differ."""
+    """Return whether both skeletons have the same joint names, hierarchy and rest rotations; lengths may differ."""
     if source.joint_names != target.joint_names or not np.array_equal(source.parents, target.parents):
         return False
     turned = quaternions.angle_between(source.rest_rotations, target.rest_rotations)

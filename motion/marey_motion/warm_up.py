@@ -92,12 +92,12 @@ def _origin() -> str:
 
 
 def _recorded_origin() -> str:
-    """Read the recorded origin of the compiled code on disk; empty if none is recorded."""
+    """Return the digest of compiler and sources that is stored with the compiled code; empty if there is none."""
     return STAMP.read_text("utf-8").partition(" ")[0] if STAMP.is_file() else ""
 
 
 def _is_done() -> bool:
-    """Check that everything is compiled, from the installed sources and by the installed compiler."""
+    """Return whether everything is compiled, from the installed sources and by the installed compiler."""
     return STAMP.is_file() and STAMP.read_text("utf-8") == f"{_origin()} {_DONE}"
 
 

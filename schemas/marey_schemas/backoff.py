@@ -36,5 +36,5 @@ class Backoff:
 
 
 def spread(seconds: float, share: float, random_unit: Callable[[], float] = random.random) -> float:
-    """Subtract a random part, up to `share`, from a duration in seconds."""
+    """Return a duration in seconds minus a random part of it; at most the fraction `share` (0 to 1) is subtracted."""
     return seconds * (1.0 - share * random_unit())

@@ -10,7 +10,7 @@ from marey_schemas.base import Request
 
 
 def in_centimetres(name: str) -> Any:
-    """Declare a deprecated field of release 0.1: the value in centimetres that `name` contains in metres."""
+    """Return the declaration of a deprecated field of release 0.1: the field `name`, but in centimetres, not metres."""
     return Field(
         None,
         exclude=True,

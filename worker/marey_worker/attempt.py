@@ -229,7 +229,7 @@ class RunningAttempt:
     # -- while the child computes --
 
     def _attend(self, child: ChildProcess) -> Done | Failed | Stop:
-        """Answer the requests of the child until the job ends."""
+        """Answer the requests of the child until the job ends; return its end, or the reason to stop it."""
         while True:
             try:
                 data = child.receive(WATCH_EVERY_S)

@@ -56,7 +56,7 @@ class AttemptApi:
         self._url = f"/jobs/{lease.job}/attempts/{lease.fence}"
 
     def heartbeat(self, progress: Progress | None, *, patiently: bool = False) -> HeartbeatAnswer:
-        """Renew the lease."""
+        """Renew the lease, and report the progress; return the answer of the server."""
         sender = self._patient if patiently else self._transport
         return read_model(HeartbeatAnswer, self._post("heartbeat", as_json(Heartbeat(progress=progress)), sender))
 
@@ -71,7 +71,7 @@ class AttemptApi:
             return LogAnswer(offset=error.context["offset"])
 
     def stage(self, body: bytes) -> None:
-        """Stage outputs, given as an encoded `StageRequest`."""
+        """Send outputs, given as an encoded `StageRequest`; they are published if the attempt completes."""
         self._post("outputs", body, self._patient, media_type=BLOCKS)
 
     def complete(self, request: CompleteRequest) -> None:
@@ -99,7 +99,7 @@ class AttemptApi:
             return self._transport.get(Item, f"/projects/{self._project}/{kind.plural}/{item}")
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find items by name, directly in a collection; if `collection` is None, anywhere in the project."""
+        """Return the items with this name that are directly in a collection, or anywhere if `collection` is None."""
         asked = f"{name}*" if name.endswith("*") else name  # a final asterisk asks for names that begin so
         query = {"name": asked, "directly_in": collection}
         with _dead_token_is_lost_lease():
@@ -117,7 +117,7 @@ class AttemptApi:
             return Blobs(self._transport).fetch(digest)
 
     def put_file(self, path: Path) -> str:
-        """Send a file and return its digest."""
+        """Send a file to the server, and return its digest."""
         with _dead_token_is_lost_lease():
             return Blobs(self._patient).put_file(path)
 

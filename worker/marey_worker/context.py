@@ -130,7 +130,7 @@ class Context:
         return Item.model_validate(self._value(asked, f"no-{kind}"))
 
     def find_items(self, kind: Kind, name: str, collection: str | None) -> list[Item]:
-        """Find items by name, directly in a collection; if `collection` is None, anywhere in the project."""
+        """Return the items with this name that are directly in a collection, or anywhere if `collection` is None."""
         found = self._ask(lambda request: FindItems(request, kind, name, collection))
         return [Item.model_validate(item) for item in found]
 

@@ -27,7 +27,7 @@ from marey_schemas.queue.worker_protocol import PinnedInput
 
 @dataclass(frozen=True)
 class Run:
-    """Order to run a job."""
+    """Message that asks a child process to run a job."""
 
     job: str
     kind: str
@@ -119,7 +119,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Made:
-    """Progress of the job."""
+    """Message that reports the progress of the job."""
 
     progress: Progress
 

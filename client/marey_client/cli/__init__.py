@@ -38,7 +38,10 @@ def _take_any_text() -> None:
 
 
 def with_global_options_first(arguments: list[str]) -> list[str]:
-    """Move the global options to the front, where typer needs them, so that `marey ls lab --server URL` works, too."""
+    """Return the arguments with the global options first, where typer needs them.
+
+    So `marey ls lab --server URL` works, too.
+    """
     first: list[str] = []
     rest: list[str] = []
     left = iter(arguments)

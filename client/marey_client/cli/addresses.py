@@ -32,7 +32,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Read `project` or `project/path`."""
+        """Parse the text `project` or `project/path`. Raises `WrongUsage` if it contains no project."""
         project, _, path = text.strip("/").partition("/")
         if not project:
             raise WrongUsage(f"{text!r} contains no project; write project/folder/name")
@@ -88,7 +88,7 @@ def _missing(marey: Marey, address: Address, what: str) -> WrongUsage:
 
 
 def addresses_in_one_project(places: Sequence[str]) -> list[Address]:
-    """Parse several addresses. Raises `WrongUsage` if they are not all in one project."""
+    """Parse texts such as `project` or `project/path`. Raises `WrongUsage` if they are not all in one project."""
     addresses = [Address.parse(place) for place in places]
     if len({address.project for address in addresses}) > 1:
         raise WrongUsage(
@@ -137,10 +137,10 @@ class Thing(Protocol):
         """Move to a folder and rename; return the moved folder or item."""
 
     def delete(self) -> None:
-        """Delete; it can be restored."""
+        """Delete the item, or the folder with its contents; `restore` restores what was deleted."""
 
     def restore(self) -> Collection | Item:
-        """Restore after deletion."""
+        """Restore the item or the folder after its deletion, and return it."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Folder:
 
     @property
     def place(self) -> str:
-        """Project and path."""
+        """The project and the path of the folder, as in `project/folder`."""
         return f"{self.project.name}/{self.collection.path}"
 
     def count(self) -> int:
@@ -199,11 +199,11 @@ class SingleItem:
 
     @property
     def place(self) -> str:
-        """Project and path."""
+        """The project and the path of the item, as in `project/folder/name`."""
         return f"{self.handle.project}/{self.handle.path}"
 
     def count(self) -> int:
-        """Return 1."""
+        """Return 1, the number of items that `delete` removes."""
         return 1
 
     def move(self, folder: str, name: str) -> Item:

@@ -303,7 +303,7 @@ def _keyframe(text: str) -> tuple[str, int]:
 
 
 def _option(text: str) -> tuple[str, Any]:
-    """Parse `name=value`, an option of a method of annotation; a value with commas is a list of texts."""
+    """Parse an option of an annotation method, `name=value`, to name and value; a value with commas becomes a list."""
     name, value = assignment(text)
     read = json_or_text(value)
     return name, value.split(",") if read == value and ("," in value or name == "joints") else read

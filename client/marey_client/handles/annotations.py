@@ -34,5 +34,5 @@ class AnnotationHandle(ItemHandle):
         return self._renewed(read_model(Item, response))
 
     def put(self, annotation: Annotation, *, message: str | None = None) -> Item:
-        """Create a revision with other segments and keyframes."""
+        """Replace the segments and keyframes; the item gets a new revision."""
         return self.put_part("annotation", annotation.model_dump(mode="json", by_alias=True), message=message)

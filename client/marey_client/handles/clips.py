@@ -59,11 +59,14 @@ class ClipHandle(ItemHandle):
         return ClipInfo.model_validate(self.part("info"))
 
     def put_info(self, info: ClipInfo) -> Item:
-        """Create a revision with another description and the same poses."""
+        """Replace the description of the clip; the item gets a new revision, in which the poses are unchanged."""
         return self.put_part("info", info.model_dump(mode="json", by_alias=True, exclude_none=True))
 
     def put_motion(self, motion: MotionDocument, *, message: str | None = None) -> Item:
-        """Create a revision with other poses. Raises `PreconditionFailed` if the clip was changed since it was read."""
+        """Replace the poses of the clip; the item gets a new revision.
+
+        Raises `PreconditionFailed` if the clip was changed since it was read.
+        """
         return self.put_part("motion", motion.model_dump(by_alias=True, exclude_none=True), message=message)
 
     def annotations(self) -> Iterator[AnnotationHandle]:

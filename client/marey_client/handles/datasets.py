@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def _silent(_what: str, _done: int, _total: int | None) -> None:
-    """Report no progress."""
+    """Ignore a report of progress."""
 
 
 @dataclass(frozen=True)

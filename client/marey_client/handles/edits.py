@@ -23,7 +23,7 @@ class EditHandle(ItemHandle):
         return EditDocument.model_validate(self.part("edit", revision=revision))
 
     def put(self, edit: EditDocument, *, message: str | None = None) -> Item:
-        """Create a revision with other commands.
+        """Replace the commands of the edit; the item gets a new revision.
 
         Raises `PreconditionFailed` if the edit was changed since it was read.
         """

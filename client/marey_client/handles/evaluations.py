@@ -62,7 +62,7 @@ class EvaluationHandle(ReportedHandle):
         return dict(json.loads(self._walk_graph("json", trial)))
 
     def save_walk_graph(self, path: str | Path, *, trial: str | None = None) -> Path:
-        """Write the walk graph to a file, as GraphML or JSON according to its ending."""
+        """Write the walk graph to a file, as GraphML or JSON according to the ending of `path`; return the path."""
         form = Path(path).suffix.lower().removeprefix(".")
         if form not in ("json", "graphml"):
             raise ValueError(f"{path}: the file name of a walk graph must end in .json or .graphml")

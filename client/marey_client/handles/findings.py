@@ -33,7 +33,7 @@ class Findings:
         return Blobs(self.transport).fetch(self._blob("report"))
 
     def save_report(self, path: str | Path) -> Path:
-        """Write the report to a file."""
+        """Write the report to a file, and return the path of the file."""
         return Blobs(self.transport).fetch_to(self._blob("report"), Path(path))
 
     def _blob(self, name: str) -> str:

@@ -32,7 +32,7 @@ class PipelineRun:
 
     @property
     def steps(self) -> Mapping[str, Job]:
-        """All jobs, each after those it depends on."""
+        """The jobs by the name of their step, in an order in which each job comes after the jobs that it depends on."""
         return MappingProxyType(self._steps)
 
     @property
@@ -80,7 +80,10 @@ class PipelineRun:
         return self.refresh()
 
     def _look(self, wait_s: float) -> Mapping[str, Job]:
-        """Request the state of each unfinished job; wait up to `wait_s` for the first one in the pipeline to end."""
+        """Request the state of each unfinished job, and return all jobs by step.
+
+        The request for the first unfinished job waits up to `wait_s` seconds for its end.
+        """
         for name, known in self._steps.items():
             if not known.state.terminal:
                 self._steps[name] = self._jobs.get(known.id, wait_s=wait_s)

@@ -112,7 +112,7 @@ class ProposalHandle:
         when_green: bool = False,
         commit: str | None = None,
     ) -> Proposal:
-        """Merge the proposal; with `when_green`, as soon as nothing is missing.
+        """Merge the proposal; with `when_green`, the server merges it as soon as all requirements are met.
 
         Raises `Conflict` with one of three codes: `proposal-not-green` if something is missing, which `missing` in the
         error's context lists; `merge-conflicts` if `resolutions` do not decide all conflicts; `proposal-moved` if

@@ -37,11 +37,11 @@ class ReportedHandle(ItemHandle):
         return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
 
     def save_report(self, path: str | Path) -> Path:
-        """Write the report to a file."""
+        """Write the report to a file, and return the path of the file."""
         return saved(path, self.report())
 
     def save_figures(self, folder: str | Path) -> list[Path]:
-        """Write every figure to a folder: as PNG and SVG, with its data as JSON and CSV."""
+        """Write every figure to a folder, as PNG and SVG, with its data as JSON and CSV; return all paths."""
         files = (file for figure in self.figures() for file in self._files_of(figure))
         return [saved(Path(folder) / safe_file_name(name), data) for name, data in files]
 
@@ -58,7 +58,7 @@ class ReportedHandle(ItemHandle):
 
 
 def saved(path: str | Path, data: bytes) -> Path:
-    """Write bytes to a file; if writing fails, no file is created."""
+    """Write bytes to a file, and return its path; if writing fails, no file is created."""
     with saved_atomically(path) as file:
         file.write(data)
     return Path(path)

@@ -47,7 +47,7 @@ class SearchableHandle(ReportedHandle):
         unit: str = DEFAULT_UNIT,
         **options: Any,
     ) -> Path:
-        """Write the result of a search to a motion file: bvh, npz or predecessor."""
+        """Write the result of a search to a motion file (bvh, npz or predecessor), and return the path of the file."""
         response = self.transport.send(
             "POST",
             f"{self.url}/search/export",

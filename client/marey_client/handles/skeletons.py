@@ -19,5 +19,5 @@ class SkeletonHandle(ItemHandle):
         return SkeletonMapping.model_validate(self.part("mapping"))
 
     def put_mapping(self, mapping: SkeletonMapping) -> Item:
-        """Create a revision with another mapping."""
+        """Replace the mapping of joints; the item gets a new revision."""
         return self.put_part("mapping", mapping.model_dump(mode="json", by_alias=True))

@@ -185,7 +185,10 @@ def _size_for(take: Take, command: AnyCommand) -> int:
 
 
 def _settled(take: Take, before: Motion) -> Take:
-    """Check that changed numbers are finite, and normalise changed rotations to unit length and continuous sign."""
+    """Check that changed numbers are finite, and normalise changed rotations to unit length; return the take.
+
+    The signs of the rotations are made continuous, too.
+    """
     motion = take.motion
     if motion.root_translations is not before.root_translations:
         require_finite(motion.root_translations)

@@ -227,7 +227,7 @@ class Hole:
 
 
 def _sums(values: Floats, span: int) -> Floats:
-    """Sum every `span` consecutive values."""
+    """Return the sum of each `span` consecutive values; empty if there are fewer values."""
     if len(values) < span:
         return np.empty(0)
     totals = np.concatenate(([0.0], np.cumsum(values)))

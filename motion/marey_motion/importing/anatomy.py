@@ -107,7 +107,7 @@ def anatomy_of(skeleton: Skeleton | SourceMotion) -> Anatomy:
 
 
 def _content_key(joints: Skeleton | SourceMotion, end_sites: tuple[EndSite, ...]) -> _SkeletonKey:
-    """List every name and number of a skeleton."""
+    """Return a key that is equal for skeletons with the same names, parents, offsets and rest rotations."""
     names = tuple(joints.joint_names)
     return (
         names,

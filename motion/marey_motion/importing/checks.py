@@ -357,7 +357,10 @@ def _dead_joints(clip: Clip, tracks: Tracks) -> CheckWarning | None:
 
 
 def _surely_no_jump(rotations: NDArray[np.float32]) -> bool:
-    """Check quickly that no rotation from frame to frame is a jump; after False, the exact check decides."""
+    """Return whether a quick check shows that no rotation from frame to frame is a jump.
+
+    False means that the exact check must decide.
+    """
     products = rotations[1:] * rotations[:-1]
     cosines = products[..., 0] + products[..., 1]
     cosines += products[..., 2]

@@ -274,7 +274,7 @@ def _flat_axis(body: _Measurements) -> tuple[UpAxis, str] | None:
 
 
 def _stands_on_origin(body: _Measurements, axis: UpAxis) -> bool:
-    """Check that a ground through the origin, orthogonal to the axis, is just under the body."""
+    """Return whether a ground through the origin, orthogonal to the axis, is just under the body."""
     assert body.leg is not None
     lowest = _heights(body.positions, axis).min(axis=0)
     return bool(abs(low_quantile(lowest)) <= _FLAT_GROUND * body.leg)
@@ -397,7 +397,7 @@ def _walks_on_hands(body: _Measurements, up_axis: UpAxis) -> bool:
 
 
 def _stands_on_all_fours(body: _Measurements, up_axis: UpAxis) -> bool:
-    """Check that hands and feet are on one ground well below the hips; if the body lies on its side, they are not."""
+    """Return whether hands and feet are on one ground well below the hips; not if the body lies on its side."""
     assert body.leg is not None
     return _walks_on_hands(body, up_axis) and _hip_height(body, up_axis) > 0.5 * body.leg
 

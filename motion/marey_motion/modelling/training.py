@@ -58,7 +58,7 @@ class FittedExamples:
 
 
 def _silent(_done: int, _total: int | None, _doing: str) -> None:
-    """Ignore progress."""
+    """Ignore a report of progress."""
 
 
 def train_primitive(

@@ -41,7 +41,7 @@ class Section(NamedTuple):
 
 
 def page(title: str, lead: Content, sections: Sequence[Section], ending: Content) -> str:
-    """Make a whole HTML document."""
+    """Return a whole HTML document with these sections."""
     links = [element("li", element("a", section.heading, href=f"#{section.anchor}")) for section in sections]
     head = element(
         "head",
@@ -73,7 +73,7 @@ def _section(section: Section) -> Html:
 
 
 def shown(figures: Mapping[str, DrawnFigure], *names: str) -> Html:
-    """Make the HTML of the named figures; names without a figure are skipped."""
+    """Return the HTML of the named figures; names without a figure are skipped."""
     return joined(_shown(figures[name], f"f{list(figures).index(name)}") for name in names if name in figures)
 
 

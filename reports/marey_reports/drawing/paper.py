@@ -64,14 +64,14 @@ class Place(NamedTuple):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Make an empty page."""
+    """Return an empty page of this size in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, facecolor=PAPER)
 
 
 def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: str = "", grid: bool = True) -> Axes:
-    """Add labelled axes at a place, in the common style."""
+    """Add axes with a title and labels at a place of the page, in the style of all figures; return the axes."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height), facecolor="none")
@@ -91,7 +91,7 @@ def add_panel(figure: Figure, place: Place, *, title: str = "", x: str = "", y: 
 def add_colour_bar(
     figure: Figure, mappable: ScalarMappable, place: Place, label: str, ticks: NDArray[np.float64] | None = None
 ) -> Axes:
-    """Draw a colour bar at a place: upright if the place is higher than wide, else horizontal."""
+    """Draw a colour bar at a place, upright if the place is higher than wide, else horizontal; return its axes."""
     width, height = figure.get_size_inches()
     left, bottom, across, up = place
     axes = figure.add_axes((left / width, bottom / height, across / width, up / height))
@@ -139,7 +139,7 @@ def plain(text: str) -> str:
 
 
 def without_shared_folder(names: Sequence[str]) -> list[str]:
-    """Drop the folders that all names share."""
+    """Return the names without the folders that all of them share."""
     places = [name.split("/") for name in names]
     levels = zip(*(folders for *folders, _ in places), strict=False)
     shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))

@@ -132,7 +132,7 @@ def _scale(
 
 
 def _label_width(rows: Sequence[StripRow]) -> float:
-    """Compute the width in inches of the labels."""
+    """Return the width in inches that the labels of the rows need."""
     longest = max([0, *(max(1.15 * len(row.label), 0.9 * len(row.note)) for row in rows)])
     return 0.2 + 0.078 * longest
 

@@ -32,7 +32,7 @@ def number(value: float | None, digits: int = 2, *, signed: bool = False, look: 
 
 
 def share(value: float) -> Number:
-    """Format a share in percent."""
+    """Format a share, such as 0.25, in percent."""
     return Number(value, f"{100 * value:.1f} %")
 
 

@@ -38,7 +38,7 @@ MOST_HOLES = 15
 
 
 def headline(result: EvaluationResult) -> Html:
-    """Make the summary of the most important numbers."""
+    """Return the summary of the most important numbers as HTML."""
     judgement, coverage = judge(result), result.coverage
     sources = sum_by_source(result.clips, result.usage)
     used = sum(1 for source in sources if source.ticks)

@@ -23,7 +23,7 @@ Figures = Mapping[str, DrawnFigure]
 
 
 def headline(trained: TrainedPrimitive) -> Html:
-    """Make the summary of the most important numbers."""
+    """Return the summary of the most important numbers as HTML."""
     primitive, report = trained.primitive, trained.report
     durations, drawn = report.training_durations, report.sample_durations
     lasting = "" if drawn is None else f"samples {drawn.least_s:.1f}–{drawn.most_s:.1f} s"

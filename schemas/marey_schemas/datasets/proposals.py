@@ -208,7 +208,7 @@ class Mergeability(Answer):
 
 
 class ProposalDetail(Proposal):
-    """A proposal with its reviews, checks and mergeability."""
+    """A proposal with its reviews and checks, and with the result that its merge would have now."""
 
     comments: int = Field(description="Number of comments.")
     reviews: tuple[Review, ...] = Field(description="The newest approval or request for changes of each reviewer.")

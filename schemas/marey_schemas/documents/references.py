@@ -10,7 +10,7 @@ from marey_schemas.base import Request
 
 
 class RevisionRef(Request):
-    """A pinned revision of an item."""
+    """Reference to one revision of an item."""
 
     item: str
     revision: int = Field(ge=1)

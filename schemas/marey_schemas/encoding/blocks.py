@@ -58,11 +58,11 @@ class _Layout:
         return replace(self, spec=ArraySpec(self.spec.dtype, (frames, *self.spec.shape[1:])))
 
     def block(self, index: int) -> slice:
-        """Return the frames of a block."""
+        """Return the range of frames that the block with this number contains."""
         return slice(index * self.block_frames, min((index + 1) * self.block_frames, self.frames))
 
     def group(self, index: int) -> slice:
-        """Return the columns of a group."""
+        """Return the range of columns that the group with this number contains."""
         return slice(index * self.group_columns, min((index + 1) * self.group_columns, self.columns))
 
     def lead(self, group: int) -> int | None:

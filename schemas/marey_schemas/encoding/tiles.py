@@ -132,7 +132,10 @@ def _from_integers(integers: Integers, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _order(bits: Integers) -> Integers:
-    """Flip all but the sign bit of negative floats; the function is its own inverse."""
+    """Flip all but the sign bit of negative floats, so that the bits sort like the floats; return the new bits.
+
+    The function is its own inverse.
+    """
     width = 8 * bits.itemsize
     signs = bits.view(f"<i{bits.itemsize}") >> (width - 1)
     ordered: Integers = bits ^ (signs.view(bits.dtype) >> 1)
@@ -217,7 +220,11 @@ def _holds_rotations(tile: NDArray[np.float32], lead: int) -> bool:
 
 
 def _predict_quaternions(channels: Integers, lead: int) -> list[Bytes]:
-    """Predict the largest component of each quaternion of the tile from the other three."""
+    """Return the parts of a tile in which one component of each quaternion is predicted from the other three.
+
+    The parts are the choice of these components, the bytes of the other channels, and the bytes of the prediction
+    errors.
+    """
     count = (len(channels) - lead) // 4
     values = _from_integers(channels, np.dtype("<f4"))
     quaternions = values[lead : lead + 4 * count].reshape(count, 4, -1)

@@ -193,7 +193,7 @@ class _Reader:
         self._text = text
 
     def read(self, tree: Any) -> Query:
-        """Return the query of a node."""
+        """Return the query that a node of the syntax tree states."""
         source = self._text[tree.meta.start_pos : tree.meta.end_pos]
         if tree.data == "bracketed":
             return self.read(tree.children[0])

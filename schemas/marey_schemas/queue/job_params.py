@@ -117,7 +117,7 @@ class CutParams(TaggedResults):
         return self
 
     def piece_name(self, clip: str, label: str, number: int) -> str:
-        """Return the name of a piece."""
+        """Return the name of the piece with this number, cut from a clip along a segment with this label."""
         given = {"clip": clip, "label": label.replace("/", "-")}
 
         def text(found: re.Match[str]) -> str:

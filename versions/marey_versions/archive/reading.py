@@ -111,7 +111,7 @@ class Archive:
         require_digest(member, f"sha256:{hashed.hexdigest()}")
 
     def commit(self, digest: str) -> CommitRecord:
-        """Return a commit."""
+        """Return the commit with this digest. Raises `BadArchive` if the archive has no valid commit of this digest."""
         try:
             return CommitRecord.of(self.tree(MemberKind.COMMIT, digest))
         except ValueError as error:

@@ -109,7 +109,7 @@ def encode(chunk: Chunk) -> tuple[str, bytes]:
 
 
 def digest_of(data: bytes) -> str:
-    """Return the digest of bytes."""
+    """Return the SHA-256 digest of bytes, as `sha256:` and 64 hexadecimal digits."""
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 

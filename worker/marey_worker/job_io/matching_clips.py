@@ -73,7 +73,7 @@ class ClipSet:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ClipSet:
-        """Return the set that `as_tree` encoded."""
+        """Return the set of clips that `as_tree` has encoded."""
         return cls(
             clips=tuple(map(PinnedInput.model_validate, tree["clips"])),
             rig=None if tree["rig"] is None else PinnedInput.model_validate(tree["rig"]),
@@ -179,7 +179,7 @@ def uid_of(pin: PinnedInput) -> str:
 
 
 def read_motions(context: Context, pins: Sequence[PinnedInput]) -> Iterator[tuple[str, MotionDocument]]:
-    """Return each clip's motion and its digest."""
+    """Yield the digest and the motion of each clip."""
     for done, (pin, tree) in enumerate(context.documents(pins, "motion")):
         context.progress(0, None, f"reading clip {done + 1} of {len(pins)}, {pin.name}")
         yield document_digest(tree), MotionDocument.model_validate(tree)

@@ -61,7 +61,7 @@ def run(context: Context, params: AlignParams) -> dict[str, Any]:
 
 
 class _Job:
-    """State of the job."""
+    """State of a job of the kind `align`."""
 
     def __init__(self, context: Context, params: AlignParams) -> None:
         self._context = context

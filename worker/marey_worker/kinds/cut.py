@@ -46,7 +46,7 @@ class _AnnotatedClip(NamedTuple):
 
 
 class _Cutting:
-    """State of the job."""
+    """State of a job of the kind `cut`."""
 
     def __init__(self, context: Context, params: CutParams) -> None:
         self._context = context

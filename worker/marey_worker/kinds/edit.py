@@ -38,7 +38,7 @@ def run(context: Context, params: EditParams) -> dict[str, Any]:
 
 
 class _Editing:
-    """State of the job."""
+    """State of a job of the kind `edit`."""
 
     def __init__(self, context: Context, params: EditParams) -> None:
         self._context = context
@@ -56,7 +56,7 @@ class _Editing:
         self._source_pins = _wanted_sources(context, self._edit)
 
     def run(self) -> dict[str, Any]:
-        """Edit all clips; return a summary."""
+        """Edit all clips, and return the result of the job."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         sources = self._read_sources()

@@ -59,7 +59,7 @@ def run(context: Context, params: ExportParams) -> dict[str, Any]:
 
 
 class _Exporting:
-    """State of the job."""
+    """State of a job of the kind `export`."""
 
     def __init__(self, context: Context, params: ExportParams) -> None:
         self._context = context

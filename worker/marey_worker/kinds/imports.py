@@ -26,7 +26,7 @@ def run(context: Context, params: ImportParams) -> dict[str, Any]:
 
 
 class _Importing:
-    """State of the job."""
+    """State of a job of the kind `import`."""
 
     def __init__(self, context: Context, params: ImportParams) -> None:
         self._context = context
@@ -41,7 +41,7 @@ class _Importing:
         """Models of this job: collection, name, and reference for graphs."""
 
     def run(self) -> dict[str, Any]:
-        """Import all files in order."""
+        """Import all files in order, and return the result of the job."""
         plan = plan_imports([file.name for file in self._params.files])
         entries = []
         for done, planned in enumerate(plan):

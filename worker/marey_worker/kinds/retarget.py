@@ -31,7 +31,7 @@ def run(context: Context, params: RetargetParams) -> dict[str, Any]:
 
 
 class _Retargeting:
-    """State of the job."""
+    """State of a job of the kind `retarget`."""
 
     def __init__(self, context: Context, params: RetargetParams) -> None:
         self._context = context
@@ -53,7 +53,7 @@ class _Retargeting:
             ) from error
 
     def run(self) -> dict[str, Any]:
-        """Retarget all clips; return a summary."""
+        """Retarget all clips, and return the result of the job."""
         pins = self._context.inputs["clips"]
         started = time.monotonic()
         for done, (pin, (motion, info)) in enumerate(self._context.documents_of_each(pins, "motion", "info")):

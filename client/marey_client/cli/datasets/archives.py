@@ -131,7 +131,7 @@ def import_archive(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Archive]:
-    """Open an archive; a file that is not one, or a damaged one, ends the command with an error."""
+    """Open an archive for the `with` block; if the file is damaged or no archive, the command ends with an error."""
     from marey_versions.archive.members import BadArchive
     from marey_versions.archive.reading import Archive
 

@@ -39,7 +39,10 @@ class NamedVersion(NamedTuple):
 
 
 def parse(text: str, *, version: bool = False) -> NamedVersion:
-    """Parse an argument. Raises `WrongUsage` if it names a version although the command takes none."""
+    """Parse `project/dataset` or `project/dataset@version`; without a version, the result names `main`.
+
+    Raises `WrongUsage` for other texts, and for a version if the command takes none, which is the default.
+    """
     place, at, named = text.partition("@")
     project, _, name = place.strip("/").partition("/")
     if not project or not name or "/" in name or (at and not named):

@@ -104,7 +104,7 @@ def show(context: typer.Context, place: DatasetPlace, number: Number, as_json: A
 
 
 def _verdicts(found: ProposalDetail) -> list[tuple[str, str, str]]:
-    """Return the table rows of reviews and checks."""
+    """Return one table row for each review and check: who made it, of what, and its state or verdict with its text."""
     reviews = [
         (one.author, f"{short(one.commit)}{', an earlier commit' if one.stale else ''}", f"{one.verdict} {one.text}")
         for one in found.reviews

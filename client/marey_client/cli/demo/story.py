@@ -135,7 +135,10 @@ class Story:
         return clip.export(self.data / "files", format="bvh")
 
     def _contact_sheet(self, pairs: Sequence[tuple[ClipHandle, ClipHandle]], total: int) -> Path | None:
-        """Draw pairs of source and result, chosen from `total` pairs, side by side, as an image."""
+        """Draw pairs of source and result side by side; return the path of the image, or None if there are no pairs.
+
+        `total` is the number of pairs from which these were chosen.
+        """
         if not pairs:
             return None
         figures = embedded.room("marey_reports.drawing.contact_sheet", "all")

@@ -43,7 +43,7 @@ def described(difference: Difference) -> Iterator[str]:
 
 
 def changes_in_words(difference: Difference) -> Iterator[str]:
-    """Yield a line for each change."""
+    """Yield one line of text for each change, or a single line that says that nothing differs."""
     lines = list(_changes(difference))
     yield from lines or [NO_DIFFERENCE]
 

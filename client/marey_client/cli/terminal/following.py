@@ -34,7 +34,7 @@ class _CommittingJob(OptionsOf):
         return (*self._job.options, *_COMMIT.options)
 
     def read(self, typed: Mapping[str, Any]) -> Chosen:
-        """Return the fields of `JobCreate`. Raises `WrongUsage`."""
+        """Return the fields of `JobCreate` that the typed options give. Raises `WrongUsage` for invalid options."""
         from pydantic import ValidationError
 
         from marey_schemas.queue.commits import CommitOptions

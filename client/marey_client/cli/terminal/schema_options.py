@@ -139,7 +139,7 @@ class _Option:
         )
 
     def read(self, typed: Any) -> Any:
-        """Convert a typed value to the type of the field. Raises `WrongUsage`."""
+        """Convert a typed value to the type of the field. Raises `WrongUsage` for a text that has another form."""
         spelled = self.spellings[0]
         if self._form == "number or none":
             return None if typed in (NONE, self.null) else read_number(typed, spelled)

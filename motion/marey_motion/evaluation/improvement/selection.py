@@ -90,7 +90,7 @@ def rows_of_sources(clips: Sequence[DatabaseClip], sources: Collection[str]) -> 
 
 
 def _by_row(database: MatchingDatabase) -> dict[str, Any]:
-    """List the arrays that have one entry per row."""
+    """Return, by field name, the arrays that have one entry per row."""
     values = {field.name: getattr(database, field.name) for field in fields(database)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 

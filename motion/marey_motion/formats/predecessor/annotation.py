@@ -193,6 +193,6 @@ def _frames(given: Any, label: str, file: str) -> list[int]:
 
 
 def _only_shares_ends(segments: Sequence[Segment]) -> bool:
-    """Check that neighbouring segments overlap by at most one frame."""
+    """Return whether neighbouring segments overlap by at most one frame."""
     ordered = sorted(segments, key=lambda one: (one.start, one.end))
     return all(before.end - 1 <= after.start for before, after in pairwise(ordered))

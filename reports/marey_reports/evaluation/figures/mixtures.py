@@ -29,7 +29,7 @@ class Normals(NamedTuple):
 
 
 def fit_one(values: AnyFloats) -> Normals:
-    """Compute mean and population standard deviation."""
+    """Return the normal distribution with the mean and the population standard deviation of the values."""
     return Normals(np.ones(1), np.array([values.mean()]), np.array([max(values.std(), LEAST_DEVIATION)]))
 
 
