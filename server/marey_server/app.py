@@ -166,7 +166,7 @@ async def listening(app: Application) -> AsyncIterator[Running]:
 
 
 def accept_connections(app: Application, server: HTTPServer, sockets: list[socket.socket]) -> Connections:
-    """Begin to accept connections, as many as the settings allow."""
+    """Begin to accept connections, as many as the settings allow; return these connections."""
     settings, in_flight = app.services.settings, app.services.in_flight
     most = settings.max_connections or default_connections()
     connections = Connections(

@@ -37,7 +37,7 @@ class Principal:
 
     @property
     def actor(self) -> str | None:
-        """The name shown as author and in events."""
+        """The name of the user, or `job:<id>` for an attempt of a job, as shown for authors and in events."""
         return self.user_name if self.kind != "attempt" else f"job:{self.job_id}"
 
 

@@ -24,22 +24,22 @@ class IssuedToken(NamedTuple):
 
 
 def issue_user_token() -> IssuedToken:
-    """Create a user's token."""
+    """Return a new token of a user, with a random secret."""
     return _user_token(issue_prefix(), secrets.token_hex(32))
 
 
 def issue_prefix() -> str:
-    """Create the prefix of a user's token."""
+    """Return a random prefix for a new token of a user."""
     return secrets.token_hex(6)
 
 
 def issue_attempt_token() -> IssuedToken:
-    """Create the token of an attempt; the hash of its secret identifies the attempt in the database."""
+    """Return a new token of an attempt; the hash of its secret identifies the attempt in the database."""
     return _attempt_token(secrets.token_hex(32))
 
 
 def derive_token_key(secret: str) -> bytes:
-    """Derive the key of `derive_attempt_token` and `derive_successor` from the secret of a user's token."""
+    """Return the key that `derive_attempt_token` and `derive_successor` use, from the secret of a user's token."""
     return hmac.digest(secret.encode("utf-8", "surrogatepass"), b"marey attempt tokens", "sha256")
 
 

@@ -26,7 +26,7 @@ class Healthz(Resource):
 
     @reads(access=Access.ANYONE, scope=None, answer=Health)
     async def get(self) -> Reply:
-        """Answer with success while the process is alive."""
+        """Answer with success if the process can answer at all."""
         return Reply(Health(status="ok"), headers={"Cache-Control": "no-store"})
 
 

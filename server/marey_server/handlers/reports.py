@@ -57,7 +57,7 @@ class StoredFileSender(BlobSender):
     """Base of resources that answer with a file named by a document."""
 
     async def send_file(self, file: StoredFile, query: ReportQuery, media_type: str, sandbox: str) -> Rendered | None:
-        """Answer with the file for display in a browser, under a content security policy."""
+        """Answer with the file, which a browser displays under a content security policy that contains `sandbox`."""
         return await self.send_blob(
             file.blob,
             disposition="inline",

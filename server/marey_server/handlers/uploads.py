@@ -48,7 +48,7 @@ async def store_in_pieces(resource: Resource, spool: blobs.Spool) -> None:
 
 
 async def append_piece(resource: Resource, upload_id: str, offset: int, piece: bytes) -> uploads.StoredUpload:
-    """Store and hash a piece of an upload."""
+    """Store a piece of an upload, and add it to the hash of the upload; return the state of the upload."""
     await _let_database_catch_up(resource)
     appended = await resource.change(uploads.append, upload_id, offset, piece)
     await resource.compute(resource.services.upload_hashes.add, upload_id, offset, piece)
@@ -62,7 +62,7 @@ async def _let_database_catch_up(resource: Resource) -> None:
 
 
 async def finish_upload(resource: Resource, upload: uploads.StoredUpload) -> uploads.StoredUpload:
-    """Hash the bytes that are not hashed yet, then store the upload as a blob."""
+    """Hash the bytes that are not hashed yet, store the upload as a blob, and return its state."""
     hashes = resource.services.upload_hashes
     while (content := await resource.compute(hashes.finish, resource.principal or ANONYMOUS, upload)) is None:
         upload = await resource.look_up(uploads.read_upload, upload.id)

@@ -81,13 +81,16 @@ class _Connection(IOStream):
         self._forget(self)
 
     def write(self, data: bytes | memoryview) -> asyncio.Future[None]:
-        """Write bytes, and start the time limit in which the client must receive some of them."""
+        """Write bytes, and begin to check that the client receives some of them within the time limit.
+
+        Returns a future that ends when all bytes are written.
+        """
         if not self.writing():
             self.start_count(time.monotonic())
         return super().write(data)
 
     def write_to_fd(self, data: memoryview) -> int:
-        """Pass bytes to the operating system, and count those that it accepted."""
+        """Pass bytes to the operating system; return how many it accepted, and add them to `taken_bytes`."""
         taken = super().write_to_fd(data)
         self.taken_bytes += taken
         return taken
@@ -150,7 +153,7 @@ class Connections:
             one.close()
 
     def close(self) -> None:
-        """Stop checking connections."""
+        """Stop the regular check of the connections."""
         if self._check is not None:
             self._check.cancel()
 

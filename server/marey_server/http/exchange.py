@@ -95,7 +95,7 @@ class Exchange(RequestHandler):
         return int(text) if _LENGTH.fullmatch(text) else 0
 
     def expects_body(self) -> bool:
-        """Return whether a body follows the headers."""
+        """Return whether the request has a body after its headers."""
         return self.declared_length() > 0 or "Transfer-Encoding" in self.request.headers
 
     def drop(self) -> None:
@@ -163,7 +163,7 @@ class Exchange(RequestHandler):
     # -- what Tornado asks for ----------------------------------------------------------------------------------------
 
     async def _undeclared(self, **_path: str) -> None:
-        """Refuse a method without a declaration."""
+        """Refuse a method that the resource does not declare."""
 
     get: Declared = _undeclared
     head: Declared = _undeclared

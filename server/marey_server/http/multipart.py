@@ -26,7 +26,7 @@ class PartHead:
 
 @dataclass(frozen=True, slots=True)
 class PartEnd:
-    """End of a part."""
+    """Event that marks the end of a part."""
 
 
 Piece = PartHead | bytes | PartEnd

@@ -47,7 +47,7 @@ DOCUMENT_FORMS = (JSON, MSGPACK, BSON, MSGPACK_BLOCKS, BSON_BLOCKS)
 
 @dataclass(frozen=True, slots=True)
 class _Range:
-    """Element of an Accept header."""
+    """Media range, one of the elements of an Accept header."""
 
     type: str
     subtype: str

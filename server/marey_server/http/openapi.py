@@ -187,7 +187,7 @@ def _query_parameters(operation: Operation) -> list[Schema]:
 
 
 def _without_null(schema: Schema) -> Schema:
-    """Remove null from the schema of a query parameter: a client omits a parameter instead of sending null."""
+    """Return the schema of a query parameter without null: a client omits a parameter instead of sending null."""
     shown = {key: value for key, value in schema.items() if key not in ("title", "default") or schema[key] is not None}
     shown.pop("title", None)
     choices = [choice for choice in shown.pop("anyOf", ()) if choice.get("type") != "null"]

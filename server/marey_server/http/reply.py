@@ -95,7 +95,7 @@ class AnswerForm:
 
 
 def settle(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Reply:
-    """Load the content of a reply with a `Lasting` document, unless the client or the cache has it already.
+    """Return a reply whose `Lasting` document is loaded, unless the client or the cache has the document already.
 
     Must be called in the transaction.
     """

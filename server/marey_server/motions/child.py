@@ -63,7 +63,7 @@ class AnswerEncoding(Message):
     arrays: ArrayForm
 
     def encode(self, tree: Any) -> bytes:
-        """Return the document as bytes."""
+        """Return a document as bytes of the media type that the client accepts."""
         return encode_tree(tree, self.media_type, arrays=self.arrays)
 
 
@@ -89,7 +89,7 @@ def unpack_tree(packed: bytes) -> Any:
 
 
 class ChildOrder(Message):
-    """Order to call a function that takes and returns bytes; its name has the form `module:function`."""
+    """Message that asks a child process to call a function, `module:function`, with bytes; it returns bytes."""
 
     function: str
     payload: bytes
@@ -132,7 +132,10 @@ def main() -> None:
 
 
 def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
-    """Carry out orders until the pipe closes; they may use `memory_bytes` more than this process uses now."""
+    """Call the function that each received `ChildOrder` names, and send the result or the error, until the pipe closes.
+
+    The functions may use `memory_bytes` more than this process uses now.
+    """
     allow_memory(memory_bytes)
     while True:
         try:

@@ -70,7 +70,7 @@ class SideOrder(Message):
 
 
 class DifferenceOrder(Message):
-    """Order to compare two revisions."""
+    """Message that asks a child process to compare two revisions."""
 
     kind: Kind
     before: SideOrder
@@ -83,7 +83,10 @@ class DifferenceOrder(Message):
 def read_difference(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: DifferenceRequest
 ) -> DifferenceSource:
-    """Read the parts that differ between two revisions. Raises `NotFoundProblem` and `TooLargeProblem`."""
+    """Read the parts that differ between two revisions, and return them.
+
+    Raises `NotFoundProblem` if an item or a revision does not exist, and `TooLargeProblem` if the parts are too large.
+    """
     item = items.read_item(tx, project, kind, item_id)
     other = item if request.to_item is None else items.read_item(tx, project, kind, request.to_item)
     after = request.to or other.revision
@@ -128,7 +131,7 @@ def _require_room(source: DifferenceSource) -> None:
 
 
 def difference_order(source: DifferenceSource, request: DifferenceRequest, encoding: AnswerEncoding) -> bytes:
-    """Return the order to compare two revisions."""
+    """Return the packed message that asks a child process to compare two revisions."""
     return DifferenceOrder(
         kind=source.kind,
         before=_side_order(source.before),

@@ -58,7 +58,7 @@ class Given:
 
 
 class BeginOrder(Message):
-    """Order to start a stream.
+    """Message that asks a child process to start a stream.
 
     If the stream starts from an evaluation, `measured` is the encoded part `evaluation` of this evaluation.
     """
@@ -77,7 +77,9 @@ class BeginOrder(Message):
 
 
 class StreamOrder(Message):
-    """Order to add `frames` to a stored stream, or to compute its coverage if `frames` is None.
+    """Message that asks a child process to add `frames` to a stored stream.
+
+    If `frames` is None, the child process only computes the coverage of the stream.
 
     `rig` is the skeleton of the stream's poses with its joint mapping, as bytes.
     """
@@ -90,14 +92,14 @@ class StreamOrder(Message):
 
 @dataclass(frozen=True, slots=True)
 class NextFrames:
-    """Digest of the frames of a request, and the order to add them."""
+    """Digest of the frames of a request, and the packed message that asks a child process to add them."""
 
     digest: str
     order: bytes
 
 
 class BegunStream(Message):
-    """New stream, and the computed members of `CoverageStreamState`."""
+    """New stream, and the members of `CoverageStreamState` that were computed for it."""
 
     settings: Tree
     state: bytes
@@ -113,7 +115,10 @@ class AdvancedStream(Message):
 
 
 def read_given(tx: Transaction, project: str, request: CoverageStreamCreate) -> Given:
-    """Read the documents that a new stream refers to. Raises `NotFoundProblem`."""
+    """Return the skeleton and the evaluation that the request for a stream names, with their documents.
+
+    Raises `NotFoundProblem`.
+    """
     projects.require(tx, project)
     skeleton = rig = evaluation = measured = None
     if request.skeleton is not None:
@@ -136,7 +141,7 @@ def _mapping(tx: Transaction, project: str, skeleton: str, revision: int) -> Tre
 
 
 def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
-    """Return the order to start a stream."""
+    """Return the packed message that asks a child process to start a stream."""
     return BeginOrder(
         request=request,
         skeleton=given.skeleton,
@@ -147,12 +152,15 @@ def begin_order(request: CoverageStreamCreate, given: Given) -> bytes:
 
 
 def look_order(stream: Stream) -> bytes:
-    """Return the order to compute the coverage of a stream in each cell, which is a range of speeds and turn rates."""
+    """Return the packed message that asks a child process to compute the coverage of a stream in each cell.
+
+    A cell is a range of speeds and turn rates.
+    """
     return StreamOrder(settings=stream.settings, rig=stream.rig, state=stream.state).pack()
 
 
 def next_frames(held: Stream, frames: CoverageFrames) -> NextFrames | Tree:
-    """Return the frames of a request with the order to add them, or the stored answer to a repeated request.
+    """Return the message that adds the frames of a request, or the stored answer to a repeated request.
 
     Raises `CoverageOffset` if the frames do not start at the stream's offset.
     """
@@ -181,7 +189,7 @@ def _digest_of(frames: CoverageFrames) -> str:
 
 
 def begin_coverage(packed: bytes) -> bytes:
-    """Carry out a `BeginOrder` and return a `BegunStream`."""
+    """Start the stream that a packed `BeginOrder` describes; return it as a packed `BegunStream`."""
     order = BeginOrder.unpack(packed)
     return begin(order.request, order.given()).pack()
 
@@ -232,7 +240,7 @@ def begin(request: CoverageStreamCreate, given: Given) -> BegunStream:
 
 
 def advance(order: StreamOrder, frames: CoverageFrames) -> AdvancedStream:
-    """Add frames to a stream."""
+    """Add frames to a stream; return its new state and the answer to the request."""
     online = _online(order.state)
     before = online.counts.copy()
     windows = 0
@@ -286,7 +294,7 @@ def _add_poses(online: OnlineCoverage, order: StreamOrder, frames: CoverageFrame
 
 
 def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
-    """Convert numbers to single precision, in which clips are stored.
+    """Convert numbers to single precision, in which clips are stored; None stays None.
 
     Values that are too large become infinite, and are refused later.
     """

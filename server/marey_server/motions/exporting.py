@@ -23,7 +23,7 @@ ExportTime = Literal["canonical", "source"]
 
 
 class ExportOrder(Message):
-    """Order to write the file of an item, whose documents are given as bytes."""
+    """Message that asks a child process to write the file of an item, whose documents are given as bytes."""
 
     item: str
     kind: Kind
@@ -39,7 +39,7 @@ class ExportOrder(Message):
     options: PredecessorOptions
 
     def source(self) -> ItemToExport:
-        """Return the item with its documents."""
+        """Return the item with its decoded documents."""
         return ItemToExport(
             self.item, self.kind, self.name, self.collection, self.revision,
             {part: unpack_tree(packed) for part, packed in self.parts.items()},
@@ -107,7 +107,7 @@ def find_original(
 def export_order(
     source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
 ) -> bytes:
-    """Return the order to write the file of an item."""
+    """Return the packed message that asks a child process to write the file of an item."""
     return ExportOrder(
         item=source.item,
         kind=source.kind,
@@ -136,7 +136,7 @@ def export_item(packed: bytes) -> bytes:
 def write_file(
     source: ItemToExport, file_format: ExportFormat, unit: WrittenUnit, time: ExportTime, options: PredecessorOptions
 ) -> ComputedFile:
-    """Write the file of an item. Raises `InvalidProblem` if the format cannot represent it."""
+    """Return the file of an item in a format. Raises `InvalidProblem` if the format cannot represent the item."""
     if time == "source" and source.kind is not Kind.PROCESSED:
         raise InvalidProblem(
             "Only aligned clips can be exported with the timing of their source clip (time=source).",

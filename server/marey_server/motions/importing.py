@@ -42,7 +42,7 @@ class SourceFile:
     content: bytes | Spool | None
 
     def read(self) -> bytes:
-        """Return the bytes of the file."""
+        """Return the content of the file."""
         assert self.content is not None
         return b"".join(self.content.chunks()) if isinstance(self.content, Spool) else self.content
 
@@ -92,7 +92,7 @@ def planned_entry(planned: PlannedFile) -> PreparedImport | None:
 def file_order(
     planned: PlannedFile, sources: Sequence[SourceFile], options: ImportOptions, skeleton: GivenSkeleton | None
 ) -> bytes:
-    """Return the order to read a file in a child process, together with its companion file if it has one."""
+    """Return the packed message that asks a child process to read a file, with its companion file if it has one."""
     with LOADING:
         from marey_server.motions.reading import FileOrder, packed_skeleton
 
@@ -150,7 +150,7 @@ def firsts_of_skeletons(files: Sequence[PreparedImport], new: Collection[str]) -
 
 
 def mapping_order(file: PreparedImport) -> bytes:
-    """Return the order to derive the joint mapping and axes of a file's skeleton in a child process."""
+    """Return the packed message that asks a child process to derive joint mapping and axes of a file's skeleton."""
     with LOADING:
         from marey_server.motions.reading import MappingOrder, ReadDocument
 
@@ -170,7 +170,7 @@ def found_mapping(answer: bytes) -> PreparedDocument:
 
 
 def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedDocument) -> list[PreparedImport]:
-    """Add joint mapping and axes to a new skeleton, which is given by its digest."""
+    """Return the files with `mapping`, which contains joints and axes, in each new skeleton of the given digest."""
 
     def with_mapping(draft: Draft) -> Draft:
         if draft.kind is not Kind.SKELETON:
@@ -184,7 +184,10 @@ def add_mapping(files: Sequence[PreparedImport], digest: str, mapping: PreparedD
 
 
 def refuse_with_skeleton(files: Sequence[PreparedImport], digest: str, error: ApiProblem) -> list[PreparedImport]:
-    """Refuse the files with a new skeleton whose mapping could not be derived."""
+    """Return the files; those that contain the skeleton of this digest become refusals with `error`.
+
+    Used if no joint mapping could be derived for the skeleton.
+    """
     return [refused_import(file.name, error) if _has_skeleton(file, digest) else file for file in files]
 
 

@@ -66,7 +66,7 @@ class PackedModel(Message):
 
 
 class SampleOrder(Message):
-    """Order to draw samples from a model, as a document."""
+    """Message that asks a child process to draw samples from a model, as a document."""
 
     found: FoundModel
     model: bytes
@@ -76,7 +76,7 @@ class SampleOrder(Message):
 
 
 class SampleFileOrder(Message):
-    """Order to draw samples from a model, as a file."""
+    """Message that asks a child process to draw samples from a model, as a file."""
 
     found: FoundModel
     model: bytes
@@ -144,7 +144,7 @@ def _usable_model(found: FoundModel, packed: bytes) -> UsableModel:
 
 
 def parse_model(loaded: LoadedModel) -> UsableModel:
-    """Build the model from its documents. Raises `InvalidProblem` if its numbers are not valid."""
+    """Return the model that its documents describe. Raises `InvalidProblem` if its numbers are not valid."""
     from marey_motion.documents import skeleton_from_document
     from marey_motion.errors import MotionError
     from marey_motion.modelling.primitive_documents import primitive_from_tree

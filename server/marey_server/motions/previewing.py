@@ -53,7 +53,7 @@ class PreviewSource:
 
 
 class PreviewOrder(Message):
-    """Order to compute a preview: the request, its inputs as bytes, and limits."""
+    """Message that asks a child process to compute a preview: the request, its inputs as bytes, and limits."""
 
     request: EditPreviewRequest
     edit: EditDocument
@@ -66,7 +66,7 @@ class PreviewOrder(Message):
     most_shown: int
 
     def source(self) -> PreviewSource:
-        """Return the inputs, decoded."""
+        """Return the edit and its inputs with decoded documents."""
         return PreviewSource(
             self.edit,
             unpack_tree(self.motion),
@@ -121,7 +121,7 @@ def _size(motion: Tree) -> int:
 
 
 def preview_order(source: PreviewSource, request: EditPreviewRequest, encoding: AnswerEncoding) -> bytes:
-    """Return the order to compute a preview."""
+    """Return the packed message that asks a child process to compute a preview."""
     return PreviewOrder(
         request=request,
         edit=source.edit,

@@ -25,7 +25,7 @@ _SKELETONS_KEPT = 64
 
 
 class FileOrder(Message):
-    """Order to read a file, together with its companion file if it has one."""
+    """Message that asks a child process to read a file, together with its companion file if it has one."""
 
     planned: PlannedFile
     content: bytes
@@ -63,12 +63,12 @@ class ReadDocument(Message):
 
     @classmethod
     def of(cls, document: PreparedDocument) -> Self:
-        """Return the message of a prepared document."""
+        """Return the message that contains a prepared document."""
         arrays = {pointer: data for pointer, (_, data) in document.arrays.items()}
         return cls(schema_name=document.schema, body=canonical_json(document.body), arrays=arrays)
 
     def document(self) -> PreparedDocument:
-        """Return the prepared document."""
+        """Return the prepared document that the message contains."""
         return document_of_bytes(self.schema_name, self.body, self.arrays)
 
 
@@ -112,7 +112,7 @@ class ReadGraph(Message):
 
     @classmethod
     def of(cls, graph: ImportedGraph) -> Self:
-        """Return the message of a graph."""
+        """Return the message that contains a graph."""
         nodes = tuple((*place, node.model_id, node.type, node.transitions) for place, node in graph.graph.nodes.items())
         return cls(
             name=graph.name, collection=graph.collection, tags=tuple(graph.tags), file=graph.file, digest=graph.digest,
@@ -120,7 +120,7 @@ class ReadGraph(Message):
         )  # fmt: skip
 
     def graph(self) -> ImportedGraph:
-        """Return the graph."""
+        """Return the graph that the message contains."""
         nodes = {(action, name): GraphNode(model, form, onwards) for action, name, model, form, onwards in self.nodes}
         graph = PredecessorGraph(nodes, self.start)
         return ImportedGraph(self.name, self.collection, self.tags, graph, self.file, self.digest)
@@ -137,7 +137,10 @@ class ReadFile(Message):
 
 
 class MappingOrder(Message):
-    """Order to find the joint mapping and axes of a skeleton, with the motion of a clip that uses it."""
+    """Message that asks a child process to find the joint mapping and axes of a skeleton.
+
+    The message contains the motion of a clip that uses the skeleton.
+    """
 
     hierarchy: ReadDocument
     motion: ReadDocument | None

@@ -57,7 +57,10 @@ class SearchLimits:
 
 
 class SearchOrder(Message):
-    """Order to run a search. A search has one or more steps; each searches one model for one motion."""
+    """Message that asks a child process to run a search.
+
+    A search has one or more steps; each searches one model for one motion.
+    """
 
     request: SearchRequest
     models: SearchedModels
@@ -70,13 +73,13 @@ class SearchOrder(Message):
 
 
 class SearchAnswerOrder(SearchOrder):
-    """Order to answer a search with a document."""
+    """Message that asks a child process to answer a search with a document."""
 
     encoding: AnswerEncoding
 
 
 class SearchFileOrder(SearchOrder):
-    """Order to answer a search with a motion file."""
+    """Message that asks a child process to answer a search with a motion file."""
 
     format: MotionFormat
     unit: WrittenUnit
@@ -93,7 +96,7 @@ class SearchResult:
 
     @property
     def clip(self) -> Clip:
-        """All steps joined to one clip."""
+        """The motions of all steps, joined to one clip."""
         last = self.found if self.finished is None else self.finished.found
         return last.motion.as_clip(last.skeleton, last.frame_rate_hz)
 
@@ -216,7 +219,7 @@ def answer_of(
 def file_of(
     result: SearchResult, found: Sequence[FoundSearchable], file_format: MotionFormat, unit: str
 ) -> ComputedFile:
-    """Write all steps to one file. Raises `InvalidProblem` if the format cannot represent it."""
+    """Return a file with the motions of all steps. Raises `InvalidProblem` if the format cannot represent them."""
     from marey_motion.errors import MotionError
     from marey_motion.exporting import write_clip_file
 

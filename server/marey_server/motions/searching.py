@@ -88,7 +88,7 @@ class Searchable:
 def find_searchables(
     tx: Transaction, project: str, kind: Kind, item_id: str, request: SearchRequest
 ) -> list[FoundSearchable]:
-    """Return the model of each step. Raises `NotFoundProblem`."""
+    """Return, for each step of the request, the model to search. Raises `NotFoundProblem` if one does not exist."""
     if kind is not Kind.MODEL:
         raise NotFoundProblem(f"Only models can be searched, not an item of the kind {kind}.", code="not-a-model")
     wanted = [step.model or item_id for step in request.asked_steps]

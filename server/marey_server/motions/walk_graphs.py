@@ -35,7 +35,7 @@ class WalkSource:
 
 
 class WalkOrder(Message):
-    """Order to write the walk graph of one trial, or of all trials together."""
+    """Message that asks a child process to write the walk graph of one trial, or of all trials together."""
 
     name: str
     evaluation: bytes
@@ -58,7 +58,7 @@ def read_walks(tx: Transaction, project: str, kind: Kind, item_id: str, revision
 
 
 def walk_order(source: WalkSource, trial: str | None, form: WalkGraphFormat) -> bytes:
-    """Return the order to write a walk graph."""
+    """Return the packed message that asks a child process to write a walk graph."""
     return WalkOrder(
         name=source.name,
         evaluation=pack_tree(source.evaluation),

@@ -97,7 +97,7 @@ class ChildTask(Generic[T]):
             _after(ABANDONED_S, self.stop, "client-gone")
 
     def succeed(self, payload: bytes) -> None:
-        """Convert the result and end the task."""
+        """Convert the bytes of the result with `read`, and end the task with it; if that fails, end with the error."""
         try:
             result = self.read(payload)
         except Exception as error:  # noqa: BLE001 - whoever waits for the task gets it

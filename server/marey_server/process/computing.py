@@ -38,11 +38,14 @@ class ComputeThreads:
         return {"computing": self._lane, "rendering": self.rendering}
 
     def submit(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a computation or file access of the server itself in a thread, away from the event loop."""
+        """Run a computation or file access of the server itself in a thread; return the future of its result."""
         return self._lane.submit(SERVER, function, *args, **kwargs)
 
     def submit_for(self, client: Client, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Run a computation for a client in a thread. Raises `UnavailableProblem` if too many wait."""
+        """Run a computation for a client in a thread; return the future of its result.
+
+        Raises `UnavailableProblem` if too many computations wait.
+        """
         return self._lane.submit(client, function, *args, **kwargs)
 
     def close(self) -> None:

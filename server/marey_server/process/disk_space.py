@@ -39,7 +39,7 @@ class DiskSpace:
         return f"the disk of {self._folder} has less than {floor} MiB free (min_free_bytes); purge or move data"
 
     def require(self) -> None:
-        """Raise `StorageFullProblem` if nothing can be stored."""
+        """Raise `StorageFullProblem` if the disk has too little free space to store anything."""
         if self._is_low():
             raise StorageFullProblem(
                 "The disk of the server is full, so nothing was written. Requests that delete data are still accepted."

@@ -48,7 +48,7 @@ class RequestMemory:
             self._by_owner[owner] += more
 
     def give_back(self, owner: str, held: int) -> None:
-        """Subtract bytes that a request no longer holds."""
+        """Subtract `held` bytes from the memory of the owner of a request, which no longer holds them."""
         with self._lock:
             self.held_bytes -= held
             self._by_owner[owner] -= held
@@ -75,7 +75,7 @@ class Holding:
         self._bytes += more
 
     def shrink(self, less: int) -> None:
-        """Hold fewer bytes."""
+        """Reduce the memory that this request holds by `less` bytes."""
         if less:
             self._bytes -= less
             self._memory.give_back(self._owner, less)

@@ -60,7 +60,9 @@ def configure_logging(form: LogForm, level: str) -> None:
 
 
 def without_received_text(record: logging.LogRecord) -> bool:
-    """Shorten Tornado's messages about malformed requests to the kind of fault.
+    """Replace what the client sent in Tornado's messages about malformed requests; return True to log the message.
+
+    Only the kind of the fault stays, because a header may contain a token.
 
     The messages quote what the client sent, and a header may contain a token.
     """
@@ -83,12 +85,12 @@ def _is_of_an_upgrade(record: logging.LogRecord) -> bool:
 
 @dataclass(frozen=True)
 class _OneMetric:
-    """Registry of one metric."""
+    """Registry that contains one metric only."""
 
     metric: Metric
 
     def collect(self) -> Iterable[Metric]:
-        """Return the metric."""
+        """Return the metric in a tuple."""
         return (self.metric,)
 
 
@@ -167,6 +169,6 @@ class Metrics:
         self.children_stopped.labels(reason, work).inc()
 
     def watch(self, lanes: Mapping[str, Sized]) -> None:
-        """Show how many calls wait in each lane."""
+        """Let the metric of waiting calls show, for each lane, how many calls wait in it."""
         for name, lane in lanes.items():
             self.waiting.labels(name).set_function(partial(len, lane))

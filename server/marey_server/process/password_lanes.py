@@ -84,7 +84,7 @@ class PasswordLane:
             self._places += Counter()  # drops addresses without a place
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run `function`, which hashes a password, in the thread of the lane."""
+        """Run `function`, which hashes a password, in the thread of the lane, and return its result."""
         return await asyncio.wrap_future(self._thread.submit(function, *args, **kwargs))
 
     def close(self) -> None:
@@ -110,7 +110,7 @@ class RefusedTries:
                 raise too_many_sign_ins(limit, wait_s)
 
     def note(self, attempt: SignInTry, refusal: TooManyRequestsProblem) -> None:
-        """Remember that a limit refused a try."""
+        """Remember how long a limit refuses further tries from this address, or for this name from this address."""
         limit: LimitScope = refusal.context["limit"]
         name = None if limit == "address" else attempt.name
         self._until.put((name, attempt.address), (self._clock() + refusal.context["wait_s"], limit))

@@ -30,7 +30,7 @@ class _RunningHash:
         self._hash = hashlib.sha256()
 
     def add(self, data: bytes) -> None:
-        """Hash and copy the next bytes."""
+        """Add the next bytes to the hash, and to the copy if there is one."""
         if self.copy is not None:
             with open(self.copy, "r+b") as file:
                 file.seek(self.offset)  # writing may have failed half-way

@@ -217,7 +217,10 @@ class DirectoryBlobs:
                             yield f"sha256:{folder.name}{path.name}"
 
     def new_copy(self) -> Path:
-        """Create a file for the copy of an upload; garbage collection removes it if `adopt` is not called."""
+        """Create an empty file for the copy of an upload, and return its path.
+
+        Garbage collection removes the file if `adopt` is not called.
+        """
         handle, name = tempfile.mkstemp(dir=self._incoming)
         os.close(handle)
         return Path(name)

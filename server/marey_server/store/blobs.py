@@ -59,7 +59,7 @@ class Spool:
         self.size_bytes = 0
 
     def write(self, data: bytes) -> None:
-        """Append bytes."""
+        """Append bytes, and add them to the hash."""
         self._file.write(data)
         self._hash.update(data)
         self.size_bytes += len(data)
@@ -76,7 +76,7 @@ class Spool:
             yield chunk
 
     def close(self) -> None:
-        """Discard the bytes."""
+        """Close the spool, which discards its bytes."""
         self._file.close()
 
     def __enter__(self) -> Self:

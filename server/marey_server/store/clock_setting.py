@@ -40,7 +40,7 @@ class StoredClock:
 
 
 def read_clock(connection: Connection) -> StoredClock:
-    """Return the clock of a database."""
+    """Return the greatest time that the database contains, and the time of the computer's clock."""
     return StoredClock(stored_high_water_us(connection), wall_clock_us())
 
 

@@ -48,7 +48,7 @@ class NewStream:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Stored state of a stream."""
+    """Row of a coverage stream in the database."""
 
     id: str
     settings: Tree
@@ -62,7 +62,7 @@ class Stream:
     rev: int
 
     def shown(self) -> Tree:
-        """Return the stream as members of `CoverageStream`."""
+        """Return the members of `CoverageStream` that describe the stream."""
         return {
             **self.settings,
             "id": self.id,
@@ -165,7 +165,7 @@ def delete_stream(tx: Transaction, project: str, stream_id: str) -> None:
 
 
 def drop_old_streams(tx: Transaction) -> int:
-    """Delete streams that have received no frames for a day."""
+    """Delete the streams that have received no frames for a day; return their number."""
     return tx.execute(delete(coverage_stream).where(_is_old(tx))).rowcount
 
 

@@ -107,7 +107,7 @@ def _check_page(
 
 
 def _check_file(tx: Transaction) -> list[StoreDefect]:
-    """Check the database file and its foreign keys on SQLite; Postgres enforces its own."""
+    """Return the faults that SQLite finds in its file and its foreign keys; none for Postgres, which prevents them."""
     if tx.is_postgres:
         return []
     pages = [row[0] for row in tx.execute(text("PRAGMA integrity_check(100)")) if row[0] != "ok"]
@@ -236,7 +236,10 @@ def _check_collection(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_holding(tx: Transaction, row: Row[Any], owner: Column[str]) -> list[StoreDefect]:
-    """Check the counters of items and bytes of a project or user; `owner` is the column of `item` that names it."""
+    """Return a fault if the stored counts of a project's or user's items and bytes are wrong.
+
+    `owner` is the column of `item` that names the project or user.
+    """
     counted, recorded = quotas.count_held(tx, owner, row.id), quotas.read_held(tx, row.id)
     return (
         []
@@ -260,7 +263,7 @@ def _check_upload(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_chunk(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Check a chunk of a tree of entries, and that the chunks below it exist."""
+    """Return the faults of one chunk of a tree of entries: it is damaged, or a chunk below it is missing."""
     try:
         chunk = decode(row.digest, bytes(row.data))
     except DamagedChunk as error:
@@ -271,7 +274,7 @@ def _check_chunk(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Check that the content of each commit has the commit's digest."""
+    """Return the faults of the commits, entries and proposals of a dataset."""
     above = select(commit_parent).where(commit_parent.c.dataset_id == row.id).order_by(commit_parent.c.position)
     parents: dict[str, list[str]] = {}
     for found in tx.execute(above):
@@ -286,7 +289,7 @@ def _check_dataset(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Check that the project has a revision with the content of each entry of each version."""
+    """Return a fault for each entry of a version whose content no revision of the project has."""
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
@@ -310,7 +313,7 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_proposals(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Check that each proposal has the fields that its state needs, and that its branches exist while it is open."""
+    """Return a fault for each proposal that lacks a field or, while it is open, a branch."""
     of_dataset = (dataset_ref.c.dataset_id == row.id, dataset_ref.c.kind == RefKind.BRANCH.value)
     branches = set(tx.execute(select(dataset_ref.c.name).where(*of_dataset)).scalars())
     return [

@@ -119,7 +119,7 @@ def _still_garbage(tx: Transaction, table: Table, digests: Sequence[str], grace_
 
 
 def delete_documents(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete the given documents, except those with references."""
+    """Delete those of the given documents that have had no reference for `grace_us`; return their number."""
     going = set(_still_garbage(tx, document, digests, grace_us)) - _staged_documents(tx)
     tx.execute(delete(document_blob).where(document_blob.c.document_digest.in_(going)))
     tx.execute(delete(document).where(document.c.digest.in_(going)))
@@ -140,7 +140,7 @@ def _staged_documents(tx: Transaction) -> set[str]:
 
 
 def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_US) -> int:
-    """Delete the given blobs, except those with references."""
+    """Delete those of the given blobs that have had no reference for `grace_us`; return their number."""
     going = _still_garbage(tx, blob, digests, grace_us)
     for digest in going:
         tx.blobs.release(tx.connection, digest)
@@ -152,7 +152,7 @@ def delete_blobs(tx: Transaction, digests: Sequence[str], grace_us: int = GRACE_
 
 
 def _sweep_strays(database: Database, grace_us: int) -> int:
-    """Remove files without a row from a directory, left by rolled-back transactions or deleted rows."""
+    """Delete the files of blobs that the database does not name, after rollbacks or deletions; return their number."""
     return sum(
         database.write(SYSTEM, _remove_stray, digest)
         for digest in database.blobs.stray_digests(older_than_s=grace_us / 1_000_000)
@@ -173,7 +173,10 @@ def _remove_stray(tx: Transaction, digest: str) -> int:
 
 
 def _delete_uploads(database: Database) -> int:
-    """Delete abandoned uploads, and the pieces that no upload and no blob needs, in short transactions."""
+    """Delete abandoned uploads, and pieces that no upload and no blob needs; return the number of these uploads.
+
+    Uses several short transactions.
+    """
     dropped = database.write(SYSTEM, uploads.drop_old, MOST_UPLOADS)
     while database.write(SYSTEM, uploads.delete_pieces):
         pass
@@ -187,7 +190,7 @@ def _drop_old_keys(tx: Transaction) -> int:
 
 
 def _drop_ended_holdings(tx: Transaction) -> int:
-    """Delete the records of uploads by attempts that have lost their jobs or have ended."""
+    """Delete the records of blobs that attempts uploaded before they ended or lost their jobs; return their number."""
     same_attempt = (job.c.id == attempt_blob.c.job_id, job.c.fence == attempt_blob.c.fence)
     held = exists().where(*same_attempt, job.c.state == RUNNING)
     return tx.execute(delete(attempt_blob).where(~held)).rowcount

@@ -36,7 +36,7 @@ class Order:
     """Columns of the order, each with True if its order is descending."""
 
     def clauses(self) -> list[UnaryExpression[Any]]:
-        """Return the clauses of ORDER BY."""
+        """Return the terms of the clause ORDER BY."""
         return [column.desc() if falls else column.asc() for column, falls in self.columns]
 
     def after(self, values: Sequence[Any]) -> ColumnElement[bool]:

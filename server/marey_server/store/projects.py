@@ -190,14 +190,14 @@ def writable_projects(tx: Transaction, names: Iterable[str]) -> list[str]:
 
 
 def read_project(tx: Transaction, name: str) -> Project:
-    """Return a project."""
+    """Return the project of this name, with the caller's role in it."""
     return require(tx, name).shown()
 
 
 def list_projects(
     tx: Transaction, *, sort: str = "name", cursor: str | None = None, limit: int = listing.DEFAULT_LIMIT
 ) -> Page:
-    """Return the projects that the caller may read."""
+    """Return a page of the projects that the caller may read."""
     order = listing.parse_order(sort, SORT_KEYS)
     identity = ["projects", tx.principal.user_id]
     statement = _with_role_of(tx.principal.user_id or "").where(is_visible(tx.principal))
@@ -310,7 +310,7 @@ def restore_project(tx: Transaction, name: str, *, expected_rev: ExpectedRev = N
 
 
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
-    """Change the limits of a project. Only administrators may do this."""
+    """Change the quotas of a project, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
     found = tx.execute(select(project.c.id).where(project.c.name == name, project.c.deleted_us.is_(None))).scalar()
     if found is None:

@@ -193,7 +193,10 @@ def show_quotas(tx: Transaction, of: Literal["project", "user"], owner_id: str) 
 
 
 def change_limits(tx: Transaction, of: Literal["project", "user"], owner_id: str, change: QuotaChange) -> QuotasInUse:
-    """Change the limits of a project or a user. The caller must have checked that the principal is an administrator."""
+    """Change the quotas of a project or a user, and return all of its quotas and their use.
+
+    The caller must have checked that the principal is an administrator.
+    """
     changed = _add(tx, owner_id, Held()).limits | change.model_dump(exclude_unset=True)
     limits = {name: limit for name, limit in changed.items() if limit is not None}
     tx.execute(update(holding).where(holding.c.owner_id == owner_id).values(limits=limits))
@@ -224,7 +227,10 @@ _SUMS = (func.count().label("items"), func.coalesce(func.sum(item.c.stored_bytes
 
 
 def count_held(tx: Transaction, owner: Column[str], owner_id: str) -> Held:
-    """Count the items and bytes of a project or a user, item by item; `owner` is the column of items that names it."""
+    """Return the numbers of items and bytes of a project or a user, counted item by item.
+
+    `owner` is the column of `item` that names the project or user.
+    """
     row = tx.execute(select(*_SUMS).where(owner == owner_id, item.c.deleted_us.is_(None))).one()
     return Held(row.items, int(row.stored_bytes))
 

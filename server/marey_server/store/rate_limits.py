@@ -59,7 +59,7 @@ def count(tx: Transaction, limit: RateLimit) -> int:
 
 
 def take_back(tx: Transaction, limit: RateLimit) -> None:
-    """Remove a counted event."""
+    """Undo the count of one event, so that it does not use up the limit."""
     values = {"until_us": sign_in_limit.c.until_us - limit.interval_us}
     tx.execute(update(sign_in_limit).where(sign_in_limit.c.key == limit.key).values(**values))
 

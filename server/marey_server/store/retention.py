@@ -52,7 +52,7 @@ class Retired:
 
 
 def retire(database: Database, retention: Retention) -> Retired:
-    """Delete events, logs and jobs that are too old; may run at any time and in several processes at once."""
+    """Delete events, logs and jobs that are too old, and return how many; may run in several processes at once."""
     return Retired(
         events=_retire_events(database, retention.events_days) if retention.events_days else 0,
         logs=_retire_logs(database, retention.logs_days) if retention.logs_days else 0,
@@ -94,7 +94,7 @@ def _old_logs(tx: Transaction, age_us: int, after: tuple[str, int]) -> list[tupl
 
 
 def _delete_logs(tx: Transaction, attempts: Sequence[tuple[str, int]]) -> int:
-    """Replace logs by the text `DELETED_LOG`. Logs of ended attempts do not grow any more."""
+    """Replace the logs of ended attempts by the text `DELETED_LOG`; return the number of these logs."""
     chosen = tuple_(job_log.c.job_id, job_log.c.fence).in_(attempts)
     tx.execute(delete(job_log).where(chosen))
     notices = [{"job_id": job_id, "fence": fence, "offset": 0, "data": DELETED_LOG} for job_id, fence in attempts]
@@ -159,7 +159,7 @@ def _delete_tasks(tx: Transaction, parent: str) -> int:
 
 
 def _delete_if_unused(tx: Transaction, job_id: str) -> int:
-    """Delete an old job, unless a job that depends on it was submitted in the meantime."""
+    """Delete an old job, unless a job that depends on it was submitted in the meantime; return 1 or 0."""
     used = select(job_dependency.c.job_id).where(job_dependency.c.on_job_id == job_id).limit(1)
     return 0 if tx.execute(used).first() else _delete_jobs(tx, [job_id])
 

@@ -36,7 +36,7 @@ def change_row(
     expected_rev: ExpectedRev,
     absent: ApiProblem,
 ) -> Row[Any]:
-    """Change the one row that meets `which`, if its `rev` is an expected one.
+    """Change the one row that meets `which`, if its `rev` is an expected one, and return the changed row.
 
     Raises `absent` if there is no such row, and `PreconditionFailedProblem` with the current `rev` if it has changed.
     """

@@ -83,11 +83,11 @@ class Transaction:
         return self.connection.dialect.name == "postgresql"
 
     def execute(self, statement: Executable, parameters: Any = None) -> CursorResult[Any]:
-        """Run one statement."""
+        """Run one SQL statement, and return its result."""
         return self.connection.execute(statement, parameters)
 
     def run(self, statement: Prepared, parameters: Mapping[str, Any]) -> list[Any]:
-        """Return the rows of a prepared statement."""
+        """Run a prepared statement, and return its rows."""
         return statement.run(self.connection, parameters)
 
     def first(self, statement: Prepared, parameters: Mapping[str, Any]) -> Any | None:

@@ -81,7 +81,7 @@ def read_upload(tx: Transaction, upload_id: str) -> StoredUpload:
 
 
 def append(tx: Transaction, upload_id: str, offset: int, data: bytes) -> StoredUpload:
-    """Append a piece of at most a few MiB at `offset`.
+    """Append a piece of at most a few MiB at `offset`, and return the state of the upload.
 
     Raises `ConflictProblem` with the current offset in `context.offset` if the upload is at another offset.
     """

@@ -74,7 +74,7 @@ def read_quotas(tx: Transaction, name: str) -> QuotasInUse:
 
 
 def change_quotas(tx: Transaction, name: str, change: QuotaChange) -> QuotasInUse:
-    """Change the limits of a user. Only administrators may do this."""
+    """Change the quotas of a user, and return all of them and their use. Only administrators may do this."""
     require_administrator(tx.principal)
     return quotas.change_limits(tx, "user", find_user(tx, name).id, change)
 

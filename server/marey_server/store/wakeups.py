@@ -69,7 +69,7 @@ class Wakeups:
 
 
 class Listener:
-    """Waiting coroutine and the topics that wake it."""
+    """Coroutine that waits, and the topics that wake it."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop

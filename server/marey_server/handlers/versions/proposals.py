@@ -106,7 +106,7 @@ class WaitingProposal(Resource):
     async def settle(
         self, function: Callable[..., Any], project: str, dataset: str, proposal: int, body: Request
     ) -> Rendered:
-        """Run `function`, which may merge the proposal, with the merge that was prepared for this.
+        """Run `function`, which may merge the proposal, with a prepared merge; answer with its result.
 
         If a branch has moved since the merge was prepared, prepare it and run `function` again.
         """

@@ -200,7 +200,7 @@ class Database:
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> Future[T]:
-        """Run `write` in a thread, on behalf of the server itself."""
+        """Run `write` in a thread, on behalf of the server itself; return the future of the function's result."""
         return self.queue_write(SERVER, principal, lambda tx: function(tx, *args, **kwargs))
 
     def queue_read(

@@ -94,6 +94,6 @@ def _shown(url: str) -> str:
 
 
 def _reason(error: BaseException | None) -> str:
-    """Return the first line of the driver's message."""
+    """Return the first line of an error's message, if possible of the error that the database driver raised."""
     text = str(getattr(error, "orig", None) or error).strip()
     return text.splitlines()[0] if text else "no reason is given"

@@ -177,7 +177,7 @@ def _run(connection: Connection, text: str, values: Any, *, gives_rows: bool = F
 
 
 def _failure(connection: Connection, text: str, error: Exception) -> Exception:
-    """Convert an error of the driver to one of SQLAlchemy.
+    """Return the SQLAlchemy error for an error that the database driver raised.
 
     If the connection broke, also discard the idle connections of the pool.
     """

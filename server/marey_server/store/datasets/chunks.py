@@ -34,7 +34,7 @@ class StoredChunks:
         return found
 
     def save(self, chunks: Mapping[str, bytes]) -> None:
-        """Collect new chunks."""
+        """Add new chunks to `new`, by digest; they are not written to the database yet."""
         self.new.update(chunks)
 
 

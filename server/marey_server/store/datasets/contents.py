@@ -46,7 +46,7 @@ def find_contents_of(tx: Transaction, wanted: Iterable[RevisionKey]) -> Contents
 
 
 def _in_order(waiting: Mapping[RevisionKey, _Waiting]) -> list[RevisionKey]:
-    """Sort revisions so that each comes after those that it refers to.
+    """Return the keys of revisions in an order in which each comes after the revisions that it refers to.
 
     If references form a circle, the order inside the circle is arbitrary.
     """
@@ -65,7 +65,7 @@ def _in_order(waiting: Mapping[RevisionKey, _Waiting]) -> list[RevisionKey]:
 
 @dataclass
 class _Waiting:
-    """Revision without a stored digest."""
+    """Revision whose content digest is not stored yet."""
 
     kind: str
     parts: Mapping[str, str]

@@ -213,7 +213,7 @@ class CommitReader:
         self._known: dict[str, _ReadCommit] = {}
 
     def read(self, digest: str) -> _ReadCommit:
-        """Return a commit, which must exist."""
+        """Return the commit with this digest, which the dataset must have."""
         if digest not in self._known:
             of_dataset = (dataset_commit.c.dataset_id == self._dataset_id, dataset_commit.c.digest == digest)
             row = self._tx.execute(select(dataset_commit).where(*of_dataset)).one()

@@ -168,7 +168,10 @@ def _merged(
     entries: Mapping[str, DatasetEntry | None],
     annotations: AnnotationMerger,
 ) -> MergedEntries:
-    """Merge the entries of a job with what others have changed at the same paths since `base`, part by part."""
+    """Return the result of merging the entries of a job with changes of others since `base`, part by part.
+
+    Only changes at the paths of these entries, up to the commit's tree `head`, are merged.
+    """
     before = {key: entry_of(key, value) for key, value in Tree(reader, base).get_several(entries).items()}
     if base == head:
         now = before
@@ -245,7 +248,7 @@ def _on_own_branch(
 
 
 def _create_branch(tx: Transaction, wanted: OutputEntries, digest: str) -> str:
-    """Create a branch with the id of the job as its name, or, if that is taken, with a number after it."""
+    """Create a branch named after the id of the job, with a number if that name is taken; return the name."""
     for number in count(1):
         name = wanted.job_id if number == 1 else f"{wanted.job_id}-{number}"
         row = new_ref(tx, wanted.dataset_id, name, RefKind.BRANCH, digest)

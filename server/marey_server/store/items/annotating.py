@@ -34,7 +34,7 @@ class ChangedAnnotation:
 
 
 def find_annotation(tx: Transaction, project: str, item_id: str) -> FoundAnnotation:
-    """Read an annotation in order to change it.
+    """Return an annotation that is to be changed, with the number of frames of its clip.
 
     Raises `NotFoundProblem` if the annotation does not exist, and `InvalidProblem` if its clip does not exist.
     """
@@ -65,7 +65,7 @@ class AnnotatedClip:
 
 
 def find_annotated_clip(tx: Transaction, project: str, item_id: str) -> AnnotatedClip:
-    """Read the clip that is to be annotated. Raises `NotFoundProblem` if it does not exist."""
+    """Return the clip that is to be annotated. Raises `NotFoundProblem` if it does not exist."""
     item = read_item(tx, project, Kind.CLIP, item_id)
     return AnnotatedClip(item, int(item.summary["frames"]))
 

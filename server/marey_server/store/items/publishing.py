@@ -154,7 +154,7 @@ def _required(kind: Kind) -> list[str]:
 
 @dataclass(frozen=True)
 class _Head:
-    """Item with the documents of its newest revision."""
+    """Item of the project, and the digests of the documents of its newest revision."""
 
     id: str
     number: int
@@ -205,7 +205,10 @@ class _Publication:
         )
 
     def _store(self, group: Sequence[_Loaded]) -> list[_Ready]:
-        """Store the documents of drafts, with references to earlier drafts replaced by their revisions."""
+        """Store the documents of drafts, and return the drafts with the digests of their documents.
+
+        References to earlier drafts are replaced by references to the revisions that these became.
+        """
         fresh: list[PreparedDocument] = []
         variants: list[tuple[str, Tree]] = []
         stored = []
@@ -263,7 +266,7 @@ class _Publication:
         return found
 
     def _find_contents(self, waiting: Sequence[_Ready], kind: Kind) -> dict[str, Row[Any]]:
-        """Find, for each draft, the first item of the project that has the same required parts."""
+        """Return, by id of the draft, the row of the first item of the project that has the same required parts."""
         self.tx.lock(f"content:{self.project.id}:{kind}")
         statement = select(item.c.id, item.c.head, item.c.creator_id).where(
             item.c.project_id == self.project.id, item.c.kind == kind.value, item.c.deleted_us.is_(None)

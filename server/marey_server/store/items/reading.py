@@ -98,7 +98,7 @@ _PART_OF_REVISION = Prepared(_PART.where(revision_part.c.number == bindparam("nu
 
 
 def find_item(tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, deleted: bool = False) -> Any:
-    """Return the row of an item. Raises `NotFoundProblem`."""
+    """Return the row of an item. Raises `NotFoundProblem` if the project has no such item of this kind."""
     which = {"item_id": item_id, "project_id": project_row.id, "kind": kind.value}
     row = tx.execute(_DELETED_ITEM, which).one_or_none() if deleted else tx.first(_ITEM, which)
     if row is None:

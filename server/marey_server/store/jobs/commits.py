@@ -167,7 +167,10 @@ JOB_COLUMNS = (
 
 
 def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> PublishedOutputs:
-    """Publish the drafts of a job (`JOB_COLUMNS`) and commit them if its submission asks for that, all or nothing."""
+    """Publish the drafts of a job, and commit them if the request for the job says so: all or nothing.
+
+    `row` has the columns `JOB_COLUMNS`. The result contains the published revisions, the commit or the failure.
+    """
     if row.commit_to is None:
         return PublishedOutputs(staging.publish_drafts(tx, row, drafts))
     if row.parent_id is not None:
@@ -181,7 +184,10 @@ def publish_outputs(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]
 
 
 def commit_tasks(tx: Transaction, row: Any) -> PublishedOutputs:
-    """Commit the outputs of all tasks of a parent job (`JOB_COLUMNS`) if its submission asks for that."""
+    """Commit the outputs of all tasks of a parent job, if the request for the job says so.
+
+    `row` has the columns `JOB_COLUMNS`. The result contains the commit or the failure.
+    """
     if row.commit_to is None:
         return PublishedOutputs()
     tasks = select(job.c.outputs).where(job.c.parent_id == row.id).order_by(job.c.position)
@@ -202,7 +208,10 @@ class _CommitRefused(Exception):
 
 
 def _publish_entries(tx: Transaction, row: Any, drafts: Mapping[str, StagedDraft]) -> list[dict[str, Any]]:
-    """Publish the drafts of a job, and compute the digests of their content, so that a parent job need not do it."""
+    """Publish the drafts of a job, and return its outputs with the paths of their entries.
+
+    Also stores the digests of their content, so that a parent job need not compute them.
+    """
     outputs = staging.publish_drafts(tx, row, drafts)
     store_contents(tx, find_contents_of(tx, map(_revision, outputs)))
     return [{**one, "entry": _entry_path(row, drafts[one["name"]])} for one in outputs]

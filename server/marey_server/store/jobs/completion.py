@@ -101,7 +101,10 @@ _WIN = Prepared(
 def _complete(
     tx: Transaction, requests: Mapping[_Place, CompleteRequest]
 ) -> dict[_Place, tuple[Ended, CompleteAnswer]]:
-    """End the jobs whose attempts are still valid, record their results and publish their outputs."""
+    """End the jobs whose attempts are still valid, and publish their outputs.
+
+    Returns, by job and fence, the ended job and the answer; attempts that are no longer valid are missing.
+    """
     if not requests:
         return {}
     won = tx.run(_WIN, {"now": tx.now_us, **held_parameters(requests)})
@@ -162,7 +165,10 @@ def _complete(
 
 
 def _fail_for_commit(tx: Transaction, row: Any, failure: dict[str, Any]) -> tuple[Ended, CompleteAnswer]:
-    """Record that a job failed because its outputs may not be committed; nothing of it was published."""
+    """Record that a job failed because its outputs may not be committed; return the ended job and the answer.
+
+    No output of the job was published.
+    """
     tx.execute(update(job).where(job.c.id == row.id).values(state="failed", failure=failure))
     end = replace(as_ended(row), state=JobState.FAILED.value, failure=failure)
     return end, CompleteAnswer(job=row.id, state=JobState.FAILED)
@@ -200,7 +206,7 @@ def _same_answer(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswe
 
 
 def _end_cancelled(tx: Transaction, place: _Place, write_id: str) -> CompleteAnswer:
-    """End a job as cancelled if its cancellation was requested before its worker completed it.
+    """End a job as cancelled because its cancellation was requested before its worker completed it; return the answer.
 
     Raises `LeaseLostProblem` if the attempt does not hold the job.
     """

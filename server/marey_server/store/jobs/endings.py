@@ -43,7 +43,7 @@ def as_ended(row: Row[Any]) -> Ended:
 
 
 def failure_document(reason: FailureReason, code: str, detail: str) -> dict[str, Any]:
-    """Return the stored document of a failure."""
+    """Return the document of a job's failure, in the form in which the database stores it."""
     return JobFailure(reason=reason, code=code, detail=detail[:LONGEST_DETAIL]).model_dump(mode="json")
 
 
@@ -54,7 +54,10 @@ def dependency_failure(cause: str, state: str) -> dict[str, Any]:
 
 
 def end_jobs(tx: Transaction, condition: ColumnElement[bool], state: str, **values: Any) -> list[Ended]:
-    """Set the final `state` of the jobs that meet `condition`; the condition must include the check of the fence."""
+    """Set the final `state` of the jobs that meet `condition`, and return these jobs.
+
+    The condition must include the check of the fence.
+    """
     statement = (
         update(job)
         .where(condition)

@@ -20,7 +20,9 @@ MOST_GATHERED = 1000
 
 
 def gather(tx: Transaction, parent_id: str) -> list[Ended]:
-    """End a parent job whose tasks have all ended, or queue it if its kind combines the results in a worker.
+    """End a parent job whose tasks have all ended, and return it.
+
+    If its kind combines the results of the tasks in a worker, the job is queued instead, and nothing is returned.
 
     If all tasks succeeded, the parent job succeeds or is queued. Otherwise it is cancelled if cancellation was
     requested, and failed if a task failed.
@@ -80,7 +82,10 @@ def combine_results(results: Iterable[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _combine(known: Any, value: Any) -> Any:
-    """Combine two values; values of different types are omitted."""
+    """Return `known` combined with `value`: numbers are added, lists joined and tables merged.
+
+    A value of another type is ignored, and so is a `known` that has another type than `value`.
+    """
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value + (known if isinstance(known, int | float) else 0)
     if isinstance(value, list):

@@ -57,7 +57,7 @@ class NewJob:
 
     @property
     def cache_mode(self) -> str:
-        """Whether a cached result may be used."""
+        """The setting of the request that says whether a cached result may be used."""
         return self.submission.request.cache
 
     @property

@@ -100,7 +100,10 @@ def _waiting(tx: Transaction, ids: Sequence[str]) -> Sequence[Row[Any]]:
 
 
 def _move(tx: Transaction, rows: Sequence[Row[Any]], upstream: dict[str, list[Ended]]) -> list[Ended]:
-    """Count ended dependencies of waiting jobs; make jobs ready, or end those that can no longer run."""
+    """Count the dependencies of waiting jobs that have ended; make jobs ready whose dependencies have all ended.
+
+    Jobs that can no longer run are ended. Returns the jobs that have ended.
+    """
     following: list[Ended] = []
     left: dict[str, int] = {}
     shared: list[Row[Any]] = []
@@ -127,7 +130,9 @@ def _store_counts(tx: Transaction, left: dict[str, int]) -> None:
 
 
 def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
-    """End a waiting job because the job `cause`, on which it depends, did not succeed; cancel its tasks.
+    """End a waiting job because the job `cause`, on which it depends, did not succeed; return the ended jobs.
+
+    Its tasks are cancelled.
 
     The job fails, or is cancelled if its `on_failure` is `skip`.
     """
@@ -142,7 +147,7 @@ def _doom(tx: Transaction, row: Row[Any], cause: Ended) -> list[Ended]:
 
 
 def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
-    """Start a parent job and make its tasks ready."""
+    """Start a parent job and make its tasks ready; return the jobs that have ended by this."""
     tasks = tx.execute(
         select(*READY_COLUMNS).where(job.c.parent_id == row.id, job.c.state == WAITING).order_by(job.c.position)
     ).all()
@@ -157,7 +162,10 @@ def _open_fan_out(tx: Transaction, row: Row[Any]) -> list[Ended]:
 
 
 def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
-    """Update the number of ended tasks of parent jobs; gather the results of parent jobs whose last task has ended."""
+    """Update the number of unfinished tasks of parent jobs; end the parent jobs whose last task has ended.
+
+    Returns the jobs that have ended by this.
+    """
     following = _stop_idle_tasks(tx, {end.parent_id for end in ended if end.state == "failed"} - {None})
     for parent_id, count in sorted(Counter(end.parent_id for end in ended if end.parent_id is not None).items()):
         left = tx.execute(
@@ -172,9 +180,9 @@ def _count_tasks(tx: Transaction, ended: Sequence[Ended]) -> list[Ended]:
 
 
 def _stop_idle_tasks(tx: Transaction, parents: Collection[str | None]) -> list[Ended]:
-    """Cancel the tasks that have not started, if another task of the same parent job has failed.
+    """Cancel the tasks of parent jobs, each of which has a failed task, and return the cancelled tasks.
 
-    This applies only to parent jobs whose results a worker would combine.
+    Only tasks that have not started are cancelled, and only those of parent jobs whose results a worker would combine.
     """
     if not parents:
         return []

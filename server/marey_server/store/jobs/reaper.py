@@ -66,7 +66,7 @@ def reap_page(
     after: tuple[int, str] | None = None,
     limit: int = PAGE,
 ) -> ReapedPage:
-    """Reclaim up to `limit` jobs after the position `after`, the longest overdue first.
+    """Reclaim up to `limit` jobs whose leases have expired, the longest overdue first, after the position `after`.
 
     Each job has its own UPDATE with the condition that the fence is unchanged and the lease has expired. So a heartbeat
     or a result at the same time is either accepted, or refused because the lease is lost. A job that cannot be
@@ -115,7 +115,7 @@ def claim_after_reaping(
 
 
 def correct_times(tx: Transaction, policy: QueuePolicy = DEFAULT_POLICY) -> int:
-    """Shorten leases and waits that end too late after the clock of the database was set back."""
+    """Shorten leases and waits that end too late after the clock of the database was set back; return their number."""
     latest_us = tx.now_us + policy.lease_ttl_us
     leases = tx.execute(
         update(job).where(job.c.state == RUNNING, job.c.lease_expires_us > latest_us).values(lease_expires_us=latest_us)

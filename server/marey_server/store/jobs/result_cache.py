@@ -173,7 +173,7 @@ def _known_sources(tx: Transaction, asking: Sequence[Any]) -> dict[tuple[str, st
 
 
 def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[Ended]:
-    """Let waiting jobs share the results of other jobs, now or as soon as those finish.
+    """Let waiting jobs share the results of other jobs, now or as soon as those finish; return the jobs that ended.
 
     `joining` pairs the row of each waiting job, of which only `id` is read, with the job that has the result.
     """
@@ -192,7 +192,9 @@ def join(tx: Transaction, joining: Sequence[tuple[Any, SharedResult]]) -> list[E
 
 
 def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
-    """Give waiting jobs the results of the finished jobs that their `cached_from` names, up to a limit of outputs.
+    """Give waiting jobs the results of the finished jobs that their `cached_from` names; return the jobs that ended.
+
+    The number of outputs in one transaction is limited.
 
     Only the `id` of the rows is read. The leading server process serves the remaining jobs later. A job whose result is
     no longer stored, or cannot be published for it, is queued instead.
@@ -206,7 +208,7 @@ def share(tx: Transaction, rows: Sequence[Any]) -> list[Ended]:
 
 
 def share_waiting(tx: Transaction) -> list[Ended]:
-    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist."""
+    """Give at most `SHARED_AT_ONCE` waiting jobs the results that now exist; return the jobs that have ended."""
     source = job.alias("source")
     rows = tx.execute(
         select(job.c.id)
@@ -220,7 +222,7 @@ def share_waiting(tx: Transaction) -> list[Ended]:
 
 
 def _share_one(tx: Transaction, job_id: str) -> list[Ended]:
-    """Give one job the result it waits for, or queue it if the result cannot be published for it.
+    """Give one job the result it waits for, or queue it if that is impossible; return the jobs that have ended.
 
     A refusal that concerns this job must not affect the job that computed the result, or others that wait for it.
     """

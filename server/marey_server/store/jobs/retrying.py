@@ -63,7 +63,7 @@ class _Family:
         """Dependencies of each job, and the newest retry of each dependency."""
 
     def add_with_needed(self, ids: Collection[str]) -> None:
-        """Add jobs and their unsuccessful dependencies, recursively."""
+        """Add jobs and the unsuccessful jobs that they depend on, directly or through others."""
         while ids:
             rows = _rows(self._tx, ids)
             for row in rows.values():

@@ -172,7 +172,7 @@ def drop_staged(tx: Transaction, attempts: Collection[tuple[str, int]]) -> None:
 
 
 def _of_attempts(attempts: Collection[tuple[str, int]]) -> dict[str, Any]:
-    """Return the parameters of `_BY_ATTEMPTS`."""
+    """Return the parameters with which `_BY_ATTEMPTS` selects the outputs of attempts (job id and fence)."""
     return {"jobs": [job_id for job_id, _ in attempts], "attempts": list(attempts)}
 
 

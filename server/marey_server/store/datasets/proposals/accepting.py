@@ -181,7 +181,7 @@ def merge_proposal(
 
 
 def _require_current(row: Row[Any], prepared: PreparedAcceptance | None) -> PreparedAcceptance:
-    """Raise `ConflictProblem` if a branch has moved since the merge was prepared."""
+    """Return `prepared`. Raises `ConflictProblem` if a branch has moved since this merge was prepared."""
     if prepared is None or prepared.request.version != row.head_now:
         raise branch_moved(row.source, row.head_now)
     if prepared.merge is not None and prepared.merge.answer.ours != row.target_now:
