@@ -1,1 +1,1 @@
-"""Speed beside peers: each benchmark runs Marey and its peer in turn, in one process, and prints ratios."""
+"""Benchmarks that compare Marey with other libraries: each runs both in turn, in one process, and prints ratios."""

@@ -1,4 +1,4 @@
-"""Run every benchmark, or those named: `python -m benchmarks bvh kinematics`."""
+"""Run all benchmarks, or only the named ones: `python -m benchmarks bvh kinematics`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _VERDICTS = {True: "met", False: "[bold]missed[/bold]", None: ""}
 
 
 def main() -> int:
-    """Print a table of ratios; exit status 1 if a goal was missed and `--strict` was given."""
+    """Print a table of the results; return the exit status, which is 1 if `--strict` is given and a goal was missed."""
     names = sorted(
         module.name.removeprefix("bench_")
         for module in pkgutil.iter_modules(benchmarks.__path__)

@@ -1,4 +1,4 @@
-"""The least that Tornado can do: bytes from memory, whoever asks. What reading from Marey is held against.
+"""Tornado server that answers every request with the same bytes, as a limit for the speed of Marey's server.
 
 `python -m benchmarks.bare_server PORT BYTES`
 """
@@ -29,7 +29,7 @@ class _Bytes(RequestHandler):
         self.write(self.body)
 
     def compute_etag(self) -> None:
-        """None: hashing would cost more than sending."""
+        """Return None, so that Tornado does not hash the body, which would take longer than sending it."""
 
 
 async def _serve(port: int, size: int) -> None:
@@ -40,7 +40,10 @@ async def _serve(port: int, size: int) -> None:
 
 @contextmanager
 def bare_server(size: int) -> Iterator[int]:
-    """Run it while the block runs; its port."""
+    """Run the server in a process while the `with` block runs; yield its port.
+
+    `size` is the number of bytes of an answer.
+    """
     port = free_port()
     process = subprocess.Popen([sys.executable, "-m", "benchmarks.bare_server", str(port), str(size)])
     try:

@@ -1,4 +1,4 @@
-"""Dynamic time warping and the alignment of whole sets, against librosa, tslearn, dtw-python and stated times."""
+"""Dynamic time warping and alignment of whole sets, compared with librosa, tslearn, dtw-python and published times."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PUBLISHED_SET_S = 12.7
 
 
 def run() -> list[Row]:
-    """Measure on one thread. Peers must find the same totals, but may choose other paths of equal cost."""
+    """Measure on one thread. Other libraries must find the same totals, but may choose other paths of equal cost."""
     _require_same_totals()
     rows = [row for size in SIZES for row in _pair(*size)]
     return [*rows, _published_pair(), _published_set(), _large_set()]
@@ -54,7 +54,7 @@ def _require_same_totals() -> None:
 
 
 def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
-    """Time the peers on given costs; each computes the path as well as its total."""
+    """Return, by library, a function that computes the path for these costs and returns its total cost."""
     return {
         "librosa": lambda: float(librosa.sequence.dtw(C=costs)[0][-1, -1]),
         "dtw-python": lambda: float(dtw_python.dtw(costs, step_pattern="symmetric1").distance),
@@ -62,7 +62,10 @@ def _peers_given_costs(costs: Floats) -> dict[str, Callable[[], float]]:
 
 
 def _peers_of_points(a: Floats, b: Floats) -> dict[str, Callable[[], float]]:
-    """Time the peers on points; each computes squared distances of flat vectors and a path through them."""
+    """Return, by library, a function that computes the costs and the path for points, and returns the total cost.
+
+    The costs are squared distances of flat vectors.
+    """
     return {
         "librosa": lambda: float(librosa.sequence.dtw(a.T, b.T, metric="sqeuclidean")[0][-1, -1]),
         "dtw-python": lambda: float(
@@ -103,7 +106,7 @@ def _against(
     calls: int,
     goal: float | None = None,
 ) -> Row:
-    """Make a row per peer; the ratio is to librosa, the fastest of them."""
+    """Time a function of Marey and those of other libraries; return a row with the ratio to librosa, the fastest."""
     own, *theirs = _each(calls, repeats, ours, *peers.values())
     by_name = dict(zip(peers, theirs, strict=True))
     ratio = by_name["librosa"].median_s / own.median_s
@@ -114,7 +117,7 @@ def _against(
 
 
 def _each(calls: int, repeats: int, *contenders: Callable[[], object]) -> list[Timing]:
-    """Time each of so many calls, in seconds."""
+    """Return the timing of one call of each function, measured over `calls` calls in a row."""
 
     def many(call: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -167,7 +170,10 @@ def _large_set() -> Row:
 
 
 def _examples(count: int, frames: tuple[int, int]) -> tuple[list[SourceExample], MatchingBody]:
-    """Make variants of one walk: timing (a sine of 0.08), size (0.9 to 1.1) and joint drift (0.002)."""
+    """Return variants of one walk, and its body.
+
+    The variants differ in timing (a sine of 0.08), size (0.9 to 1.1) and joint drift (0.002).
+    """
     random = np.random.default_rng(5)
     walk = generate_gait(1.3, 0.2, 50 / 60)
     motion = Motion.of(walk)

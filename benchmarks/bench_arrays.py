@@ -1,8 +1,8 @@
-"""A clip as JSON and ranges of its frames over HTTP, beside Tiled, which serves the same array.
+"""Time to send a clip as JSON, and ranges of its frames, over HTTP, compared with Tiled, which serves the same array.
 
-Figures are processor time of the server per answer. Tiled runs in an environment of its own, whose interpreter
-`MAREY_BENCH_TILED` names: it needs SQLAlchemy below 2.1 and pydantic-settings below 2.12, which Marey is pinned past.
-CONTRIBUTING.md says how to make it.
+Times are processor time of the server per answer. Tiled runs in a Python environment of its own, whose interpreter
+`MAREY_BENCH_TILED` names: it needs SQLAlchemy below 2.1 and pydantic-settings below 2.12, but Marey needs newer
+versions. CONTRIBUTING.md describes how to create this environment.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Ask = Callable[[], object]
 
 
 def run() -> list[Row]:
-    """Measure a server that keeps no answers in memory, so that each one is computed."""
+    """Measure a server that stores no answers in memory, so that it computes each answer."""
     with local_server(MAREY_ANSWER_CACHE_BYTES="0") as server, _tiled() as tiled, httpx.Client() as http:
         clip = seed(server, FRAMES, JOINTS).clip
 
@@ -77,7 +77,7 @@ def run() -> list[Row]:
 
 
 def _milliseconds(pid: int, ask: Ask) -> float:
-    """Processor time that a server takes for an answer."""
+    """Return the processor time in milliseconds that the server process `pid` needs for one call of `ask`."""
     server = psutil.Process(pid)
     before = server.cpu_times()
     for _ in range(ANSWERS):
@@ -103,7 +103,10 @@ def _row(job: str, size: str, rounds: tuple[tuple[float, float | None], ...], go
 
 @contextmanager
 def _tiled() -> Iterator[tuple[int, int] | None]:
-    """Run Tiled with the array of the clip while the block runs; its process and port, None without an interpreter."""
+    """Run Tiled with the array of the clip while the `with` block runs; yield its process id and port.
+
+    Yields None if no interpreter for Tiled is named.
+    """
     interpreter = os.environ.get(TILED)
     if interpreter is None:
         yield None

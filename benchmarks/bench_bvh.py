@@ -1,8 +1,8 @@
-"""Reading of BVH text to a clip of quaternions, one file and many, against pymotion and a plain loader in numpy.
+"""Conversion of BVH files to quaternions, one file and many, compared with pymotion and a simple loader in numpy.
 
-Marey is timed twice: reading alone (`read_bvh`: numbers, quaternions, every check of the text), which is what the peers
-do and what the goals are about; and importing (`read_motion`), which besides finds the body's landmarks, settles unit
-and axes, and looks for faults of capture.
+Marey is timed twice. Reading alone (`read_bvh`) parses the numbers, computes quaternions and checks the text; the other
+loaders do the same, and the goals refer to it. Importing (`read_motion`) also finds the landmarks of the body,
+determines unit and axes, and searches for faults of the capture.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ GOAL_PYMOTION, GOAL_PLAIN, GOAL_MANY = 20, 5, 15
 
 
 def run() -> list[Row]:
-    """Measure a generated file, a real one where there is one, and a folder of small ones."""
+    """Measure a generated file, a real one if there is one, and a folder of small files."""
     with tempfile.TemporaryDirectory() as folder:
         generated = Path(folder, "generated.bvh")
         generated.write_bytes(write_bvh(captured_walk(FRAMES, JOINTS)))
@@ -68,7 +68,7 @@ def _row(job: str, size: str, ours: Timing, peer_name: str, peer: Timing, goal: 
 
 
 def _many(paths: list[Path], origin: str) -> list[Row]:
-    """Measure files that both can read; a folder of real capture also holds faulty ones and rigs of one pose."""
+    """Measure the files that Marey and pymotion both read; a folder of real capture also contains files with faults."""
     frames = loaded_with_pymotion(paths)
     read = [path for path in frames if _is_read(path)]
     reading, importing, pymotion = time_in_turn(
@@ -93,7 +93,7 @@ def _is_read(path: Path) -> bool:
 
 
 def _check_agreement(path: Path) -> int:
-    """Check that all three find the same rotations; return the number of frames."""
+    """Check that the three loaders find the same rotations in a file; return its number of frames."""
     ours = read_bvh(path.read_bytes(), path.name).rotations
     assert ours is not None
     for theirs in (load_with_pymotion(path), load_plainly(path)):

@@ -1,7 +1,7 @@
 """Versions of a dataset with as many entries as the largest public collection, and with a million.
 
-Git commits one changed file among as many small files in the same run, by the commands that touch only its index and
-objects.
+In the same run, Git commits one changed file of equally many small files, by commands that change only the index and
+the objects of its repository.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ URL = f"/projects/{PROJECT}/datasets/large"
 
 
 def run() -> list[Row]:
-    """Measure commits, differences, branches, lists and a merge at each size."""
+    """Measure commits, differences, branches, lists and a merge, for each number of entries."""
     rows: list[Row] = []
     for size in SIZES:
         with local_server(partial(_prepare, size)) as server:
@@ -153,7 +153,7 @@ def _row(
 
 
 def _git_commits(files: int) -> float | None:
-    """Return the median milliseconds in which Git commits one of so many small files; None where it is missing."""
+    """Return the median milliseconds in which Git commits one of `files` small files; None if Git is not installed."""
     git = shutil.which("git")
     if git is None:
         return None
@@ -174,7 +174,7 @@ def _git_commits(files: int) -> float | None:
 
 
 def _history(files: int) -> Iterator[bytes]:
-    """Return the input of `git fast-import` for one commit of many files."""
+    """Yield the input of `git fast-import` for one commit of `files` files."""
     yield f"commit refs/heads/{MAIN}\ncommitter bench <bench@localhost> 0 +0000\ndata 5\nfirst\n".encode()
     for number in range(files):
         content = f"take {number}"

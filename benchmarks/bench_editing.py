@@ -1,4 +1,4 @@
-"""Edits of 10,000 frames: each command by itself, and beside what scipy offers for the same."""
+"""Edits of 10,000 frames: the time of each command, for some commands compared with a function of scipy."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ COMMANDS: tuple[AnyCommand, ...] = (
 
 
 def run() -> list[Row]:
-    """Measure every command as users get it: from and to a clip in single precision, checked before and after."""
+    """Measure every command as users call it: from clip to clip, in single precision, checked before and after."""
     walk = generate_gait(1.3, 0.1, FRAMES / RATE_HZ, RATE_HZ)
     run_clip = generate_gait(3.0, -0.2, 20.0, RATE_HZ)
     rows = [_alone(walk, run_clip, command) for command in COMMANDS]
@@ -106,9 +106,10 @@ def _beside(walk: Clip, name: str, peer: str, command: AnyCommand, theirs: Calla
 
 
 def _peers(walk: Clip) -> list[tuple[str, str, AnyCommand, Callable[[], Any]]]:
-    """Time the same with scipy, from and to single precision; edits that scipy does not have are left out.
+    """Return the edits that scipy offers, too: name, function of scipy, our command, and a call of the function.
 
-    Its filter smooths components: it ignores sign changes of quaternions and does not keep the ends.
+    The calls convert from and to single precision. The filter of scipy smooths components: it ignores sign changes of
+    quaternions and does not keep the ends.
     """
 
     def slerped() -> list[NDArray[np.float32]]:

@@ -1,4 +1,4 @@
-"""The whole grid of Abichequer Sangalli et al. (2022): 162 trials of 33 s, from clips to the assembled result."""
+"""The whole suite of Abichequer Sangalli et al. (2022): 162 trials of 33 s, from clips to the complete result."""
 
 from __future__ import annotations
 

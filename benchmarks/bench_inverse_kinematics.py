@@ -1,7 +1,7 @@
-"""Inverse kinematics of one arm and of whole bodies, against scipy's least squares and the predecessor's times.
+"""Inverse kinematics of one arm and of whole bodies, compared with scipy's least squares and Marey's predecessor.
 
-The predecessor's are the times stated for it on a walk of 47 frames and 78 joints: the setup is repeated here on a
-generated walk, with wrist targets 8 cm (standard deviation per axis) from where the wrist is.
+The times of the predecessor are published times for a walk of 47 frames and 78 joints. The same setup is repeated here
+with a generated walk; the targets of the wrist are 8 cm (standard deviation per axis) from its position.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Solver = Callable[..., SolvedPoses]
 
 
 def run() -> list[Row]:
-    """Measure everything on one thread."""
+    """Measure all of these on one thread."""
     clip = generate_gait(1.3, 0.2, BATCH / 60.0)
     skeleton = clip.skeleton
     motion = Motion.of(clip)
@@ -81,7 +81,7 @@ def _each(
     solver: Solver,
     stated_ms: float,
 ) -> Row:
-    """Make one call per constraint, as a user who drags a hand does."""
+    """Time one call per problem, as when a user drags a hand; return a row with the ratio to `stated_ms`."""
     solved = [solver(skeleton, one, targets, freedom=freedom) for one, targets in problems]
     reached = sum(bool(one.reached[0]) for one in solved)
 
@@ -107,7 +107,7 @@ def _each(
 
 
 def _with_scipy(skeleton: Skeleton, motion: Motion, targets: Sequence[Target], freedom: Freedom) -> float:
-    """Solve the same objective by trust regions and finite differences, with the project's kinematics."""
+    """Minimise the same objective with `least_squares` of scipy and our kinematics; return the remaining cost."""
     carried = {joint for target in targets for joint in skeleton.path_to_root(target.joint)}
     joints = sorted(carried if freedom.joints is None else carried & set(freedom.joints))
     rotations = motion.rotations.copy()
@@ -174,7 +174,7 @@ def _batch(skeleton: Skeleton, motion: Motion, near: Floats, freedom: Freedom) -
 
 
 def _edit(skeleton: Skeleton, motion: Motion, near: Floats) -> Row:
-    """Constrain one frame in the middle of a walk with fingers, and spread the change over the whole walk."""
+    """Measure a constraint in one frame of a walk with fingers, whose change is blended over the whole walk."""
     body = with_fingers(skeleton, 78, skeleton.joint_names[map_joints(skeleton).indices(skeleton, ("left_wrist",))[0]])
     rotations = np.asarray(quaternions.identity(FRAMES, body.joint_count), dtype=np.float64)
     rotations[:, [body.index_of(name) for name in skeleton.joint_names]] = motion.rotations[:FRAMES]

@@ -22,7 +22,7 @@ PREDECESSOR_POSES_PER_S = 573
 
 
 def run() -> list[Row]:
-    """Measure Marey and the peer, each on one thread."""
+    """Measure Marey and pymotion, each on one thread."""
     return [_forward_kinematics(), _retargeting()]
 
 

@@ -1,4 +1,4 @@
-"""Pages of a list of 10,000 clips, asked for one after another by one client."""
+"""Pages of a list of 10,000 clips, which one client requests one after another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exact nearest neighbours as motion matching asks for them, against numpy, scipy's cKDTree and faiss's flat index."""
+"""Exact nearest neighbours, as motion matching needs them, compared with numpy, scipy's cKDTree and faiss."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ FLOAT32_EXCESS = 1e-5
 
 @dataclass(frozen=True)
 class _Play:
-    """Queries (Q, D) of characters led by motion matching, and the row (Q,) that each shows when it asks."""
+    """Queries (Q, D) of characters that motion matching controls, and the row (Q,) that each shows at its query."""
 
     queries: Floats
     shown: Rows
 
 
 def run() -> list[Row]:
-    """Measure on one thread; all contenders answer the same queries, and those in float64 must find the same rows."""
+    """Measure on one thread. All libraries answer the same queries; those that use float64 must find the same rows."""
     faiss.omp_set_num_threads(1)
     return [_race(*size, hard) for size in SIZES for hard in (False, True)]
 
@@ -103,9 +103,10 @@ def _peers(rows: Floats, selectable: NDArray[np.bool_]) -> dict[str, Callable[[F
 
 
 def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
-    """Normalised rows (N, D), first rows of the clips and N, and the trajectories of clips that are not among them.
+    """Return normalised rows (N, D), the first row of each clip followed by N, and trajectories of other clips.
 
-    The clips there are, and after them the same with seeded changes of proportion and place until there are enough.
+    The rows are those of all available clips, then of copies with random changes of proportion and place, until there
+    are `row_count` rows.
     """
     clips = matching_features()
     rng = np.random.default_rng(row_count)
@@ -128,7 +129,10 @@ def _database(row_count: int) -> tuple[Floats, Rows, Floats]:
 
 
 def _play(index: SearchIndex, starts: Rows, wishes: Floats, hard: bool) -> _Play:
-    """Play trials: each shows a row, searches for one that continues its pose towards a goal, and shows the next."""
+    """Return the queries of trials. In each, a character searches for a row that continues its pose towards a goal.
+
+    The next query starts from a row shortly after the row that was found.
+    """
     rng = np.random.default_rng(1)
     stops = np.repeat(starts[1:], np.diff(starts))
     shown = rng.choice(np.flatnonzero(index.selectable), TRIALS)

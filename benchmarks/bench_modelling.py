@@ -1,4 +1,4 @@
-"""Principal functions, mixtures and whole models, against scikit-fda, numpy, scikit-learn and stated times."""
+"""Principal functions, mixtures and whole models, compared with scikit-fda, numpy, scikit-learn and published times."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WITHOUT_REPORT = ModelOptions(leave_one_out=False, folds=0, report_samples=0)
 
 
 def run() -> list[Row]:
-    """Measure everything on one thread. Peers must find the same shares of variance."""
+    """Measure all of these on one thread. Other libraries must find the same shares of variance."""
     with one_thread():
         return [_one_channel(), _all_channels(), _mixtures(), _whole_model(), _report()]
 
@@ -133,7 +133,7 @@ def _report() -> Row:
 
 
 def _smooth(channels: int) -> Floats:
-    """Make random smooth functions (clips, frames, channels) with a little noise."""
+    """Return random smooth functions (clips, frames, channels) with a little noise."""
     random = np.random.default_rng(1)
     basis = SplineBasis.clamped(FRAMES, COEFFICIENTS)
     modes = random.standard_normal((40, COEFFICIENTS, channels)) * np.geomspace(1.0, 0.02, 40)[:, None, None]
@@ -142,7 +142,7 @@ def _smooth(channels: int) -> Floats:
 
 
 def _examples(count: int) -> tuple[list[SourceExample], MatchingBody]:
-    """Generated walks of many speeds and turn rates, 42 to 53 frames long."""
+    """Return generated walks of many speeds and turn rates, 42 to 53 frames long, and their body."""
     random = np.random.default_rng(5)
     examples = []
     for number in range(count):

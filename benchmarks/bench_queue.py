@@ -1,4 +1,4 @@
-"""Clips through the queue and one worker: to another skeleton, and to BVH files; beside pymotion in one process.
+"""Jobs that retarget clips and write them to BVH files with one worker, compared with pymotion in one process.
 
 Marey's times are those that a person waits, from the submission until the job has ended: clips are read from the
 server, computed by the worker, sent back, checked and published. pymotion computes from arrays in memory.
@@ -40,7 +40,7 @@ Floats = NDArray[np.floating]
 
 
 def run() -> list[Row]:
-    """Measure one server and one worker with one slot."""
+    """Measure one server and a worker that runs one job at a time."""
     clips = [captured_walk(FRAMES, JOINTS, seed) for seed in range(CLIPS)]
     with local_server() as server, one_worker(server), server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
@@ -59,7 +59,7 @@ def run() -> list[Row]:
 
 
 def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
-    """Store the clips in `takes`, one of them in `first`, and a skeleton to move them to; its id."""
+    """Store the clips in the folder `takes`, one of them in `first`, and a skeleton to retarget to; return its id."""
     skeletons = []
     for name, skeleton in (("studio", clips[0].skeleton), ("game", game_skeleton())):
         mapping = map_joints(skeleton)
@@ -76,7 +76,7 @@ def _seed(project: ProjectHandle, clips: list[Clip]) -> str:
 
 
 def _timed(marey: Marey, submit: Callable[[], Job]) -> float:
-    """Measure the seconds from the submission of a job to its end."""
+    """Return the seconds from the submission of a job to its end."""
     started = time.perf_counter()
     ended = marey.jobs.wait(submit().id)
     seconds = time.perf_counter() - started
@@ -91,7 +91,7 @@ def _plan(source: Skeleton, target: Skeleton) -> RetargetPlan:
 
 
 def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list[Floats], float]:
-    """Local rotations of the target's joints for each clip, and the seconds all of them took."""
+    """Return the local rotations of the target's joints for each clip, and the total seconds."""
     offsets, parents = clips[0].skeleton.offsets.astype(np.float32), clips[0].skeleton.parents.copy()
     target_parents = plan.target.parents.copy()
     parents[0] = target_parents[0] = 0  # pymotion's mark of the root
@@ -112,7 +112,7 @@ def _retarget_with_pymotion(clips: list[Clip], plan: RetargetPlan) -> tuple[list
 
 
 def _write_with_pymotion(moved: list[Floats], target: Skeleton) -> float:
-    """Measure the seconds to write clips as BVH files."""
+    """Return the seconds in which pymotion writes clips as BVH files."""
     rest = np.tile(np.concatenate([target.offsets[0], target.rest_rotations.ravel()]), (FRAMES, 1)).astype(np.float32)
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
         template = Path(folder, "template.bvh")

@@ -1,6 +1,6 @@
-"""A server under load, on this machine: reading clips alone and beside uploads, and cycles of jobs.
+"""A server under load, on this machine: reading clips, with and without uploads at the same time, and cycles of jobs.
 
-Server, readers and uploader are processes of their own; all share this machine's cores.
+Server, readers and uploader are separate processes, which share the cores of this machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Start = Callable[..., Future[Any]]
 
 
 def run() -> list[Row]:
-    """Measure one server; answers from memory are measured again on a server that keeps none."""
+    """Measure one server; reads that it answers from memory are also measured on a server that stores no answers."""
     with load.in_processes(2) as start:
         with local_server() as server:
             seeded = seed(server, FRAMES, JOINTS)
@@ -101,7 +101,10 @@ def _size(seeded: Seeded) -> str:
 
 
 def _with_processor_ms(server: LocalServer, measure: Callable[[], Load]) -> tuple[Load, float]:
-    """Add the server's processor time per request to a measurement; the warm-up is included."""
+    """Return a measurement, and the processor time of the server in milliseconds per request.
+
+    Requests of the warm-up count in the processor time.
+    """
     before_s = server.processor_s()
     measured = measure()
     share = measured.seconds / (measured.seconds + load.WARM_UP_S)

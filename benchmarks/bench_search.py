@@ -1,4 +1,4 @@
-"""Trees over samples, searches and refinement, against k-means of scikit-learn and what the published system took."""
+"""Trees of samples, searches and refinement, compared with k-means of scikit-learn and with published times."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ REPEATS = 9
 
 
 class _Material(NamedTuple):
-    """A model of walks, and places where the wrist was in walks that it has not seen."""
+    """A model of walks, and positions of the wrist in walks that were not used to train the model."""
 
     primitive: MotionPrimitive
     joints: dict[str, int]
@@ -59,7 +59,7 @@ class _Material(NamedTuple):
 
 
 def run() -> list[Row]:
-    """Measure everything on one thread."""
+    """Measure all of these on one thread."""
     return [*_trees(), *_searches(), _refinement()]
 
 
@@ -121,7 +121,7 @@ def _trees() -> list[Row]:
 
 
 def _sklearn_tree(samples: NDArray[np.float32]) -> int:
-    """Leaves of k-means in k-means."""
+    """Divide samples by k-means into four groups, and these again, up to leaves; return the number of leaves."""
     if len(samples) <= LEAF:
         return 1
     labels = KMeans(4, n_init=1, random_state=0).fit_predict(samples)

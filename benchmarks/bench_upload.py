@@ -1,7 +1,7 @@
-"""A folder of motion files to stored clips, through the client and REST, beside pymotion reading the BVH files of it.
+"""Upload of a folder of motion files with the client, compared with pymotion, which only reads the BVH files.
 
 Marey's time is what a person waits for `marey upload`: hashing, sending, reading, checking and storing every file, with
-its original. pymotion reads the BVH files in one process and keeps nothing; for other formats it has no reader.
+its original. pymotion reads the BVH files in one process and stores nothing; it has no reader for other formats.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GOAL_FILES_PER_S, GOAL_POSES_PER_S = 60, 20_000
 
 
 def run() -> list[Row]:
-    """Measure uploads to fresh servers, each with one worker, in turn with pymotion."""
+    """Measure uploads to new servers, each with one worker, and pymotion in turn."""
     with folder_of_takes() as folder:
         files = find_files(folder).files
         frames = loaded_with_pymotion(file.path for file in files if file.name.lower().endswith(".bvh"))
@@ -55,7 +55,10 @@ def run() -> list[Row]:
 
 
 def _upload(files: tuple[LocalFile, ...]) -> tuple[float, float, list[ImportEntry]]:
-    """Upload to a new server that has read one file before; seconds, those of the server's processor, and entries."""
+    """Upload files to a new server that has read one file before.
+
+    Returns the seconds, the seconds of processor time of the server, and the entries of the import.
+    """
     with local_server() as server, one_worker(server), server.client() as marey:
         marey.create_project(ProjectCreate(name="warm"))
         warm = Path(server.data.parent, "warm-up.bvh")

@@ -17,7 +17,7 @@ _NUMBER = re.compile(r"\d[\d.,]*")
 
 
 def main() -> int:
-    """Print the table."""
+    """Print a table of the two runs; return the exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.compare", description=__doc__)
     parser.add_argument("before", type=Path, help="JSON of the earlier run (python -m benchmarks --json FILE)")
     parser.add_argument("after", type=Path, help="JSON of the later run")
@@ -35,16 +35,17 @@ def _rows_of(path: Path) -> list[Row]:
 
 
 def as_markdown(before: Sequence[Row], after: Sequence[Row]) -> str:
-    """Make a table of both runs in the order of the later one; rows that it lacks come last."""
+    """Return a table of both runs in the order of the later run, then the rows that only the earlier run has."""
     lines = [_line(_HEADINGS), _line(["---"] * len(_HEADINGS))]
     lines += [_line(_cells(*pair)) for pair in matched(before, after)]
     return "\n".join(lines)
 
 
 def matched(before: Sequence[Row], after: Sequence[Row]) -> Iterator[tuple[Row | None, Row | None]]:
-    """Pair rows of equal job and size, then rows whose sizes differ in numbers alone; None where a run has no such row.
+    """Pair the rows of two runs that have the same job and size; a row without a counterpart is paired with None.
 
-    Sizes may hold figures of the run itself, such as processor time, and differ from run to run.
+    Rows of the same job are also paired if their sizes differ only in numbers, because a size may contain measurements
+    of the run, such as processor time.
     """
     left = list(before)
     pairs = [(_take(left, row, str), row) for row in after]
@@ -59,7 +60,10 @@ def _without_numbers(size: str) -> str:
 
 
 def _take(left: list[Row], row: Row, form: Callable[[str], str]) -> Row | None:
-    """Take the first row of the same job and, in a form, the same size out of those that are left."""
+    """Remove from `left` the first row of the same job whose size is equal after conversion by `form`; return it.
+
+    Returns None if there is no such row.
+    """
     found = next((one for one in left if one.job == row.job and form(one.size) == form(row.size)), None)
     if found is not None:
         left.remove(found)

@@ -1,4 +1,4 @@
-"""One evaluation in a process of its own: `python -m benchmarks.evaluation_run ROWS THREADS` prints its figures."""
+"""One evaluation in a separate process: `python -m benchmarks.evaluation_run ROWS THREADS` prints its measurements."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PACE = 0.1
 
 
 def main(row_count: int, threads: int) -> dict[str, float | str]:
-    """Print the seconds of each step and the largest memory of the process."""
+    """Return the seconds of building the database and of the evaluation, and the peak memory of the process in MiB."""
     sources = list(_sources(row_count))
     options = EvaluationOptions()
     # Kernels load and the machine's caches warm up on something small.
@@ -54,7 +54,7 @@ def main(row_count: int, threads: int) -> dict[str, float | str]:
 
 
 def _peak_mb() -> float:
-    """Read the largest memory of this program; getrusage would include that of its parent process."""
+    """Return the peak memory of this program in MiB; `getrusage` would include the memory of its parent process."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
     return int(found[1]) / 1024 if found else float("nan")
 
@@ -73,7 +73,7 @@ def _evaluate(database: MatchingDatabase, options: EvaluationOptions, threads: i
 
 
 def _sources(row_count: int) -> Iterator[SourceClip]:
-    """Clips of one skeleton that make exactly so many rows: the takes there are, then the same at other paces."""
+    """Yield clips of one skeleton with `row_count` rows in total: all takes, then the same at other speeds."""
     rng = np.random.default_rng(row_count)
     takes = _takes()
     left = row_count

@@ -1,4 +1,4 @@
-"""Load that clients and workers put on a server. Each function runs in a process of its own (`in_process`)."""
+"""Functions that put the load of clients and workers on a server; `in_processes` runs each in a separate process."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ WARM_UP_S = 0.5
 
 @dataclass(frozen=True)
 class Load:
-    """Requests answered, in how much time, and how long each took."""
+    """Requests that were answered: the duration of the measurement, and the duration of each request, in seconds."""
 
     seconds: float
     latencies_s: list[float]
 
     @classmethod
     def joined(cls, loads: Sequence[Load]) -> Load:
-        """Several of the same kind as one."""
+        """Return several measurements of the same kind as one: durations are added, requests are combined."""
         return cls(sum(one.seconds for one in loads), [latency for one in loads for latency in one.latencies_s])
 
     @property
     def per_second(self) -> float:
-        """Answers per second."""
+        """Number of answers per second."""
         return len(self.latencies_s) / self.seconds
 
     def percentile_ms(self, percent: int) -> float:
-        """Compute the time that `percent` of the requests did not exceed, in milliseconds."""
+        """Return the time in milliseconds that `percent` of the requests did not exceed."""
         return statistics.quantiles(self.latencies_s, n=100, method="inclusive")[percent - 1] * 1e3
 
 
 @contextmanager
 def in_processes(count: int) -> Iterator[Callable[..., Future[Any]]]:
-    """Make a function that starts another one in one of `count` processes."""
+    """Yield a function that runs another function in one of `count` processes, and returns the future of its result."""
     with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
         yield pool.submit
 
 
 def read_steadily(port: int, token: str, path: str, *, accept: str, connections: int, seconds: float) -> Load:
-    """GET one address over and over on each of `connections`."""
+    """Request one path again and again by GET, on each of `connections`; return the durations."""
 
     def once(connection: Connection) -> None:
         connection.exchange(connection.head("GET", path, Accept=accept))
@@ -66,7 +66,7 @@ def read_steadily(port: int, token: str, path: str, *, accept: str, connections:
 
 
 def upload_steadily(port: int, token: str, skeleton: RevisionRef, *, frames: int, joints: int, seconds: float) -> Load:
-    """Create clips on one connection, no two of them equal, with arrays as the client sends them."""
+    """Create clips on one connection, all of them different, with arrays encoded as the client sends them."""
     clip = noisy_clip(frames, joints)
     sideways = np.eye(1, clip.poses.shape[1], dtype=np.float32)
     run = secrets.token_hex(4)
@@ -84,7 +84,7 @@ def upload_steadily(port: int, token: str, skeleton: RevisionRef, *, frames: int
 
 
 def cycle_jobs(port: int, token: str, job: dict[str, Any], *, connections: int, seconds: float) -> Load:
-    """Submit a job, claim one, complete it: three requests, each on the disk before its answer."""
+    """Submit a job, claim it and complete it, again and again; each step is on the disk before its answer."""
 
     def once(connection: Connection) -> None:
         connection.call(f"/projects/{PROJECT}/jobs", job)
@@ -96,7 +96,7 @@ def cycle_jobs(port: int, token: str, job: dict[str, Any], *, connections: int, 
 
 
 def cycle_job_batches(port: int, token: str, job: dict[str, Any], *, size: int, seconds: float) -> Load:
-    """Submit, claim and complete `size` jobs with three requests."""
+    """Submit, claim and complete `size` jobs with three requests, again and again."""
 
     def once(connection: Connection) -> None:
         connection.call(f"/projects/{PROJECT}/jobs/batch", {"jobs": [job] * size})
@@ -110,7 +110,7 @@ def cycle_job_batches(port: int, token: str, job: dict[str, Any], *, size: int, 
 
 
 def _repeatedly(port: int, token: str, once: Callable[[Connection], None], connections: int, seconds: float) -> Load:
-    """Call `once` over and over, in a thread per connection, and time what begins after the warm-up."""
+    """Call `once` again and again in a thread for each connection; return the durations of calls after the warm-up."""
     start = time.perf_counter() + WARM_UP_S
     latencies: list[float] = []
     failures: list[BaseException] = []

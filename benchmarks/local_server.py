@@ -1,6 +1,7 @@
-"""A server and a worker for a benchmark, each one process of this machine, their data in folders that go away.
+"""Server and worker for a benchmark, each in one process of this machine, with data in temporary folders.
 
-Settings are the defaults: SQLite with every commit on the disk, blobs in the database, one line of log per request.
+The settings are the defaults: SQLite with every commit on the disk, blobs in the database, and one log line per
+request.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ WARM_S = 300
 
 @dataclass(frozen=True)
 class LocalServer:
-    """A running server."""
+    """Server that runs in a process of this machine."""
 
     url: str
     data: Path
@@ -45,27 +46,27 @@ class LocalServer:
 
     @property
     def port(self) -> int:
-        """The port it listens on."""
+        """The port on which the server listens."""
         return int(self.url.rpartition(":")[2])
 
     @property
     def token(self) -> str:
-        """Token of the administrator."""
+        """The token of the administrator."""
         return (self.data / "admin.token").read_text().strip()
 
     def processor_s(self) -> float:
-        """Processor time it has used so far, seconds."""
+        """Return the processor time that the server has used so far, in seconds."""
         times = psutil.Process(self.pid).cpu_times()
         return float(times.user + times.system)
 
     def client(self) -> Marey:
-        """Make an administrator's client."""
+        """Return a client of this server, with the token of the administrator."""
         return Marey(self.url, self.token)
 
 
 @contextmanager
 def local_server(prepare: Callable[[Path], None] | None = None, **settings: str) -> Iterator[LocalServer]:
-    """Run a server while the block runs; `prepare` fills its data folder before it starts."""
+    """Run a server while the `with` block runs; `prepare` fills the data folder before the server starts."""
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as folder:
         data = Path(folder, "data")
         if prepare is not None:
@@ -76,7 +77,7 @@ def local_server(prepare: Callable[[Path], None] | None = None, **settings: str)
 
 @contextmanager
 def running(data: Path, **settings: str) -> Iterator[LocalServer]:
-    """Run a server over a data folder while the block runs; `settings` are variables of its environment."""
+    """Run a server with this data folder while the `with` block runs; `settings` are environment variables."""
     port = free_port()
     with Path(data.parent, "server.log").open("ab") as log:
         process = subprocess.Popen(
@@ -98,7 +99,7 @@ def running(data: Path, **settings: str) -> Iterator[LocalServer]:
 
 @contextmanager
 def one_worker(server: LocalServer) -> Iterator[None]:
-    """Run a worker with one slot while the block runs."""
+    """Run a worker that runs one job at a time, while the `with` block runs."""
     with tempfile.TemporaryDirectory(prefix="marey-bench-") as cache:
         process = subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", "worker", "--cache", cache],
@@ -115,7 +116,7 @@ def one_worker(server: LocalServer) -> Iterator[None]:
 
 
 def clean_environment() -> dict[str, str]:
-    """This process's environment without settings of servers."""
+    """Return the environment variables of this process, without the settings of servers."""
     return {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
 
 
@@ -133,7 +134,7 @@ def _wait_until_ready(server: LocalServer, process: subprocess.Popen[bytes]) -> 
 
 
 def _wait_until_warm(server: LocalServer) -> None:
-    """Wait for the end of the process that compiles kernels beside a new server: it would be measured, too."""
+    """Wait until the process that compiles kernels beside a new server has ended, because it would distort times."""
     compiling = [one for one in psutil.Process(server.pid).children() if "marey_motion.warm_up" in one.cmdline()]
     _, running = psutil.wait_procs(compiling, timeout=WARM_S)
     if running:
@@ -141,7 +142,7 @@ def _wait_until_warm(server: LocalServer) -> None:
 
 
 def free_port() -> int:
-    """Find a port of this machine that nobody listens on."""
+    """Return a port of this machine on which no program listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -158,7 +159,7 @@ class Seeded:
 
 
 def seed(server: LocalServer, frames: int, joints: int) -> Seeded:
-    """Make the project, a skeleton and one clip through the client."""
+    """Create a project, a skeleton and one clip with the client; return the clip and the skeleton."""
     clip = noisy_clip(frames, joints)
     with server.client() as marey:
         project = marey.create_project(ProjectCreate(name=PROJECT))
@@ -170,7 +171,7 @@ def seed(server: LocalServer, frames: int, joints: int) -> Seeded:
 
 
 def clip_parts(clip: Clip, skeleton: RevisionRef) -> dict[str, dict[str, object]]:
-    """Make the documents of a clip on a stored skeleton."""
+    """Return the documents of a clip that uses a stored skeleton."""
     return {
         "motion": clip_to_document(clip, skeleton).model_dump(by_alias=True),
         "info": ClipInfo().model_dump(mode="json", by_alias=True),

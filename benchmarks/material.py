@@ -1,4 +1,4 @@
-"""Motion to measure with: the project's own generated gaits, and real capture where MAREY_TEST_MOCAP names a folder."""
+"""Motion to measure with: gaits that Marey generates, and real capture if MAREY_TEST_MOCAP names a folder."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _REAL_LOCOMOTION = ("bandai-namco-1/*.bvh", "bandai-namco-2/*.bvh", "cmu-bvh/*.b
 
 
 def real_folder() -> Path | None:
-    """Find the folder of real motion capture, if there is one."""
+    """Return the folder of real motion capture, or None if MAREY_TEST_MOCAP is not set."""
     folder = os.environ.get("MAREY_TEST_MOCAP")
     return Path(folder) if folder else None
 
 
 @contextmanager
 def folder_of_takes() -> Iterator[Path]:
-    """Give the folder of real motion capture, or a folder of small generated takes while the block runs."""
+    """Yield the folder of real motion capture, or else a temporary folder of small generated takes."""
     real = real_folder()
     if real is not None:
         yield real
@@ -51,7 +51,10 @@ def folder_of_takes() -> Iterator[Path]:
 
 
 def noisy_clip(frames: int, joints: int, seed: int = 0) -> Clip:
-    """Five harmonics per Euler angle about a bent pose, with capture noise of 2e-4 rad and 0.05 mm, at 60 Hz."""
+    """Return a clip of random smooth motion at 60 Hz, with capture noise of 2e-4 rad and 0.05 mm.
+
+    Each Euler angle is the sum of five harmonics about a random constant angle.
+    """
     rng = np.random.default_rng(seed)
     seconds = np.arange(frames) / 60.0
     angles = _harmonics(seconds, (joints, 3), 0.4, rng) + rng.normal(scale=0.3, size=(joints, 3))
@@ -74,7 +77,7 @@ def _harmonics(
 
 
 def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
-    """Make a tree of `joints` with limbs of about five joints."""
+    """Return a random skeleton of `joints` joints, with limbs of about five joints."""
     parents: NDArray[np.int32] = np.array([-1, *(max(0, j - 1) if j % 5 else 0 for j in range(1, joints))], np.int32)
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1))
     return Skeleton(
@@ -83,9 +86,9 @@ def chain_skeleton(joints: int, rng: np.random.Generator) -> Skeleton:
 
 
 def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
-    """Make a generated walk at 120 Hz like one of a capture system: with fingers, and noise on every channel.
+    """Return a generated walk at 120 Hz like one from a capture system: with fingers, and noise on every channel.
 
-    The fingers make up for the joints that the generated body lacks of `joints`; they move like everything else.
+    The fingers have the joints that the generated body lacks to have `joints` joints.
     """
     walk = generate_gait(1.3, 0.2, frames / 120.0, 120.0)
     skeleton = with_fingers(walk.skeleton, joints, "LeftHand")
@@ -102,7 +105,7 @@ def captured_walk(frames: int, joints: int, seed: int = 0) -> Clip:
 
 
 def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:
-    """Add finger joints, three to a finger, to one hand of a skeleton, so that it has `joints`."""
+    """Return the skeleton with fingers of three joints added to one hand, so that it has `joints` joints."""
     old, new = skeleton.joint_count, joints - skeleton.joint_count
     names = tuple(f"{hand}Finger{index // 3 + 1}_{index % 3 + 1}" for index in range(new))
     parents = [old + index - 1 if index % 3 else skeleton.index_of(hand) for index in range(new)]
@@ -117,7 +120,7 @@ def with_fingers(skeleton: Skeleton, joints: int, hand: str) -> Skeleton:
 
 
 def matching_features() -> list[NDArray[np.float64]]:
-    """Normalised features (F, 27) of each generated take, and of each captured one where there is real capture."""
+    """Return the normalised features (F, 27) of each generated take, and of each captured take if there are any."""
     databases = [_database_of(take.name, take.clip) for take in generate_dataset()]
     folder = real_folder()
     for path in sorted(file for pattern in _REAL_LOCOMOTION if folder for file in folder.glob(pattern)):

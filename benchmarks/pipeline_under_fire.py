@@ -1,7 +1,7 @@
-"""A pipeline whose worker is killed at random moments must end in the same bytes as one that is left alone.
+"""Check that a pipeline whose workers are killed at random moments gives the same bytes as an undisturbed one.
 
-`python -m benchmarks.pipeline_under_fire [TAKES [KILLS [SEED]]]` brings 200 generated takes from files to a model, with
-one worker, with two, and with one that is killed ten times, and prints what that took.
+`python -m benchmarks.pipeline_under_fire [TAKES [KILLS [SEED]]]` makes a model of 200 generated takes three times: with
+one worker, with two, and with one that is killed ten times. It prints the duration of each.
 """
 
 from __future__ import annotations
@@ -55,7 +55,10 @@ class Outcome:
 
 
 def write_takes(folder: Path, count: int, seconds: float = SECONDS) -> Path:
-    """Walks of different speeds and turns as BVH files, and beside their folder a skeleton to carry them over to."""
+    """Write walks of different speeds and turns as BVH files; return their folder.
+
+    The file `game.bvh` beside this folder contains a skeleton to retarget them to.
+    """
     takes = folder / "takes"
     takes.mkdir(parents=True)
     chance = random.Random(count)
@@ -79,10 +82,10 @@ def run_pipeline(
     settings: Mapping[str, str] = MappingProxyType({}),
     **choices: Any,
 ) -> Outcome:
-    """Bring the takes of a folder from files to a model on a server of its own; `choices` are those of the plan.
+    """Make a model of the takes in a folder, on a new server; `choices` are arguments of `plan_model`.
 
-    So many times, a moment after a worker has begun some work, all workers are killed and started anew; each step gets
-    its share of that.
+    All workers are killed and started again `kills` times, each time a moment after a worker has begun a step; the
+    kills are distributed over the steps.
     """
     data.parent.mkdir(parents=True, exist_ok=True)
     with running(data, **QUICK_LEASES, **settings) as server, server.client() as marey:
@@ -113,7 +116,9 @@ def _attempts(marey: Marey, lab: ProjectHandle) -> Iterator[str | None]:
 
 
 def digests(lab: ProjectHandle) -> dict[str, str]:
-    """Compute digests of all arrays of aligned clips and models, by path of the item and place in its documents."""
+    """Return the digest of each array of aligned clips and models, by the path of the item and the place in its
+    documents.
+    """
     found: dict[str, str] = {}
     for kind, parts in PARTS.items():
         for one in lab.items(kind).list():
@@ -138,7 +143,7 @@ def _arrays(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 class Shift:
-    """Workers of a server, which can be killed together and started anew."""
+    """Workers of a server, which can be killed together and started again."""
 
     def __init__(self, server: LocalServer, count: int) -> None:
         self._server = server
@@ -150,7 +155,7 @@ class Shift:
         self._processes = [self._worker(number) for number in range(self._count)]
 
     def kill(self) -> None:
-        """End every worker as a power cut would."""
+        """Kill all workers at once, as a power failure would."""
         for process in self._processes:
             process.kill()
             process.wait()
@@ -172,7 +177,7 @@ class Shift:
 
 @contextmanager
 def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
-    """Keep `count` workers running while the block runs."""
+    """Keep `count` workers running while the `with` block runs."""
     shift = Shift(server, count)
     with ExitStack() as stack:
         stack.callback(shift.kill)
@@ -181,7 +186,7 @@ def at_work(server: LocalServer, count: int) -> Iterator[Shift]:
 
 
 class _Fire:
-    """Kills workers under a pipeline."""
+    """Kills the workers that run a pipeline."""
 
     def __init__(self, marey: Marey, run: PipelineRun, shift: Shift, chance: random.Random, at_each_step: int) -> None:
         self._marey = marey
@@ -192,7 +197,7 @@ class _Fire:
         self._seen: set[tuple[str, int]] = set()
 
     def shoot(self) -> str:
-        """Kill every worker a moment after one has begun something; what it had begun."""
+        """Kill all workers a moment after one has begun a step, and start them again; return which step that was."""
         deadline = time.monotonic() + PATIENCE_S
         while not (begun := [step for step in self._begun() if self._left[step] > 0]):
             if self._run.ended or time.monotonic() > deadline:
@@ -207,7 +212,7 @@ class _Fire:
         return f"{pause_s:.2f} s after {' and '.join(sorted(begun))} had begun"
 
     def _begun(self) -> list[str]:
-        """Steps of which a worker has begun something that was not begun before."""
+        """Return the steps of which workers have begun jobs since the last call."""
         begun = []
         for name, job in self._run.refresh().items():
             if job.state != "running":
@@ -224,7 +229,7 @@ class _Fire:
 
 
 def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
-    """Run the pipeline three times, print figures, and fail where the results are not the same."""
+    """Run the pipeline three times, print its durations, and exit with an error if the results differ."""
     with tempfile.TemporaryDirectory(prefix="marey-fire-") as folder:
         material = Path(folder, "material")
         write_takes(material, takes)
@@ -243,7 +248,7 @@ def main(takes: int = TAKES, kills: int = KILLS, seed: int = SEED) -> None:
 
 
 def _differing(one: Outcome, other: Outcome) -> list[str]:
-    """Places of arrays that are not the same, or only in one of the two."""
+    """Return the places of arrays that differ in two results, or that only one of them has."""
     places = sorted(one.digests.keys() | other.digests.keys())
     return [place for place in places if one.digests.get(place) != other.digests.get(place)]
 

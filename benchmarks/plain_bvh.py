@@ -1,4 +1,4 @@
-"""A BVH loader as most projects have one: line by line in Python, then Euler angles to quaternions in numpy."""
+"""A simple BVH loader: it parses line by line in Python, and converts Euler angles to quaternions with numpy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 def load_plainly(path: Path) -> Floats:
-    """Read local quaternions (F, J, 4) w, x, y, z of a file whose joints all have the same rotation order."""
+    """Return the local quaternions (F, J, 4) w, x, y, z of a file whose joints all have the same rotation order."""
     channels: list[int] = []
     order = ""
     frames: list[list[float]] = []
@@ -59,7 +59,7 @@ def _product(a: Floats, b: Floats) -> Floats:
 
 
 def _continuous(rotations: Floats) -> Floats:
-    """Flip signs of quaternions so that they do not jump from frame to frame."""
+    """Change signs of quaternions so that they do not jump from frame to frame."""
     for frame in range(1, len(rotations)):
         flipped = (rotations[frame - 1] * rotations[frame]).sum(axis=-1) < 0
         rotations[frame][flipped] *= -1

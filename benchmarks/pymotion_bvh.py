@@ -1,4 +1,4 @@
-"""BVH files read with pymotion, the peer of readers and of uploads."""
+"""Reading of BVH files with pymotion, for comparison."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pymotion.io.bvh import BVH
 
 
 def load_with_pymotion(path: Path) -> NDArray[np.float64]:
-    """Read local quaternions (F, J, 4) of a file."""
+    """Return the local quaternions (F, J, 4) of a file, as pymotion reads them."""
     bvh = BVH()
     bvh.load(str(path))
     rotations: NDArray[np.float64] = bvh.get_data()[0]
@@ -19,7 +19,7 @@ def load_with_pymotion(path: Path) -> NDArray[np.float64]:
 
 
 def loaded_with_pymotion(paths: Iterable[Path]) -> dict[Path, int]:
-    """Count the frames of each file that pymotion reads; it raises whatever comes up for others."""
+    """Return the number of frames of each file that pymotion can read; print the names of the other files."""
     frames = {}
     for path in paths:
         try:

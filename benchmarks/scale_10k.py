@@ -1,8 +1,8 @@
-"""Ten thousand clips through the front door: `python -m benchmarks.scale_10k`.
+"""Measurement of a server with ten thousand uploaded clips: `python -m benchmarks.scale_10k`.
 
-Uploads clips of 300 frames with the client, several at a time, into one project of a fresh server on SQLite, watching
-the server's memory all the while. Then times list pages and checks every digest and reference of the database.
-Takes minutes; leaves nothing behind. Exit status 1 if a goal was missed.
+Uploads clips of 300 frames with the client, several at a time, into one project of a new server on SQLite, and samples
+the memory of the server meanwhile. Then measures pages of lists, and checks every digest and reference of the database.
+This takes minutes and leaves no data behind. The exit status is 1 if a goal was missed.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ GOAL_RSS_MIB, GOAL_PAGE_MS = 400, 5.0
 
 @dataclass
 class MemoryWatch:
-    """Resident memory of a process, sampled; MiB."""
+    """Samples of the resident memory of a process, in MiB."""
 
     samples_mib: list[float] = field(default_factory=list)
 
     @contextmanager
     def over(self, pid: int) -> Iterator[None]:
-        """Sample while the block runs."""
+        """Sample the memory of the process `pid` while the `with` block runs."""
         process, stop = psutil.Process(pid), threading.Event()
 
         def sample() -> None:
@@ -63,7 +63,7 @@ class MemoryWatch:
 
 
 def main() -> int:
-    """Run it and print a table."""
+    """Run the measurement and print a table; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale_10k", description=__doc__)
     parser.add_argument("--clips", type=int, default=CLIPS, help="how many clips instead of %(default)s")
     clips: int = parser.parse_args().clips
@@ -113,7 +113,7 @@ def _upload(server: LocalServer, clips: int, console: Console) -> None:
 
 
 def _shaken(walk: Clip, seed: int) -> Clip:
-    """Add capture noise to the walk."""
+    """Return the walk with capture noise added."""
     noise = np.random.default_rng(seed).normal(scale=1e-4, size=walk.poses.shape)
     return replace(walk, poses=(walk.poses + noise).astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""Thousands of clips put into a project in no time: through the store, without HTTP."""
+"""Thousands of clips that are written to a project in a few seconds: directly to the store, without HTTP."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CLIPS_PER_WRITE = 500
 
 
 def fill(data: Path, clips: int) -> None:
-    """Make a data folder whose project holds a skeleton and `clips` different short clips."""
+    """Create a data folder with a project that contains a skeleton and `clips` different short clips."""
     database = open_database(Settings(data=data))
     try:
         skeleton = database.write(SYSTEM, _make_project)

@@ -1,4 +1,4 @@
-"""A Tiled server with one array: a peer that serves arrays, run by an interpreter that has `tiled[server]`.
+"""A server of Tiled with one array, for comparison; it needs an interpreter that has `tiled[server]`.
 
 `python benchmarks/tiled_server.py PORT FILE.npy`, where no other package of this repository is needed.
 """

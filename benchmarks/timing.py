@@ -1,7 +1,7 @@
-"""Timing several ways of doing the same thing in turn, so that a drifting machine slows all of them.
+"""Timing of several functions in turn, so that a change of the machine's speed affects all of them.
 
-What is timed in this process is its processor time, all threads together: on a machine that others use, wall time
-tells more about them.
+Functions in this process are measured by their processor time, of all threads together: on a machine that others use,
+wall time depends on the other users.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds per call."""
+    """Best and median processor time of a call, in seconds."""
 
     best_s: float
     median_s: float
 
     def shown(self, per_second: float, unit: str, digits: int = 1) -> str:
-        """Median, and the best in parentheses, in another unit, of which a second has `per_second`."""
+        """Return the median as text, with the best in parentheses, in a unit of which a second has `per_second`."""
         return f"{self.median_s * per_second:.{digits}f} ({self.best_s * per_second:.{digits}f}) {unit}"
 
 
@@ -29,8 +29,8 @@ class Timing:
 class Row:
     """One line of the report.
 
-    `ratio` compares with the peer of the same run, above 1 where Marey is better; None where there is none to compare
-    with. `met` is None where there is no goal.
+    `ratio` is the comparison with another library in the same run, above 1 if Marey is better; None without another
+    library. `met` is None if there is no goal.
     """
 
     job: str
@@ -43,7 +43,7 @@ class Row:
 
 
 def time_in_turn(*contenders: Callable[[], object], repeats: int = 7) -> list[Timing]:
-    """Call each `repeats` times, in turn, after one warm-up of each (compilation, caches)."""
+    """Call each function `repeats` times, in turn, after one call of each as warm-up; return their timings."""
     for call in contenders:
         call()
     seconds: list[list[float]] = [[] for _ in contenders]

@@ -1,4 +1,4 @@
-"""HTTP/1.1 over a plain socket: as little as keeps a load generator from being what is measured."""
+"""HTTP/1.1 over a plain socket, with so little code that the load generator hardly affects the measurement."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _RECEIVE_BYTES = 64 * 1024
 
 
 class Connection:
-    """One keep-alive connection that sends a bearer token. For answers with a Content-Length."""
+    """One keep-alive connection that sends a bearer token. It can read only answers with a Content-Length."""
 
     def __init__(self, port: int, token: str) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port))
@@ -28,7 +28,7 @@ class Connection:
         self._socket.close()
 
     def head(self, method: str, path: str, *, length: int = 0, token: str | None = None, **headers: str) -> bytes:
-        """Make the head of a request, which may be sent many times."""
+        """Return the head of a request, which may be sent many times."""
         fields = {"Host": "127.0.0.1", "Authorization": f"Bearer {token or self._token}"}
         fields |= {name.replace("_", "-"): text for name, text in headers.items()}
         if length or method != "GET":
@@ -37,9 +37,9 @@ class Connection:
         return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
     def exchange(self, request: bytes) -> memoryview:
-        """Send a request and take the whole answer in; its body, valid until the next one.
+        """Send a request and return the body of the answer, which is valid until the next request.
 
-        Raises `RuntimeError` for any status but a success.
+        Raises `RuntimeError` if the status is not a success.
         """
         self._socket.sendall(request)
         received = self._socket.recv_into(self._buffer)
@@ -64,7 +64,7 @@ class Connection:
         return body
 
     def call(self, path: str, document: Any, token: str | None = None) -> Any:
-        """POST a JSON document and read the JSON of the answer."""
+        """Send a JSON document by POST, and return the JSON of the answer."""
         body = json.dumps(document).encode()
         head = self.head("POST", path, length=len(body), token=token, Content_Type="application/json")
         return json.loads(bytes(self.exchange(head + body)))
