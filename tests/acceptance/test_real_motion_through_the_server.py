@@ -27,7 +27,7 @@ pytestmark = pytest.mark.timeout(600)
 
 @dataclass(frozen=True)
 class Uploaded:
-    """The collection on a server."""
+    """The collection of real motion after its upload to a server."""
 
     marey: Marey
     lab: ProjectHandle
@@ -92,7 +92,7 @@ def motion_in(uploaded: Uploaded, clip: ClipHandle, form: str) -> dict[str, Any]
 
 
 def positions_of(lab: ProjectHandle, clip: ClipHandle) -> NDArray[np.float32]:
-    """(F, J, 3) metres, by the clip's own documents."""
+    """Return the positions (F, J, 3) of the joints in metres, computed from the clip's own documents."""
     motion = MotionDocument.model_validate(clip.part("motion"))
     skeleton = lab.skeletons.get(motion.skeleton.model_dump()["item"])
     return global_positions(clip_from_document(motion, skeleton_from_document(skeleton.hierarchy())))

@@ -26,7 +26,7 @@ OLD_US = 2 * 24 * 3600 * 1_000_000
 
 
 class BlobBackingContract:
-    """Subclasses give `backing`."""
+    """Tests that every backing of blobs must pass; each subclass defines the fixture `backing`."""
 
     @pytest.fixture
     def store(self, database: Database, backing: Any) -> Lab:

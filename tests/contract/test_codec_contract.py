@@ -44,7 +44,7 @@ objects = st.dictionaries(keys, values, max_size=5)
 
 
 def same(a: object, b: object) -> bool:
-    """Equal to the type and to the bit."""
+    """Return whether two values are equal in their types and in every bit."""
     if isinstance(a, np.ndarray):
         return isinstance(b, np.ndarray) and (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
     if isinstance(a, dict):

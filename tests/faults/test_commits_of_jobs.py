@@ -47,7 +47,7 @@ AFTER = ("publish.after_commit", "complete.after_commit")
 
 
 class Seen(NamedTuple):
-    """What others see of a job that commits."""
+    """State of a job that commits, as other clients see it."""
 
     state: str
     outputs: int
@@ -118,7 +118,7 @@ def test_a_server_that_dies_at_a_completion_leaves_all_or_nothing(
 
 
 def complete_each(gaits: CommittingDesk, leases: list[Lease], database: Database) -> None:
-    """Complete attempts from several threads at once."""
+    """Complete attempts from several threads at the same time."""
 
     def complete(lease: Lease) -> Any:
         request = CompleteRequest(write_id=f"write-{lease.job}")
@@ -129,7 +129,7 @@ def complete_each(gaits: CommittingDesk, leases: list[Lease], database: Database
 
 
 def submitted(gaits: CommittingDesk, count: int) -> tuple[list[str], list[Lease]]:
-    """Submit jobs that all start from the present commit; stage an output of each."""
+    """Submit jobs that all start from the present commit, and stage outputs of each; return their ids and leases."""
     jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(count)]
     leases = gaits.desk.claim_many()
     for number, lease in enumerate(leases):
@@ -166,7 +166,7 @@ def do_not_lock(patch: pytest.MonkeyPatch) -> None:
 def test_without_the_lock_and_the_check_of_the_branch_commits_would_be_lost(
     gaits: CommittingDesk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A negative control of the test above."""
+    """Check that the test of commits at once fails without the lock and the check."""
     do_not_lock(monkeypatch)
     for _ in range(20):
         before = len(gaits.log()) if gaits.head() else 0

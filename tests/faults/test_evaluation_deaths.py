@@ -80,14 +80,14 @@ def tasks_of(lab: ProjectHandle, job: Job) -> list[Job]:
 
 
 def warm_up(marey: Marey, lab: ProjectHandle) -> Job:
-    """An evaluation of two tasks that takes no time, so that a worker has somewhere to show itself."""
+    """Run a short evaluation of two tasks to its end, so that every worker has started; return its job."""
     options = {**LONG, "name": "warm-up", "speeds_m_s": (1.0,), "turn_rates_deg_s": LONG["turn_rates_deg_s"]}
     job = lab.evaluate("walks", cache="off", **{**options, "duration_s": 1.0})
     return marey.jobs.wait(job.id)
 
 
 def workers_of(marey: Marey, lab: ProjectHandle, job: Job) -> set[str]:
-    """Who worked on the tasks of a job."""
+    """Return the names of the workers that worked on the tasks of a job."""
     return {attempt.worker for task in tasks_of(lab, job) for attempt in marey.jobs.attempts(task.id)}
 
 

@@ -23,23 +23,23 @@ Folders = dict[str, str]
 
 @pytest.fixture
 def other(open_database: Callable[[], Database]) -> Database:
-    """The same database, as another server process opens it."""
+    """The same database, opened again as another server process would open it."""
     return open_database()
 
 
 def make(lab: Lab, *paths: str) -> Folders:
-    """Folders; their ids by path."""
+    """Create folders, and return their ids by path."""
     made = [lab.write(collections.create_collection, lab.name, CollectionCreate(path=path)) for path in paths]
     return {one.path: one.id for one in made}
 
 
 def living(lab: Lab) -> list[str]:
-    """The paths of every folder that is there."""
+    """Return the paths of all folders that are not deleted."""
     return [one.path for one in lab.read(collections.list_collections, lab.name).items]
 
 
 def places(lab: Lab) -> list[str]:
-    """Where the skeletons are that are there."""
+    """Return the paths of all skeletons that are not deleted."""
     found = lab.read(items.list_items, lab.name, Kind.SKELETON, ItemFilters()).items
     return sorted(f"{one.collection}/{one.name}" for one in found)
 
@@ -52,7 +52,7 @@ def require_whole_trees(lab: Lab) -> None:
 
 
 def puts(path: str) -> Callable[[Transaction], object]:
-    """Makes a skeleton in a folder, which is made for it."""
+    """Return a function that creates a skeleton in a folder, which it creates if necessary."""
     request = ItemCreate(name="rig", collection=path, parts={"hierarchy": skeleton_tree()})
     return lambda tx: items.create_item(tx, "lab", Kind.SKELETON, request)
 

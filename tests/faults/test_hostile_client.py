@@ -59,7 +59,7 @@ class Attacked:
 
 @pytest.fixture
 def attacked(tmp_path: Path, database_url: str) -> Iterator[Attacked]:
-    """A furnished server in a process of its own, on SQLite and on Postgres."""
+    """A server with users, a project and jobs in a separate process, on SQLite and on Postgres."""
     process = ServerProcess(tmp_path, database_url, **ATTACKED).start()
     database = Database(database_url)
     people = People(process.url, database)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.every_database
 
 @pytest.fixture
 def other(open_database: Callable[[], Database]) -> Database:
-    """The same database over other connections."""
+    """The same database, opened again with other connections."""
     return open_database()
 
 
@@ -36,14 +36,14 @@ def completes(desk: Desk, database: Database, lease: Lease) -> Step:
 
 
 def claimed_maker(desk: Desk, number: int = 0, made: int = 3) -> Lease:
-    """A maker whose results are staged."""
+    """Claim a job of the kind `sum` and stage its results; return its lease."""
     lease = desk.claim(job=desk.submit("sum", params={"number": number}, into=f"made{number}"))
     desk.stage(lease, *(f"thing{n}" for n in range(made)))
     return lease
 
 
 def work_off(desk: Desk) -> list[str]:
-    """Names of the things squared."""
+    """Complete all jobs that can be claimed; return the paths of their inputs, sorted."""
     seen: list[str] = []
     while leases := desk.claim_many():
         for lease in leases:

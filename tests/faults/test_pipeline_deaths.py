@@ -60,7 +60,7 @@ def start_worker(tmp_path: Path, server: ServerProcess) -> Iterator[StartWorker]
 
 
 def game_rig(lab: ProjectHandle, folder: Path) -> str:
-    """Id of the skeleton to carry the walks over to, which came with a clip."""
+    """Import a clip on another skeleton; return the id of this skeleton, to which walks are retargeted."""
     skeleton = game_skeleton()
     at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
     file = folder / "game.bvh"
@@ -71,7 +71,7 @@ def game_rig(lab: ProjectHandle, folder: Path) -> str:
 
 
 def to_game_and_back(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -> PipelineCreate:
-    """Import the takes, carry them over to the game's skeleton, and what came of that once more."""
+    """Return a pipeline that imports the takes, retargets them to another skeleton, and retargets the results again."""
     files = [file.model_dump() for file in lab.imports.send(takes)]
     skeleton = {"item": game_rig(lab, folder)}
     steps: dict[str, Any] = {

@@ -68,7 +68,7 @@ def make_lab(marey: Marey) -> ProjectHandle:
 
 
 def import_game_skeleton(lab: ProjectHandle, folder: Path) -> str:
-    """Id of a second skeleton, which came with a clip."""
+    """Import a clip on another skeleton; return the id of this skeleton."""
     skeleton = game_skeleton()
     at_rest = np.concatenate([skeleton.offsets[0], skeleton.rest_rotations.ravel()]).astype(np.float32)
     file = folder / "game.bvh"
@@ -97,7 +97,7 @@ def test_a_server_that_does_not_warm_up_starts_children_when_a_request_needs_the
 
 
 def clips_by_name(lab: ProjectHandle) -> dict[str, tuple[str, int]]:
-    """Id and newest revision of every clip; fails when a name is there twice in a folder."""
+    """Return id and newest revision of every clip by path; fail if two clips have the same path."""
     found: dict[str, tuple[str, int]] = {}
     for clip in lab.clips.list():
         assert clip.path not in found, f"{clip.path} is there twice"

@@ -48,7 +48,7 @@ class Bout:
         desk.stage(self.lease, "result")
 
     def does(self, name: str, database: Database) -> Step:
-        """The step called `name` over a connection."""
+        """Return the step with this name, to be run with connections of `database`."""
         actions: dict[str, tuple[Principal, Callable[[Transaction], object]]] = {
             "complete": (
                 self.worker,
@@ -88,7 +88,7 @@ class Bout:
 
 @pytest.fixture
 def other(open_database: Callable[[], Database]) -> Database:
-    """The same database over other connections."""
+    """The same database, opened again with other connections."""
     return open_database()
 
 

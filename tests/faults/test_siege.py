@@ -152,7 +152,7 @@ def _characters(client: httpx.Client) -> Iterator[dict[str, Any]]:
 
 
 def _creations(client: httpx.Client, kind: str) -> Counter[str]:
-    """Count the events that report the creation of items of a kind, by item."""
+    """Return the number of events that report the creation of items of a kind, by item."""
     found: Counter[str] = Counter()
     after = 0
     while events := client.get("/projects/lab/events", params={"after": after}).raise_for_status().json()["items"]:
@@ -167,7 +167,7 @@ def _creations(client: httpx.Client, kind: str) -> Counter[str]:
 
 @pytest.fixture
 def processes(tmp_path: Path, database_url: str) -> Iterator[tuple[list[ServerProcess], list[WorkerProcess]]]:
-    """Two servers over one database, and workers that are not started."""
+    """Two servers with the same database, and workers that are not started."""
     servers = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()

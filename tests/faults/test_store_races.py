@@ -24,7 +24,7 @@ Act = Callable[[Transaction], object]
 
 @pytest.fixture
 def other(open_database: Callable[[], Database]) -> Database:
-    """The same database, as another server process opens it."""
+    """The same database, opened again as another server process would open it."""
     return open_database()
 
 

@@ -27,7 +27,7 @@ class Writer:
         """Lines that the last process printed."""
 
     def run(self, work: str, fault: str = "") -> int:
-        """Exit status: 0, or minus the signal that ended it."""
+        """Run `work` in a process; return its exit status: 0, or minus the number of the signal that killed it."""
         environment = {**os.environ, "MAREY_FAULT": fault}
         done = subprocess.run([*self._args, work, self._folder], env=environment, capture_output=True, timeout=60)
         assert done.returncode in (0, -signal.SIGKILL), done.stderr.decode()

@@ -31,12 +31,12 @@ GUESSES = 3
 
 @pytest.fixture
 def house(server: Server) -> House:
-    """A private project full of canaries, and one token per kind of caller."""
+    """A private project with marked contents, and one token for each kind of caller."""
     return build_house(server)
 
 
 def send(house: House, route: Route, role: str) -> httpx.Response:
-    """Send the request of a route as one kind of caller."""
+    """Send the request of a route as one kind of caller, and return the answer."""
     template, token = route.template, house.tokens[role]
     own = {"attempt": "owner", "ended": "contributor"}.get(role, role)
     changed = {"user": own} if "/users/" in template and token else {}
@@ -52,7 +52,7 @@ def send(house: House, route: Route, role: str) -> httpx.Response:
 
 
 def find_wrong_answers(house: House, routes: tuple[Route, ...]) -> list[str]:
-    """Send every route as every role; list the answers that differ from the declaration."""
+    """Send the request of every route as every role; return the answers that differ from the declaration."""
     wrong = []
     for route in routes:
         operation = route.operation

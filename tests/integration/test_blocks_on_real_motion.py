@@ -9,7 +9,7 @@ from marey_schemas.encoding import blocks
 
 
 def arrays_of(path: Path) -> list[NDArray[np.float32]]:
-    """Poses and translations of a BVH file as a clip stores them."""
+    """Return the poses and translations of a BVH file in the form in which a clip stores them."""
     source = read_bvh(path.read_bytes(), path.name)
     if source.rotations is None or source.root_positions is None:
         return []

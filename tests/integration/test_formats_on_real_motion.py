@@ -172,7 +172,10 @@ def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None
 
 
 def _rigid_and_scale(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Rotation (from the right) and scale that bring points a (n, 3) nearest to b (Umeyama 1991, eq. 40 to 42)."""
+    """Return the rotation (from the right) and the scale that bring points a (n, 3) nearest to points b.
+
+    The method is that of Umeyama (1991), equations 40 to 42.
+    """
     u, strength, v = np.linalg.svd(a.T @ b)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
     return u @ np.diag(signs) @ v, float((strength * signs).sum() / (a**2).sum())

@@ -52,7 +52,7 @@ def database(takes: list[SourceClip]) -> MatchingDatabase:
 
 
 def courses(database: MatchingDatabase, clip: DatabaseClip) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities (F - 1, 2) to the left and forward, m/s, and turn rates (F - 1,) in rad/s, of a clip's root."""
+    """Return the velocities (F - 1, 2) of a clip's root to the left and forward in m/s, and its turn rates in rad/s."""
     steps = database.root_motion.steps[clip.start : clip.stop - 1] * database.options.rate_hz
     return steps[:, :2], steps[:, 2]
 

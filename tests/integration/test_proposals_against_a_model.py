@@ -36,7 +36,7 @@ STEPS = 400
 
 @dataclass
 class Model:
-    """What a proposal should be."""
+    """Expected state of a proposal."""
 
     author: str
     source: str
@@ -116,7 +116,7 @@ class Program:
         return allowed and (not directly or self.rule is None or self.rule.direct_commits)
 
     def choose(self) -> tuple[int, Model]:
-        """Choose a proposal, mostly an open one."""
+        """Choose a proposal, mostly an open one; return its number and its expected state."""
         still_open = [number for number, one in self.models.items() if one.state == "open"]
         number = self.chance.choice(still_open * 8 + [max(self.models)])
         return number, self.models[number]

@@ -260,7 +260,7 @@ def test_nothing_is_decoded_for_an_attempt_that_has_ended_or_belongs_to_another_
 
 @pytest.fixture
 def bound(desk: Desk) -> httpx.Client:
-    """A token of the author that is bound to the project `lab`."""
+    """A client with a token of the author that is valid only for the project `lab`."""
     user = desk.server.database.read(SYSTEM, tokens.resolve_token, desk.author.headers["Authorization"][7:])
     scopes = ("read!project=lab", "write!project=lab", "jobs!project=lab")
     return desk.server.client(desk.server.make_token(str(user.user_id), "olga", scopes=scopes))

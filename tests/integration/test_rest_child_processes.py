@@ -31,7 +31,7 @@ TRIM = {"commands": [{"command": "trim", "stop": 20}]}
 
 
 def until(condition: Callable[[], Any]) -> None:
-    """Wait for a condition."""
+    """Wait until a condition is true; fail after `PATIENCE_S`."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline
@@ -49,7 +49,7 @@ def made(owner: httpx.Client, kind: str, **parts: object) -> str:
 
 @pytest.fixture
 def preview(owner: httpx.Client) -> str:
-    """The address of previews of a clip."""
+    """The path at which previews of a clip are requested."""
     walk = make_walk(seconds=1.0)
     skeleton = made(owner, "skeletons", hierarchy=skeleton_to_document(walk.skeleton).model_dump(by_alias=True))
     motion = clip_to_document(walk, RevisionRef(item=skeleton, revision=1)).model_dump(by_alias=True)
@@ -58,7 +58,7 @@ def preview(owner: httpx.Client) -> str:
 
 @pytest.fixture
 def noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file in which the child that computes a preview notes its process; it then waits."""
+    """A file to which the child process that computes a preview writes its process id; the child then waits."""
     monkeypatch.setattr(previewing, "MAKE_PREVIEW", WAITING)
     monkeypatch.setattr(previewing, "preview_order", lambda *_: str(tmp_path / "noted").encode())
     return tmp_path / "noted"

@@ -25,7 +25,7 @@ RATE_HZ = 60.0
 
 @pytest.fixture(scope="module")
 def walk() -> Clip:
-    """Five seconds at 1.5 m/s, turning 50 degrees a second to the left."""
+    """A walk of five seconds at 1.5 m/s that turns to the left by 50 degrees per second."""
     return generate_gait(1.5, math.radians(50.0), 5.0, frame_rate_hz=RATE_HZ)
 
 
@@ -79,7 +79,7 @@ def test_a_performance_fills_its_cell_and_the_next_target_lies_beside_it(
 
 
 def circling(speed_m_s: float, turn_rate_deg_s: float, seconds: float) -> Floats:
-    """Roots (n, 3) that go where they face."""
+    """Return roots (n, 3) of a body that moves in the direction that it faces."""
     headings = math.radians(turn_rate_deg_s) * np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
     steps = speed_m_s / RATE_HZ * np.stack((np.sin(headings), np.cos(headings)), axis=-1)
     return np.column_stack((np.cumsum(steps, axis=0) - steps, headings))

@@ -35,7 +35,7 @@ def refused(response: httpx.Response, status: int, code: str) -> Any:
 
 
 def skeleton(name: str, joint: str = "Hips", *, folder: str = "gaits", mapped: bool = False) -> dict[str, Any]:
-    """The body of a request for a skeleton with one joint."""
+    """Return the body of a request that creates a skeleton with one joint."""
     parts: dict[str, Any] = {"hierarchy": hierarchy(joint)}
     if mapped:
         parts["mapping"] = {"schema": "marey/skeleton-mapping@1", "joints": {joint: "hips"}}
@@ -47,7 +47,7 @@ def hierarchy(joint: str) -> dict[str, Any]:
 
 
 def clip(used: str, place: float) -> dict[str, Any]:
-    """The parts of a clip with one frame."""
+    """Return the parts of a clip with one frame, on the skeleton with the id `used`, at x = `place` metres."""
     motion = {
         "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": ["Hips"],
         "skeleton": {"item": used, "revision": 1},
@@ -58,7 +58,7 @@ def clip(used: str, place: float) -> dict[str, Any]:
 
 @pytest.fixture
 def gaits(owner: httpx.Client) -> Callable[..., Any]:
-    """Makes the dataset `gaits`, whose folder has the skeletons `a` and `b`; the function commits its folder."""
+    """Create the dataset `gaits` with skeletons `a` and `b` in its folder; return a function that commits this folder."""
     for name in ("a", "b"):
         ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}")), 201)
     ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)
@@ -86,7 +86,7 @@ def delete(owner: httpx.Client, path: str) -> None:
 
 
 def put(owner: httpx.Client, path: str, joint: str) -> Any:
-    """Replace the only joint of a skeleton."""
+    """Replace the only joint of the skeleton at a path; return the changed item."""
     url = f"{LAB}/skeletons/{item_at(owner, path)['id']}/parts/hierarchy"
     return ok(owner.put(url, json=hierarchy(joint), headers={"If-Match": "*"}))
 
@@ -258,7 +258,7 @@ def test_a_checkout_swaps_names(owner: httpx.Client, gaits: Callable[..., Any]) 
 def two_branches(
     owner: httpx.Client, gaits: Callable[..., Any]
 ) -> Callable[[Callable[[], Any], Callable[[], Any]], None]:
-    """Commits one change to the branch `trial` and another to `main`; the folder has the entries of `main`."""
+    """Function that commits one change to the branch `trial` and another to `main`, and leaves the folder at `main`."""
 
     def diverge(on_trial: Callable[[], Any], on_main: Callable[[], Any]) -> None:
         ok(owner.post(f"{GAITS}/refs", json={"name": "trial", "kind": "branch"}), 201)

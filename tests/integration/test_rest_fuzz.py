@@ -19,7 +19,7 @@ CALLERS = ("anonymous", "reader", "owner")
 
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FuzzedServer]:
-    """A server with a private project, and its callers."""
+    """A server with a private project, users and jobs."""
     folder: Path = tmp_path_factory.mktemp("fuzzed")
     url = f"sqlite:///{folder / 'marey.db'}"
     upgrade_schema(url)

@@ -80,7 +80,7 @@ Frame Time: 0.033333
 
 
 def bvh(seed: int = 0) -> bytes:
-    """A small body that sways."""
+    """Return a BVH file of a small body that moves a little."""
     rng = np.random.default_rng(seed)
     rows = rng.normal(scale=5, size=(12, 3 + 3 * 9))
     rows[:, 1] += 99

@@ -29,20 +29,20 @@ BLOCKS = "application/msgpack; arrays=blocks"
 
 @pytest.fixture
 def server(database: Database, tmp_path: Path, test_kinds: None) -> Iterator[Server]:
-    """A server that knows the kinds of the queue's tests."""
+    """A server that knows the kinds of jobs that the tests of the queue declare."""
     with running(database, tmp_path) as one:
         yield one
 
 
 @pytest.fixture
 def owner(server: Server) -> httpx.Client:
-    """Who submits."""
+    """The client of the user who submits jobs."""
     return server.client(server.make_project())
 
 
 @pytest.fixture
 def worker(server: Server) -> httpx.Client:
-    """Who works."""
+    """The client of the user who runs jobs."""
     return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
 
 

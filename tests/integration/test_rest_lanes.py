@@ -20,7 +20,7 @@ STUDY = {"schema": "marey/document@1", "answer": 42}
 
 @contextmanager
 def busy(server: Server) -> Iterator[None]:
-    """Keep every thread for ordinary reads, and the line before them, busy with many clients' reads."""
+    """Occupy all threads for ordinary reads, and their queue, with reads of many clients during the `with` block."""
     done = threading.Event()
     clients = [Client(f"192.0.2.{number}", known=False) for number in range(40)]
     reads = [server.database.queue_read(one, SYSTEM, lambda _tx: done.wait(PATIENCE_S)) for one in clients]

@@ -62,7 +62,7 @@ class Process:
         return (self.folder / "admin.token").read_text().strip()
 
     def end(self) -> int:
-        """Ask it to stop; its exit status."""
+        """Ask the process to stop with SIGTERM, and return its exit status."""
         self.process.send_signal(signal.SIGTERM)
         status = self.process.wait(PATIENCE_S)
         self._reader.join(PATIENCE_S)

@@ -18,19 +18,19 @@ FORMS = ("application/json", "application/msgpack", "application/bson", "applica
 
 @pytest.fixture
 def reader(server: Server) -> httpx.Client:
-    """Rita."""
+    """The client of the user `rita`, who may only read."""
     return server.client(server.make_user("rita"))
 
 
 @pytest.fixture
 def owner(server: Server, reader: httpx.Client) -> httpx.Client:
-    """The owner of `lab`, which Rita may read."""
+    """The client of the owner of `lab`, which `rita` may read."""
     return server.client(server.make_project(rita=Role.READER))
 
 
 @pytest.fixture
 def study(owner: httpx.Client) -> str:
-    """The path of an item's document."""
+    """The path of an item with one document."""
     made = owner.post("/projects/lab/studies", json={"name": "s", "parts": {"study": STUDY}})
     assert made.status_code == 201, made.text
     return f"/projects/lab/studies/{made.json()['id']}"

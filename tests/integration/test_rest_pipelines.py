@@ -15,20 +15,20 @@ from marey_server.store.database.connections import Database
 
 @pytest.fixture
 def server(database: Database, tmp_path: Path, test_kinds: None) -> Iterator[Server]:
-    """A server that knows the kinds of the queue's tests."""
+    """A server that knows the kinds of jobs that the tests of the queue declare."""
     with running(database, tmp_path) as one:
         yield one
 
 
 @pytest.fixture
 def owner(server: Server) -> httpx.Client:
-    """Who submits."""
+    """The client of the user who submits jobs."""
     return server.client(server.make_project())
 
 
 @pytest.fixture
 def worker(server: Server) -> httpx.Client:
-    """Who works."""
+    """The client of the user who runs jobs."""
     return server.client(server.make_user("wanda", administrator=True, scopes=("work",)))
 
 
@@ -51,7 +51,7 @@ def submit(owner: httpx.Client, wanted: object = CHAIN, **headers: str) -> Any:
 
 
 def do_next(server: Server, worker: httpx.Client, *names: str) -> Any:
-    """Claim one job and make small documents of these names; its lease."""
+    """Claim one job and complete it with small documents of these names; return its lease."""
     (lease,) = ok(worker.post("/leases", json={"worker": "w", "kinds": ["sum", "square"]}))["leases"]
     attempt = server.client(lease["attempt_token"])
     place = f"/jobs/{lease['job']}/attempts/{lease['fence']}"

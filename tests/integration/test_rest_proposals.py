@@ -55,7 +55,7 @@ class Team:
     items: tuple[str, ...]
 
     def put(self, branch: str, path: str, item: int, **fields: Any) -> httpx.Response:
-        """Commit one entry to a branch."""
+        """Commit an entry with the item number `item` at `path` to a branch; return the answer."""
         change = {"change": "put", "path": path, "item": self.items[item]}
         return self.ada.post(f"{GAITS}/commits", json={"branch": branch, "message": path, "changes": [change]})
 
@@ -78,7 +78,7 @@ def skeleton(name: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=BACKENDS)
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The server of all tests over one kind of database; each test has a project `lab` of its own."""
+    """A server that all tests with one kind of database share; each test has its own project `lab`."""
     folder = tmp_path_factory.mktemp("server")
     with contextlib.ExitStack() as after:
         if request.param == "sqlite":
@@ -93,13 +93,13 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="module")
 def people(server: Server) -> dict[str, httpx.Client]:
-    """The people who use the server, by name."""
+    """The clients of all users, by name."""
     return {name: server.client(server.make_user(name)) for name in ("olga", "mia", "ada", "ben", "rita", "eve")}
 
 
 @pytest.fixture
 def team(people: dict[str, httpx.Client]) -> Iterator[Team]:
-    """The dataset `gaits`: one commit on `main`, another one on the branch `trial`."""
+    """The users and the dataset `gaits`, which has one commit on `main` and another one on the branch `trial`."""
     olga, ada = people["olga"], people["ada"]
     ok(olga.post("/projects", json={"name": "lab"}), 201)
     for name, role in (("mia", "maintainer"), ("ada", "contributor"), ("ben", "contributor"), ("rita", "reader")):

@@ -414,7 +414,7 @@ def test_a_length_that_is_no_number_is_refused(server: Server, length: str) -> N
 
 
 def talk_of_a_project(server: Server, length: str) -> bytes:
-    """What is answered to a body of 15 bytes whose Content-Length is `length`."""
+    """Send a body of 15 bytes whose Content-Length is `length`, and return the bytes of the answer."""
     head = f"POST /api/v1/projects HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {server.make_user('olga')}\r\n"
     return talk(
         server, f'{head}Connection: close\r\nContent-Length: {length}\r\n\r\n{{"name":"loft"}}'.encode("latin-1")

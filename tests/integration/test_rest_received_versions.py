@@ -36,13 +36,13 @@ def hierarchy(joint: str) -> dict[str, Any]:
 
 
 def skeleton(joint: str, path: str | None = "rig") -> dict[str, Any]:
-    """A received skeleton with one joint."""
+    """Return a skeleton with one joint, as it is received from another server."""
     content = revision_content("skeleton", {"hierarchy": document_digest(hierarchy(joint))})
     return {"content": content, "kind": "skeleton", "path": path, "parts": {"hierarchy": hierarchy(joint)}}
 
 
 def clip(joint: str, used: str) -> dict[str, Any]:
-    """A received clip with one frame, on the skeleton with this content."""
+    """Return a clip with one frame, as it is received, on the skeleton with the content digest `used`."""
     motion: dict[str, Any] = {
         "schema": "marey/motion@1", "frame_rate_hz": 30, "joints": [joint], "skeleton": {"content": used},
         "poses": {"dtype": "<f4", "shape": [1, 7], "data": POSES.tolist()},
@@ -56,7 +56,10 @@ def parts_of(one: dict[str, Any]) -> dict[str, str]:
 
 
 def commit(entries: dict[str, dict[str, Any]], *parents: str, before: dict[str, dict[str, Any]] | None = None) -> Any:
-    """A received commit whose version has these entries, given by path; its first parent has those of `before`."""
+    """Return a received commit whose version has these entries, by path.
+
+    `before` are the entries of its first parent.
+    """
     before = before or {}
     values = {key_of(path, one["kind"]): {"parts": parts_of(one), "tags": []} for path, one in entries.items()}
     tree = build(ChunksInMemory(), sorted(values.items()))
@@ -73,7 +76,7 @@ def commit(entries: dict[str, dict[str, Any]], *parents: str, before: dict[str, 
 
 @pytest.fixture
 def client(owner: httpx.Client) -> httpx.Client:
-    """The owner of `lab`, which has the dataset `gaits` without commits."""
+    """The client of the owner of `lab`, which has the dataset `gaits` without commits."""
     ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)
     return owner
 

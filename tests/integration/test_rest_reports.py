@@ -114,7 +114,7 @@ def test_other_items_have_no_report(owner: httpx.Client) -> None:
 
 @pytest.fixture
 def walked(owner: httpx.Client) -> str:
-    """The path of an evaluation with the ticks of its trials."""
+    """The path of an evaluation that has records of its trials."""
     result = synthetic_result()
     trials = [each.trial for each in result.trials]
     parts = {"evaluation": result_to_tree(result), "records": records_to_tree(trials, result.records)}
@@ -126,7 +126,10 @@ def walked(owner: httpx.Client) -> str:
 
 
 def read_graphml(data: bytes) -> tuple[list[Any], list[Any], dict[str, Any]]:
-    """(clip, frame, ticks) of nodes, (source, target, count) of edges, walks by trial; read from the XML alone."""
+    """Read a walk graph without Marey: return its nodes, its edges, and its attributes by trial.
+
+    Nodes are (clip, frame, ticks), and edges are (source, target, count).
+    """
     space = {"g": "http://graphml.graphdrawing.org/xmlns"}
     root = ElementTree.fromstring(data)
     names = {key.get("id"): key.get("attr.name") for key in root.findall("g:key", space)}

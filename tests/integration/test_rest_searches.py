@@ -34,7 +34,7 @@ def send(client: httpx.Client, method: str, url: str, tree: object, status: int)
 
 @pytest.fixture
 def document(owner: httpx.Client) -> dict[str, Any]:
-    """A model of walks, on a skeleton of the project."""
+    """The document of a model of walks, on a skeleton of the project."""
     primitive = walking()[0]
     hierarchy = skeleton_to_document(primitive.skeleton).model_dump(by_alias=True)
     skeleton = send(owner, "POST", "/projects/lab/skeletons", {"name": "rig", "parts": {"hierarchy": hierarchy}}, 201)
@@ -153,7 +153,7 @@ def test_models_that_nobody_can_use_are_refused(
 
 
 def _stretched(document: dict[str, Any], frames: int) -> dict[str, Any]:
-    """The model over so many canonical frames."""
+    """Return the document of the model, changed to `frames` canonical frames."""
     parts = {name: dict(document[name]) for name in ("spatial", "temporal")}
     for name, last in (("spatial", frames - 1), ("temporal", frames - 2)):
         parts[name]["knots"] = parts[name]["knots"] * (last / parts[name]["knots"][-1])

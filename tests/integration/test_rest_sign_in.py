@@ -84,7 +84,7 @@ def test_an_unknown_user_gets_the_answer_of_a_wrong_password_for_the_same_work(
 
 @pytest.fixture
 def going_on(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Event until which checks of wrong passwords go on."""
+    """Event that must be set before checks of wrong passwords continue."""
     event = threading.Event()
     matches = passwords.password_matches
 
@@ -98,7 +98,7 @@ def going_on(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 def guess_once(server: Server, address: str) -> int:
-    """Sign in through a connection of its own, as a stranger does."""
+    """Try to sign in with a wrong password from an address, on a new connection; return the status of the answer."""
     with httpx.Client(base_url=server.api, timeout=PATIENCE_S) as client:
         body = {"name": "ann", "password": "guess"}
         return client.post("/login", json=body, headers={"X-Forwarded-For": address}).status_code

@@ -25,7 +25,7 @@ DOCUMENT_BYTES = 6 * MIB
 
 @contextmanager
 def reading(server: Server, path: str, token: str) -> Iterator[socket.socket]:
-    """Send a request, and read nothing of its answer."""
+    """Send a request and read nothing of the answer; yield the socket."""
     host, port = server.address.removeprefix("http://").split(":")
     head = f"GET /api/v1{path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
     with socket.socket() as client:

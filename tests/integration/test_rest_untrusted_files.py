@@ -35,7 +35,7 @@ def bson_bomb(elements: int) -> bytes:
 
 
 def npz_bomb(megabytes: int) -> bytes:
-    """Return an archive of zeros."""
+    """Return an npz archive that is small, but contains `megabytes` MiB of zeros."""
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as members:
         arrays = {"format": np.array("marey/clip-npz@1"), "poses": np.zeros((megabytes, 1 << 18), np.float32)}
@@ -48,13 +48,13 @@ def npz_bomb(megabytes: int) -> bytes:
 
 @pytest.fixture
 def small(database: Database, tmp_path: Path) -> Iterator[Server]:
-    """A server that gives a file little memory."""
+    """A server that allows little memory for reading a file."""
     with running(database, tmp_path, child_memory_mb=MEMORY_MB) as server:
         yield server
 
 
 def until(condition: Callable[[], Any]) -> None:
-    """Wait for a condition."""
+    """Wait until a condition is true; fail after some seconds."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline

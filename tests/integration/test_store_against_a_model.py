@@ -33,7 +33,7 @@ TEXTS = st.sampled_from(["one", "two", "three"])
 
 @dataclass(frozen=True)
 class Model:
-    """What an item should be."""
+    """Expected state of an item."""
 
     name: str
     place: str
@@ -45,7 +45,7 @@ class Model:
 
 @dataclass
 class World:
-    """The items there should be, by id."""
+    """Expected items by id."""
 
     items: dict[str, Model] = field(default_factory=dict)
 
@@ -74,7 +74,7 @@ class ItemsMachine(RuleBasedStateMachine):
         return self.lab.write(function, self.lab.name, Kind.STUDY, item_id, *args, **kwargs)
 
     def attempt(self, item_id: str, expected: str, change: Callable[..., Any], *, blocked: bool = False) -> bool:
-        """Run `change(expected_rev)`; True if it happened. The model decides which error there must be."""
+        """Run `change(expected_rev)`; return whether it succeeded. The model decides which error is expected."""
         model = self.world.items[item_id]
         expected_rev = {"any": None, "right": model.rev, "wrong": model.rev + 7}[expected]
         error: type[Exception] | None = None

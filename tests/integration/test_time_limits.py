@@ -17,7 +17,7 @@ from marey_schemas.queue.jobs import FailureReason, JobCreate, JobState, Resourc
 
 @pytest.fixture
 def marey(tmp_path: Path) -> Iterator[Marey]:
-    """A server and a worker that know a kind of job that can sleep."""
+    """The client of a server with a worker that knows a kind of job that can sleep."""
     process = ServerProcess(tmp_path, PYTHONPATH=python_path())
     process.start(workers=1)
     with process.client() as client:

@@ -15,7 +15,7 @@ from marey_motion.rigs import map_joints
 
 @cache
 def walk(frames: int = 60, speed: float = 1.3, turn_rate: float = 0.2) -> Clip:
-    """A walk at 60 Hz that begins at the origin and faces +z."""
+    """Return a walk at 60 Hz that begins at the origin and faces +z."""
     return generate_gait(speed, turn_rate, frames / 60.0)
 
 
@@ -24,7 +24,7 @@ def body_of(clip: Clip) -> MatchingBody:
 
 
 def played(clip: Clip, times: Floats) -> Clip:
-    """Sample the clip at fractional frames by another library than the one under test."""
+    """Return the clip at fractional frames `times`, interpolated by a library other than the tested one."""
     frames = np.arange(clip.frame_count)
     root = np.stack([np.interp(times, frames, axis) for axis in clip.root_translations.T.astype(float)], axis=1)
     joints = []
@@ -36,7 +36,7 @@ def played(clip: Clip, times: Floats) -> Clip:
 
 
 def moved(clip: Clip, heading_rad: float, x: float, z: float) -> Clip:
-    """Rotate the clip to the left about the origin, then shift it on the ground."""
+    """Return the clip rotated to the left about the origin, then shifted on the ground."""
     turn = Rotation.from_euler("y", heading_rad)
     poses = clip.poses.astype(float).copy()
     poses[:, :3] = turn.apply(poses[:, :3]) + np.array((x, 0.0, z))
@@ -45,13 +45,16 @@ def moved(clip: Clip, heading_rad: float, x: float, z: float) -> Clip:
 
 
 def sine_warp(source_frames: int, frames: int, depth: float = 0.06) -> Floats:
-    """Frames of a source at each frame of a motion of so many: rising from the first to the last, unevenly."""
+    """Return a warp (frames,): source frames that rise unevenly from the first to the last."""
     share = np.linspace(0.0, 1.0, frames)
     return (share + depth * np.sin(2.0 * np.pi * share)) * (source_frames - 1)
 
 
 def warped_walks(count: int = 6, seed: int = 3, frames: int = 60) -> tuple[list[SourceExample], dict[str, Floats]]:
-    """Examples of one walk, each with a warp of its own: frame of the walk at each frame of the example, by uid."""
+    """Return examples of one walk with different timing, and the warp of each by uid.
+
+    A warp is the frame of the walk at each frame of the example.
+    """
     random = np.random.default_rng(seed)
     base = walk(frames)
     examples, warps = [SourceExample("clip_a@1", "walk a", base)], {"clip_a@1": np.arange(frames, dtype=float)}

@@ -11,7 +11,7 @@ from pymotion.rotations import quat_np
 
 
 def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
-    """Compute joint positions (F, J, 3) in the file's unit and axes."""
+    """Return the joint positions (F, J, 3) of a BVH file, in the unit and the axes of the file."""
     loader = BVH()
     loader.load(str(path))
     rotations, positions, parents, *_ = loader.get_data()

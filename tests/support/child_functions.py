@@ -14,33 +14,33 @@ def echo(payload: bytes) -> bytes:
 
 
 def environment(_payload: bytes) -> bytes:
-    """Return all variables of the process."""
+    """Return all environment variables of the process."""
     return "\n".join(f"{name}={text}" for name, text in os.environ.items()).encode()
 
 
 def refuse(_payload: bytes) -> bytes:
-    """Refuse the payload."""
+    """Raise `InvalidProblem`, as a function does that refuses its input."""
     raise InvalidProblem("no walk", code="no-walk")
 
 
 def fail(_payload: bytes) -> bytes:
-    """Fail as a function with a mistake does."""
+    """Raise `KeyError`, as a function with a defect may do."""
     raise KeyError("walk")
 
 
 def eat(_payload: bytes) -> bytes:
-    """Fill the memory."""
+    """Allocate more memory than there is."""
     return b"x" * (1 << 40)
 
 
 def burn(_payload: bytes) -> bytes:
-    """Use the processor for ever."""
+    """Use the processor without end."""
     while True:
         pass
 
 
 def wait_for(payload: bytes) -> bytes:
-    """Note the number of the process in a file, and wait until a file beside it exists."""
+    """Write the process id to the file named by `payload`, and wait until the file with the ending `.go` exists."""
     noted = Path(payload.decode())
     noted.with_suffix(".part").write_text(str(os.getpid()))
     noted.with_suffix(".part").rename(noted)
@@ -50,20 +50,20 @@ def wait_for(payload: bytes) -> bytes:
 
 
 def wait_in_import(order: bytes) -> bytes:
-    """Wait as `wait_for` does; the file to import contains the path."""
+    """Wait as `wait_for` does; the content of the file to import is the path."""
     from marey_server.motions.reading import FileOrder  # which loads far more than the other functions need
 
     return wait_for(FileOrder.unpack(order).content)
 
 
 def stop(payload: bytes) -> bytes:
-    """Stop the whole process, which then neither answers nor ends."""
+    """Write the process id to the file named by `payload`, and suspend the process, which neither answers nor ends."""
     Path(payload.decode()).write_text(str(os.getpid()))
     os.kill(os.getpid(), signal.SIGSTOP)
     return b""
 
 
 def crash(_payload: bytes) -> bytes:
-    """End by a fault of native code."""
+    """End the process by a segmentation fault."""
     os.kill(os.getpid(), signal.SIGSEGV)
     return b""

@@ -32,7 +32,7 @@ class CommandLine:
     def __call__(
         self, *arguments: object, status: int = 0, stdin: str = "", **environment: str
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command in this process to its end; fail unless it exits with `status`."""
+        """Run a command in this process and return its output; fail if its exit status is not `status`."""
         words = list(map(str, arguments))
         with mock.patch.dict(os.environ, self._environment(environment), clear=True), contextlib.chdir(self.folder):
             done = run_here(words, stdin)
@@ -40,7 +40,7 @@ class CommandLine:
         return done
 
     def start(self, *arguments: object) -> subprocess.Popen[str]:
-        """Start a command in a process of its own, whose output can be read and which can be interrupted."""
+        """Start a command in a separate process, and return the process, whose output can be read."""
         return subprocess.Popen(
             [sys.executable, "-m", "marey_client.cli", *map(str, arguments)],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=self.folder, env=self._environment({}),
@@ -54,7 +54,7 @@ class CommandLine:
 
 
 def run_here(arguments: list[str], stdin: str = "") -> subprocess.CompletedProcess[str]:
-    """Run `marey` in this process, with streams like those of a pipe."""
+    """Run `marey` in this process and return its result; its output streams are like those of a pipe."""
     given, out, err = (io.TextIOWrapper(io.BytesIO(text), encoding="utf-8") for text in (stdin.encode(), b"", b""))
     streams = mock.patch.multiple(sys, argv=["marey", *arguments], stdin=given, stdout=out, stderr=err)
     status: object = 0
@@ -76,7 +76,7 @@ def _written(stream: io.TextIOWrapper) -> str:
 
 @contextlib.contextmanager
 def _logging_restored() -> Iterator[None]:
-    """Remove the handlers that `--verbose` adds."""
+    """Restore the handlers and the level of the log after the `with` block, since `--verbose` changes them."""
     root = logging.getLogger()
     handlers, level = list(root.handlers), root.level
     try:

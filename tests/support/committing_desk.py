@@ -33,15 +33,18 @@ class CommittingDesk:
         self.write(datasets.create_dataset, "lab", DatasetCreate(name=name, collection=collection))
 
     def read(self, function: Any, *args: Any, **kwargs: Any) -> Any:
-        """Run a read as the user of the desk."""
+        """Run a function that reads the database, as the user of the desk; return its result."""
         return self.desk.database.read(self.desk.user, requiring(WRITE, function), *args, **kwargs)
 
     def write(self, function: Any, *args: Any, who: Principal | None = None, **kwargs: Any) -> Any:
-        """Run a write as the user of the desk, or as `who`."""
+        """Run a function that writes to the database, as the user of the desk or as `who`; return its result."""
         return self.desk.database.write(who or self.desk.user, requiring(WRITE, function), *args, **kwargs)
 
     def submit(self, kind: str = "sum", to: str | None = None, **fields: Any) -> str:
-        """Submit a job that commits to `to`, by default to `main`; fields of the commit begin with `commit_`."""
+        """Submit a job that commits to the branch `to`, by default `main`; return its id.
+
+        Fields of the request for the commit are given with the prefix `commit_`.
+        """
         chosen = {name.removeprefix("commit_"): fields.pop(name) for name in list(fields) if name.startswith("commit_")}
         request = JobCreate(kind=kind, commit=OutputsCommit.at(to or self.name, **chosen), **fields)
         (made,) = self.desk.database.write(self.desk.user, requiring(JOBS, submission.submit), "lab", (request,))
@@ -49,7 +52,7 @@ class CommittingDesk:
         return job_id
 
     def work(self, *names: str, **fields: Any) -> Lease:
-        """Claim a job, and complete it with outputs of these names."""
+        """Claim a job, and complete it with outputs of these names; return its lease."""
         lease = self.desk.claim()
         if names:
             self.desk.stage(lease, *names, **fields)
@@ -57,11 +60,11 @@ class CommittingDesk:
         return lease
 
     def job(self, job_id: str) -> Job:
-        """Return a job."""
+        """Return the present state of the job with this id."""
         return self.desk.job(job_id)
 
     def head(self, branch: str = MAIN) -> str | None:
-        """Return the newest commit of a branch."""
+        """Return the digest of the newest commit of a branch, or None if it has none."""
         found: str | None = self.read(datasets.read_ref, "lab", self.name, branch).commit
         return found
 
@@ -71,7 +74,7 @@ class CommittingDesk:
         return {one.name for one in page.items}
 
     def commit(self, version: str = MAIN) -> Commit:
-        """Return a commit."""
+        """Return the commit that a version names."""
         found: Commit = self.read(datasets.read_commit, "lab", self.name, version)
         return found
 
@@ -81,12 +84,12 @@ class CommittingDesk:
         return list(page.items)
 
     def listed(self, version: str = MAIN) -> list[Entry]:
-        """Return the entries of a version."""
+        """Return the entries of a version, by path."""
         page = self.read(datasets.list_entries, "lab", self.name, version, path="", cursor=None, limit=1000)
         return list(page.items)
 
     def entries(self, version: str = MAIN) -> dict[str, str | None]:
-        """Return the items of a version by path."""
+        """Return the id of the item of each entry of a version, by path; None for an entry without item."""
         return {one.path: one.item for one in self.listed(version)}
 
     def put(self, path: str, *, number: int, branch: str = MAIN) -> str:
@@ -96,7 +99,7 @@ class CommittingDesk:
         return made.item
 
     def change(self, *changes: Any, branch: str = MAIN) -> Commit:
-        """Commit changes as a person."""
+        """Commit changes to `main` as a user, not as a job; return the commit."""
         request = CommitCreate(branch=branch, message="by hand", changes=changes)
         prepared = self.read(datasets.prepare_commit, "lab", self.name, request)
         made: Commit = self.write(datasets.record_commit, "lab", self.name, prepared)
@@ -105,5 +108,5 @@ class CommittingDesk:
 
 @pytest.fixture
 def gaits(desk: Desk) -> CommittingDesk:
-    """A fresh project with a queue and the dataset `gaits`."""
+    """A new project with a queue and the dataset `gaits`."""
     return CommittingDesk(desk)

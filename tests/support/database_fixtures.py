@@ -37,7 +37,7 @@ WHERE schemaname = 'public' AND last_value IS NOT NULL
 
 
 class AdjustableClock:
-    """Running clock that a test can set forward."""
+    """Clock that shows the time of this machine plus the time by which a test has advanced it."""
 
     def __init__(self) -> None:
         self._ahead_us = 0
@@ -46,7 +46,7 @@ class AdjustableClock:
         return time.time_ns() // 1000 + self._ahead_us
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock at once."""
+        """Set the clock forward by some seconds."""
         self._ahead_us += round(seconds * 1_000_000)
 
 
@@ -59,7 +59,7 @@ def _administer(url: URL, *statements: str) -> None:
 
 @pytest.fixture(scope="session")
 def postgres_url() -> Iterator[URL]:
-    """A Postgres server in which databases may be created."""
+    """The address of a Postgres server on which tests may create databases."""
     given = os.environ.get(URL_VARIABLE)
     if given:
         yield make_url(given).set(drivername="postgresql+psycopg")
@@ -80,7 +80,7 @@ def postgres_url() -> Iterator[URL]:
 
 @contextlib.contextmanager
 def new_postgres_database(server: URL, purpose: str) -> Iterator[URL]:
-    """Create a Postgres database with the newest schema, and drop it after the block."""
+    """Create a Postgres database with the newest schema, yield its address, and drop it after the `with` block."""
     name = f"marey_{purpose}_{os.getpid()}"
     _administer(server, f"CREATE DATABASE {name} TEMPLATE template0 ENCODING 'UTF8'")
     url = server.set(database=name)
@@ -121,7 +121,7 @@ class SharedPostgres:
 
 @pytest.fixture(scope="session")
 def shared_postgres(postgres_url: URL) -> Iterator[SharedPostgres]:
-    """The Postgres database of this process."""
+    """The Postgres database that all tests of this process share."""
     with new_postgres_database(postgres_url, "tests") as url:
         shared = SharedPostgres(url)
         yield shared
@@ -155,19 +155,19 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 def database_address(url: URL) -> str:
-    """Return the whole address, password included."""
+    """Return the address of a database as text, including the password."""
     return url.render_as_string(hide_password=False)
 
 
 @pytest.fixture
 def clock() -> AdjustableClock:
-    """The clock of `database`."""
+    """The clock that `database` uses."""
     return AdjustableClock()
 
 
 @pytest.fixture
 def open_database(database_url: str, clock: AdjustableClock) -> Iterator[Callable[[], Database]]:
-    """Opens the same fresh database again, as another server process would."""
+    """Function that opens the same new database again, as another server process would."""
     opened: list[Database] = []
 
     def open_one() -> Database:
@@ -181,5 +181,5 @@ def open_database(database_url: str, clock: AdjustableClock) -> Iterator[Callabl
 
 @pytest.fixture
 def database(open_database: Callable[[], Database]) -> Database:
-    """A fresh database with the newest schema, on SQLite and on Postgres."""
+    """A new database with the newest schema, on SQLite and on Postgres."""
     return open_database()

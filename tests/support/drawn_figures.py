@@ -16,7 +16,10 @@ from marey_reports.drawing.drawn import DrawnFigure
 
 
 def is_sound(figure: DrawnFigure) -> DrawnFigure:
-    """Check that both pictures are readable, the columns of each table equally long, and the caption not empty."""
+    """Check that both pictures can be read, columns of a table are equally long, and the caption is not empty.
+
+    Returns the figure.
+    """
     assert imread(io.BytesIO(figure.png)).shape[0] > 100
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
     assert figure.caption.endswith(".")
@@ -33,7 +36,7 @@ def rows_of(figure: DrawnFigure, table: str) -> list[Any]:
 
 
 def cut_off(figure: Figure) -> list[Any]:
-    """List the texts of a matplotlib page that extend beyond its borders."""
+    """Return the texts of a matplotlib page that extend beyond its borders."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     page = figure.bbox.padded(1.0)
@@ -44,7 +47,7 @@ def cut_off(figure: Figure) -> list[Any]:
 
 
 def _labels_beyond(axes: Axes) -> Iterator[Any]:
-    """List the labels of ticks outside the limits of their axis, which are not drawn."""
+    """Yield the labels of ticks that lie outside the limits of their axis, which are not drawn."""
     for axis in (axes.xaxis, axes.yaxis):
         low, high = sorted(axis.get_view_interval())
         for tick in axis.get_major_ticks():

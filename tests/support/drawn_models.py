@@ -29,13 +29,13 @@ def trained_on(aligned: AlignedSet, options: ModelOptions = QUICK) -> tuple[Trai
 
 
 def figures_of(subject: ModelSubject) -> dict[str, DrawnFigure]:
-    """Draw every figure of a model and of its examples."""
+    """Return every figure of a model and of the alignment of its examples, by name."""
     return {**draw_alignment_figures(subject.examples), **draw_model_figures(subject)}
 
 
 @functools.cache
 def model_of_walks() -> tuple[TrainedPrimitive, ModelSubject]:
-    """Return the model of the usual walks."""
+    """Return a model that was trained on generated walks."""
     return trained_on(walks())
 
 

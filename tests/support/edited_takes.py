@@ -66,6 +66,6 @@ def require_sound(clip: Clip) -> None:
 
 
 def largest_step(clip: Clip) -> float:
-    """Compute the largest distance that a joint moves between consecutive frames, metres."""
+    """Return the largest distance in metres by which a joint moves between consecutive frames."""
     steps = np.linalg.norm(np.diff(global_positions(clip).astype(np.float64), axis=0), axis=-1)
     return float(steps.max())

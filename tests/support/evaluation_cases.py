@@ -72,7 +72,7 @@ def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -
 
 
 def clips_of(*frame_counts: int, loop: bool = False) -> tuple[DatabaseClip, ...]:
-    """Return clips a, b, c… with consecutive rows."""
+    """Return clips `a`, `b`, `c` and so on with these numbers of frames, whose rows follow one another."""
     stops = np.cumsum(frame_counts).tolist()
     return tuple(
         DatabaseClip(chr(97 + index), f"clip {index}", "", stop - frames, stop, loop)
@@ -107,7 +107,7 @@ def trajectory_database(*roots: tuple[NDArray[np.float64], NDArray[np.float64]])
 def _futures(
     positions: NDArray[np.float64], headings: NDArray[np.float64], ahead: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Compute positions, then directions, (F, 12) at each horizon in the frame of each row."""
+    """Return positions, then directions, (F, 12) at each future time, relative to the root of each row."""
     frames = len(headings)
     later = np.minimum(np.arange(frames)[:, None] + ahead, frames - 1)
     step = positions[later] - positions[:, None]

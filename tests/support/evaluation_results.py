@@ -63,7 +63,7 @@ def evaluated(
     records: tuple[Any, ...],
     coverage: Coverage,
 ) -> EvaluationResult:
-    """Measure records and assemble an evaluation."""
+    """Return the evaluation of trials, computed from their records."""
     outcomes = tuple(
         measure_trial(trial, reference(trial, RATE_HZ), record, options)
         for trial, record in zip(trials, records, strict=True)

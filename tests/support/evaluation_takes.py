@@ -11,7 +11,7 @@ TURN_RATES_DEG_S = (-60.0, 0.0, 60.0)
 
 
 def write_walks(folder: Path, seconds: float = 6.0) -> Path:
-    """Nine walks of one skeleton, straight ahead and turning both ways, as BVH."""
+    """Write nine walks of one skeleton as BVH files, straight ahead and turning both ways; return their folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for speed in SPEEDS_M_S:
         for turn_rate in TURN_RATES_DEG_S:

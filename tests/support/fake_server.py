@@ -23,7 +23,7 @@ BLOB = re.compile(r"/api/v1/blobs/(sha256:[0-9a-f]{64})")
 
 @dataclass(frozen=True, kw_only=True)
 class FakeJob:
-    """A job that waits for a worker."""
+    """Job of the fake server, with the values of its lease."""
 
     name: str
     kind: str
@@ -36,7 +36,7 @@ class FakeJob:
     size: int | None = None
 
     def lease(self, fence: int) -> dict[str, Any]:
-        """Return the lease as the server sends it."""
+        """Return the lease of this job in the form in which the server sends it."""
         limits = {"time_limit_s": self.time_limit_s, "memory_limit_mb": self.memory_limit_mb}
         return {
             "job": self.name, "project": "lab", "kind": self.kind, "params": self.params, "inputs": {}, "into": "out",

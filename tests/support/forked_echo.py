@@ -16,7 +16,7 @@ LOADED = os.getpid()
 
 
 def answer(pipe: Connection) -> None:
-    """Answer messages until the pipe closes."""
+    """Answer each message with process ids, until the pipe closes; the messages `fail` and `exit N` end the process."""
     while True:
         try:
             message = pipe.recv_bytes()
@@ -30,7 +30,7 @@ def answer(pipe: Connection) -> None:
 
 
 def refuse() -> int:
-    """Fail as `os.fork` does if the system has no memory left."""
+    """Raise `BlockingIOError`, as `os.fork` does if the system has no memory left."""
     raise BlockingIOError(errno.EAGAIN, "no memory is left")
 
 

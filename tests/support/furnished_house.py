@@ -176,7 +176,7 @@ class House:
 
 
 def build_house(people: People) -> House:
-    """Furnish a server: users, the project `lab`, its contents, and jobs of which one runs and one has ended."""
+    """Fill a server with users, the project `lab`, items, and jobs, of which one is running and one has ended."""
     tokens = _tokens_of_users(people)
     owner, contributor = people.client(tokens["owner"]), people.client(tokens["contributor"])
     variables = _furnish(owner)

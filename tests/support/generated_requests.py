@@ -47,7 +47,7 @@ AnyCase = Case[Any]
 
 @dataclass(frozen=True)
 class FuzzedServer:
-    """A furnished server, and checks of its answers."""
+    """Server with users, a project and jobs, and checks of its answers."""
 
     house: House
 
@@ -91,7 +91,7 @@ def _requested_wait_s(case: AnyCase) -> float:
 
 @contextlib.contextmanager
 def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
-    """Serve a private project to all kinds of callers until the block ends."""
+    """Run a server with a private project and users of all kinds until the `with` block ends."""
     with running(database, folder, login_tries_per_minute=1_000_000) as server:
         house = build_house(server)
         server.make_user("fred")
@@ -101,7 +101,7 @@ def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
 
 @functools.cache
 def operations() -> list[AnyOperation]:
-    """Return every operation of the document."""
+    """Return every operation of the OpenAPI document."""
     document = build_document(RouteTable(None, RESOURCES), version("marey"))
     schema = schemathesis.openapi.from_dict(document, config=schemathesis.config.SchemathesisConfig())
     results: Any = schema.get_all_operations()
@@ -117,7 +117,7 @@ def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
 
 
 def generate(requests: Any, number: int, of_seed: int, send: Callable[[AnyCase], object]) -> None:
-    """Call `send` with a number of generated requests."""
+    """Generate `number` requests, and call `send` with each."""
 
     @seed(of_seed)
     @settings(

@@ -48,7 +48,7 @@ class Manner(StrEnum):
 
 @dataclass(frozen=True)
 class Shape:
-    """Body and headers of an attack."""
+    """Body and headers of a request that attacks the server."""
 
     content: bytes
     headers: dict[str, str] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class Shot:
 
     @property
     def label(self) -> str:
-        """Route, caller and attack."""
+        """The route, the caller and the attack, as text."""
         return f"{self.route} as {self.person}: {self.attack}"
 
 
@@ -87,7 +87,7 @@ class Outcome:
 
     @property
     def fault(self) -> str | None:
-        """What is wrong with the answer, or None."""
+        """Description of what is wrong with the answer, or None."""
         if self.hangs:
             return f"{self.shot.label}: no answer after {HANGS_S:g} s"
         if self.status is None or self.status < 500:
@@ -218,7 +218,7 @@ def some(every: list[Shot], count: int, seed: int) -> list[Shot]:
 
 
 async def fire(address: str, shot: Shot) -> Outcome:
-    """Send a shot and return its outcome."""
+    """Send an attacking request, and return its outcome."""
     start = time.monotonic()
     try:
         async with asyncio.timeout(HANGS_S):
@@ -263,7 +263,7 @@ async def _send(writer: asyncio.StreamWriter, shot: Shot) -> None:
 
 
 async def _read(reader: asyncio.StreamReader) -> str:
-    """Read the whole answer and return its head."""
+    """Read the whole answer, and return its head."""
     head = b""
     with contextlib.suppress(ConnectionError):
         with contextlib.suppress(asyncio.IncompleteReadError, asyncio.LimitOverrunError):
@@ -274,7 +274,7 @@ async def _read(reader: asyncio.StreamReader) -> str:
 
 
 async def fire_all(address: str, every: Iterable[Shot], at_once: int) -> list[Outcome]:
-    """Fire shots over a number of connections at the same time."""
+    """Send attacking requests over `at_once` connections at the same time; return their outcomes."""
     waiting = iter(every)
     outcomes: list[Outcome] = []
 

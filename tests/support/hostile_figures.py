@@ -84,7 +84,7 @@ class Companion:
                 self._refused.append(status)
 
     def line(self) -> str:
-        """Return the figures as a line."""
+        """Return the measured waiting times as one line of text."""
         waits_ms = sorted(1e3 * wait for wait in self._waits_s) or [0.0]
         p99 = waits_ms[min(len(waits_ms) - 1, round(0.99 * len(waits_ms)))]
         return (
@@ -187,7 +187,7 @@ def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float, nic
 
 @contextlib.contextmanager
 def measuring(name: str, companions: Sequence[Companion], cost: ProcessCost) -> Iterator[None]:
-    """Print what the companions wait inside the block, and what the server takes."""
+    """Print the waiting times of the companions during the `with` block, and the memory of the server."""
     cost.reset_peak()
     start, processor = time.monotonic(), cost.processor_s()
     with companions[0], companions[1], companions[2]:
@@ -201,7 +201,7 @@ def measuring(name: str, companions: Sequence[Companion], cost: ProcessCost) -> 
 
 
 def main() -> None:
-    """Run the measurements."""
+    """Run all measurements, and print their results."""
     parser = argparse.ArgumentParser(prog="python -m tests.support.hostile_figures")
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--shots", type=int, default=1_000)

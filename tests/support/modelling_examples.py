@@ -23,7 +23,7 @@ def chain(joints: int = 4) -> Skeleton:
 
 
 def unit_poses(poses: Floats) -> Floats:
-    """Poses (..., 3 + 4·J) with quaternions of unit length."""
+    """Return poses (..., 3 + 4·J) with their quaternions scaled to unit length."""
     rotations = poses[..., 3:].reshape(*poses.shape[:-1], -1, 4)
     rotations = rotations / np.linalg.norm(rotations, axis=-1, keepdims=True)
     return np.concatenate((poses[..., :3], rotations.reshape(*poses.shape[:-1], -1)), axis=-1)
@@ -37,7 +37,7 @@ def as_motion(poses: Floats) -> Motion:
 def aligned_set(
     skeleton: Skeleton, poses: Floats, time_functions: Floats | None = None, keyframes: dict[str, int] | None = None
 ) -> AlignedSet:
-    """A set of examples with poses (m, N, 3 + 4·J) and time functions (m, N), by default the identity."""
+    """Return a set of examples with these poses (m, N, 3 + 4·J) and time functions (m, N), by default the identity."""
     clips = []
     for index, one in enumerate(poses):
         times = np.arange(len(one), dtype=float) if time_functions is None else time_functions[index]
@@ -69,7 +69,7 @@ def bending_chains(count: int = 20, frames: int = 30, seed: int = 0, joints: int
 
 
 def walks(count: int = 16, frames: int = 40, seed: int = 0) -> AlignedSet:
-    """Generated walks of many speeds and turn rates, which begin in the same phase."""
+    """Return a set of generated walks of many speeds and turn rates, which begin in the same phase."""
     random = np.random.default_rng(seed)
     clips = [generate_gait(0.9 + 0.7 * random.random(), 0.3 * random.standard_normal(), 1.0) for _ in range(count)]
     poses = np.stack([Motion.of(clip).at_frames(np.arange(frames)).poses for clip in clips])

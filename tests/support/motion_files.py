@@ -26,7 +26,7 @@ ROOT Hips
 
 
 def rows_of(values: Sequence[Sequence[float]]) -> list[str]:
-    """Lines of numbers as files write them."""
+    """Return rows of numbers as lines of text, with six decimals."""
     return [" ".join(f"{value:.6f}" for value in row) for row in values]
 
 

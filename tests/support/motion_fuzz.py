@@ -43,7 +43,7 @@ class TooSlow(BaseException):
 
 @functools.cache
 def seeds() -> tuple[Seed, ...]:
-    """(name, file, companion) of one good file per format and form."""
+    """Return one valid file for each format and form: (name, file, companion)."""
     clip = generate_gait(1.2, 0.0, 0.2, 30.0)
     skeleton = write_predecessor_skeleton(clip.skeleton)
     six = f"{POSITIONS} {ZXY}"

@@ -28,7 +28,10 @@ class PlainRun:
 
 
 def run_plainly(database: MatchingDatabase, path: Reference, options: ControllerOptions, ticks: int) -> PlainRun:
-    """Follow `path` in the mode "time" or "open_loop" for so many ticks, with plain loops over all rows."""
+    """Follow `path` for `ticks` ticks, with plain loops over all rows; return the record of the ticks.
+
+    The mode of the controller is "time" or "open_loop".
+    """
     normalised = (database.features - database.normaliser.offset) / database.normaliser.scale
     points = database.root_positions[:, 1] + 1j * database.root_positions[:, 0]
     angles = database.root_headings

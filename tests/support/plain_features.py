@@ -23,7 +23,7 @@ class PlainRows(NamedTuple):
 
 
 def joints_in_the_world(clip: Clip) -> np.ndarray:
-    """Compute joint positions (F, J, 3) by descending the hierarchy in every frame."""
+    """Return joint positions (F, J, 3), computed down the hierarchy frame by frame."""
     skeleton = clip.skeleton
     places = np.zeros((clip.frame_count, skeleton.joint_count, 3))
     for frame in range(clip.frame_count):

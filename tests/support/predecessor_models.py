@@ -26,7 +26,7 @@ def knots(coefficients: int) -> list[float]:
 
 
 def space(generator: Generator, joints: tuple[str, ...]) -> tuple[list[float], list[list[float]]]:
-    """Mean and components of a walk ahead with small turns of the joints, centimetres."""
+    """Return the mean and the components of a straight walk with small rotations of the joints, in centimetres."""
     channels = 3 + 4 * len(joints)
     mean = np.zeros((COEFFICIENTS, channels))
     mean[:, 2] = np.linspace(0.0, 130.0, COEFFICIENTS)
@@ -38,7 +38,7 @@ def space(generator: Generator, joints: tuple[str, ...]) -> tuple[list[float], l
 
 
 def time(generator: Generator) -> tuple[list[float], list[list[float]]]:
-    """Logarithms of the steps between coefficients, and components of them, one in each row."""
+    """Return the mean and the components of the logarithms of time steps, with one component in each row."""
     steps = np.diff(np.linspace(0.0, FRAMES - 1.0, TIME_COEFFICIENTS) + 1.0, prepend=0.0)
     mean = np.log(steps) + generator.normal(scale=0.05, size=TIME_COEFFICIENTS)
     mean[0] = 0.0
@@ -130,7 +130,7 @@ LAYOUTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def tree(generator: Any = None) -> dict[str, Any]:
-    """A cluster tree over 40 samples: four branches, single samples at the ends."""
+    """Return a cluster tree over 40 samples in which each node has up to four children, and each leaf one sample."""
     generator = generator or np.random.default_rng(7)
     data = generator.normal(size=(40, SPATIAL + TEMPORAL))
 
@@ -151,7 +151,7 @@ FILE, TREE_FILE = f"sha256:{'1' * 64}", f"sha256:{'2' * 64}"
 
 
 def imported() -> tuple[Mapping[str, Any], dict[str, Any]]:
-    """The parts of a model with its tree that two files become, and the hierarchy of the skeleton."""
+    """Import a model with its tree from two files; return the parts of the model and the hierarchy of its skeleton."""
     planned, companion = plan_imports(["in/walk_mm.json", "in/walk_cluster_tree.json"])
     assert (planned.companion, companion.role) == ("in/walk_cluster_tree.json", "companion")
     data, beside = (json.dumps(one).encode() for one in (layout_3(), tree()))

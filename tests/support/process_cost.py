@@ -32,7 +32,7 @@ class ProcessCost:
         return sum(self._status_kb(pid, "VmHWM") for pid in self._family()) / 1e3
 
     def resident_mb(self) -> float:
-        """Return the resident memory in MB."""
+        """Return the resident memory of the process in MB."""
         return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
 
     def own_peak_mb(self) -> float:
@@ -40,7 +40,7 @@ class ProcessCost:
         return self._status_kb(self.pid, "VmHWM") / 1e3
 
     def reset_peak(self) -> None:
-        """Start to measure the peak of memory again."""
+        """Start to measure the peak of the memory from the present value."""
         for pid in self._family():
             with contextlib.suppress(OSError):
                 Path(f"/proc/{pid}/clear_refs").write_text("5")

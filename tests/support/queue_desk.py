@@ -39,7 +39,7 @@ from marey_server.store.transaction import Transaction
 
 
 class Params(Request):
-    """Parameters of the kinds below."""
+    """Parameters of the kinds of jobs that the tests of the queue declare."""
 
     number: int = 0
 
@@ -107,7 +107,7 @@ KINDS = {kind.name: kind for kind in (*job_kinds.BUILT_IN, ERRAND, SUM, SQUARE, 
 
 @dataclass
 class Desk:
-    """Submitter and worker in the project `lab`."""
+    """User who submits jobs to the project `lab` and also runs them."""
 
     database: Database
     clock: AdjustableClock
@@ -117,14 +117,14 @@ class Desk:
     _write_ids: Iterator[int] = field(default_factory=itertools.count)
 
     def open(self) -> None:
-        """Make the user `ann` and her project."""
+        """Create the user `ann` and her project."""
         made = self.database.write(SYSTEM, users.create_user, UserCreate(name="ann"))
         scopes = ("read", "write", "jobs", "work")
         self.user = Principal("user", made.id, "ann", scopes=scopes, token_id="token_ann", token_key=b"of ann")
         self.database.write(self.user, projects.create_project, ProjectCreate(name=self.project))
 
     def replaced_token(self) -> Principal:
-        """Return the user with another token."""
+        """Return the user with another token, as after a rotation."""
         return replace(self.user, token_id="token_new", token_key=b"another secret")
 
     # -- submitting ----------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ class Desk:
         return self.submit_many(JobCreate(kind=kind, **fields))[0]
 
     def submit_many(self, *requests: JobCreate) -> list[str]:
-        """Submit jobs at once; return their ids."""
+        """Submit jobs in one request, and return their ids."""
         made = self.database.write(self.user, submission.submit, self.project, requests)
         return [job.id for job in made]
 
@@ -143,11 +143,11 @@ class Desk:
         return self.database.read(self.user, reading.read_job, job_id)
 
     def state(self, job_id: str) -> str:
-        """Return the state of a job."""
+        """Return the present state of a job."""
         return self.job(job_id).state.value
 
     def cancel(self, job_id: str) -> Job:
-        """Cancel a job."""
+        """Cancel a job, and return it."""
         return self.database.write(self.user, reading.cancel_job, job_id, self.policy)
 
     def outputs(self, job_id: str) -> list[Any]:
@@ -155,14 +155,14 @@ class Desk:
         return list(self.database.read(self.user, reading.list_outputs, job_id).items)
 
     def things(self, count: int, collection: str = "raw") -> list[str]:
-        """Create items to work on; return their ids."""
+        """Create `count` items that can be inputs of jobs, and return their ids."""
         drafts = [
             Draft(f"thing{n}", Kind.STUDY, f"thing{n}", {"study": document(number=n)}, collection) for n in range(count)
         ]
         return [one.item for one in self.publish(*drafts)]
 
     def publish(self, *drafts: Draft) -> list[Published]:
-        """Publish drafts, as a person would."""
+        """Publish drafts as a user, not as a job."""
 
         def act(tx: Transaction) -> list[Published]:
             return publish(tx, projects.require(tx, self.project), drafts, author_id=self.user.user_id)
@@ -172,12 +172,12 @@ class Desk:
     # -- working -------------------------------------------------------------------------------------------------------
 
     def claim_many(self, count: int = 256, kinds: tuple[str, ...] = tuple(KINDS), **fields: Any) -> list[Lease]:
-        """Claim jobs as the worker `w`."""
+        """Claim up to `count` jobs as the worker `w`, and return their leases."""
         request = ClaimRequest(worker="w", kinds=kinds, max=count, **fields)
         return self.database.write(self.user, queue.claim, request, self.policy)
 
     def claim(self, **fields: Any) -> Lease:
-        """Claim one job that must be there."""
+        """Claim one job, and return its lease; fail if there is none."""
         (lease,) = self.claim_many(1, **fields)
         return lease
 
@@ -186,38 +186,38 @@ class Desk:
         return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
 
     def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
-        """Send a heartbeat."""
+        """Send a heartbeat, and return the answer."""
         return self.database.write(
             _as_attempt(lease), queue.heartbeat, lease.job, lease.fence, Heartbeat(progress=progress), self.policy
         )
 
     def stage(self, lease: Lease, *names: str, **fields: Any) -> int:
-        """Stage a small document under each name."""
+        """Stage a small document under each name; return the number of outputs that the attempt has staged."""
         return self.stage_outputs(lease, *(output(name, **fields) for name in names))
 
     def stage_outputs(self, lease: Lease, *staged: StagedOutput) -> int:
-        """Stage results."""
+        """Stage outputs; return the number of outputs that the attempt has staged."""
         outputs = [staging.prepare_output(one) for one in staged]
         return self.database.write(self._attempt_of(lease), staging.stage, lease.job, lease.fence, outputs)
 
     def complete(self, lease: Lease, *, write_id: str | None = None, **fields: Any) -> CompleteAnswer:
-        """Complete the attempt."""
+        """Complete the attempt, and return the answer."""
         request = CompleteRequest(write_id=write_id or self.write_id(), **fields)
         return self.database.write(self._attempt_of(lease), completion.complete, lease.job, lease.fence, request)
 
     def fail(self, lease: Lease, code: str = "broken", *, write_id: str | None = None, **fields: Any) -> FailAnswer:
-        """End the attempt without success."""
+        """End the attempt without success, and return the answer."""
         request = FailRequest(write_id=write_id or self.write_id(), code=code, **fields)
         return self.database.write(
             self._attempt_of(lease), completion.fail, lease.job, lease.fence, request, self.policy
         )
 
     def reap(self) -> int:
-        """Reclaim overdue jobs."""
+        """Reclaim the jobs whose leases have expired; return their number."""
         return self.database.write(SYSTEM, reap_page, self.policy).taken
 
     def write_id(self) -> str:
-        """Return a new one."""
+        """Return a new write id."""
         return f"write-{next(self._write_ids):06}"
 
     def _attempt_of(self, lease: Lease) -> Principal:
@@ -238,7 +238,7 @@ def _as_attempt(lease: Lease) -> Principal:
 
 
 def document(**facts: Any) -> dict[str, Any]:
-    """Return a small open document."""
+    """Return a small document with these members, whose schema allows any member."""
     return {"schema": "marey/document@1", **facts}
 
 
@@ -258,7 +258,7 @@ def test_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def desk(database: Database, clock: AdjustableClock, test_kinds: None) -> Desk:
-    """A fresh project with a queue, on SQLite and on Postgres."""
+    """A new project with a queue, on SQLite and on Postgres."""
     opened = Desk(database, clock)
     opened.open()
     return opened

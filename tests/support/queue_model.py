@@ -13,7 +13,7 @@ TERMINAL = ("succeeded", "failed", "cancelled")
 
 @dataclass
 class ModelJob:
-    """State of one job."""
+    """Expected state of one job."""
 
     id: str
     priority: int
@@ -87,7 +87,7 @@ class ModelQueue:
         job.started = True
 
     def heartbeat(self, job_id: str, now_us: int) -> None:
-        """Extend a lease that is held."""
+        """Extend the lease of a running job."""
         self.write(job_id)
         self.renew(job_id, now_us)
 
@@ -142,7 +142,7 @@ class ModelQueue:
         return "queued"
 
     def reap(self, now_us: int) -> None:
-        """Reclaim overdue jobs."""
+        """Reclaim the jobs whose leases have expired."""
         for job in list(self.jobs.values()):
             if job.state != "running" or job.lease_expires_us > now_us:
                 continue

@@ -62,7 +62,7 @@ class Page(HTMLParser):
 
 
 def is_sound(source: str) -> Page:
-    """Check that tags are balanced, ids unique, no resources loaded, and no scripts but the page's own."""
+    """Check a page and return it: tags are balanced, ids are unique, and there are no external resources or scripts."""
     page = Page(source)
     assert set(page.ids.values()) == {1}
     for link in page.links:

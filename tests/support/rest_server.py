@@ -40,14 +40,14 @@ class People:
         return f"{self.address}/api/v1"
 
     def client(self, token: str | None = None) -> httpx.Client:
-        """Return a client that shows `token`."""
+        """Return a client that sends `token` with each request."""
         if token not in self._clients:
             headers = {"Authorization": f"Bearer {token}"} if token else {}
             self._clients[token] = httpx.Client(base_url=self.api, headers=headers, timeout=PATIENCE_S)
         return self._clients[token]
 
     def make_user(self, name: str, *, administrator: bool = False, scopes: tuple[str, ...] = USER_SCOPES) -> str:
-        """Create a user with a token; return both."""
+        """Create a user, and return a token of this user."""
         made = self.database.write(SYSTEM, users.create_user, UserCreate(name=name, administrator=administrator))
         return self.make_token(made.id, name, administrator=administrator, scopes=scopes)
 
@@ -85,7 +85,7 @@ class SharedChildren(Children):
     """Child processes that all servers of a test run use, because starting them takes long; they are never closed."""
 
     def close(self) -> None:
-        """Leave the children to the next server."""
+        """Do nothing, so that the next server can use the child processes, too."""
 
 
 @functools.cache
@@ -96,7 +96,7 @@ def shared_children() -> SharedChildren:
 
 @contextlib.contextmanager
 def running(database: Database, folder: Path, **settings: Any) -> Iterator[Server]:
-    """Serve a database until the block ends."""
+    """Run a server with a database until the `with` block ends."""
     started: dict[str, Any] = {}
     ready = threading.Event()
 
@@ -136,5 +136,5 @@ def server(database: Database, tmp_path: Path) -> Iterator[Server]:
 
 @pytest.fixture
 def owner(server: Server) -> httpx.Client:
-    """The owner of the project `lab`."""
+    """The client of the owner of the project `lab`."""
     return server.client(server.make_project())

@@ -35,7 +35,7 @@ class ScriptedServer:
         self.waited: list[float] = []
 
     def __call__(self, request: httpx.Request) -> httpx.Response:
-        """Answer a request with the next prepared answer."""
+        """Record the request, and return the next prepared answer, or raise it if it is an error."""
         request.read()
         self.requests.append(request)
         answer = self.answers.pop(0)

@@ -18,7 +18,7 @@ RATE_HZ = 30.0
 
 
 def functions(basis: SplineBasis, examples: Floats, count: int) -> tuple[FunctionalComponents, Floats]:
-    """Principal functions of examples (m, N, D), with scores of unit variance, and the scores (m, count)."""
+    """Return principal functions of examples (m, N, D), scaled to scores of unit variance, and the scores."""
     coefficients = basis.fit(examples)
     mean = coefficients.mean(axis=0)
     flat = (coefficients - mean).reshape(len(examples), -1)
@@ -38,14 +38,14 @@ def functions(basis: SplineBasis, examples: Floats, count: int) -> tuple[Functio
 
 
 def walk_poses(speed_m_s: float, turn_rate_rad_s: float) -> tuple[Skeleton, Floats]:
-    """A second of walking in canonical time: generated, of FRAMES frames, continuous in sign."""
+    """Return the skeleton and the poses of a generated walk of FRAMES frames, with quaternions continuous in sign."""
     clip = generate_gait(speed_m_s, turn_rate_rad_s, FRAMES / RATE_HZ + 0.5, RATE_HZ)
     return clip.skeleton, Motion.of(clip).poses[:FRAMES]
 
 
 @cache
 def walking(components: int = 6, mixtures: int = 2) -> tuple[MotionPrimitive, Floats]:
-    """Walks that differ in speed and turn rate; also their poses (m, N, D) and time functions (m, N)."""
+    """Return a model of walks that differ in speed and turn rate, and the latent vectors (m, L) of its examples."""
     rng = np.random.default_rng(5)
     speeds, turns = rng.uniform(0.8, 1.6, 40), rng.uniform(-0.6, 0.6, 40)
     made = [walk_poses(speed, turn) for speed, turn in zip(speeds, turns, strict=True)]
@@ -68,7 +68,7 @@ def walking(components: int = 6, mixtures: int = 2) -> tuple[MotionPrimitive, Fl
 
 
 def mixture_of(latents: Floats, count: int) -> LatentMixture:
-    """A mixture about the first `count` parts of the latent vectors."""
+    """Return a mixture of `count` Gaussians, one for each group of latent vectors with similar first numbers."""
     parts = np.array_split(latents[np.argsort(latents[:, 0], kind="stable")], count)
     floor = 0.05 * np.eye(latents.shape[1])
     return LatentMixture(
@@ -80,13 +80,16 @@ def mixture_of(latents: Floats, count: int) -> LatentMixture:
 
 @cache
 def standard_joints() -> dict[str, int]:
-    """Joint index by standard name, of the walking skeleton."""
+    """Return the joint index by standard name, for the skeleton of the walks."""
     skeleton = walking()[0].skeleton
     return {name: skeleton.index_of(joint) for name, joint in map_joints(skeleton).joints.items()}
 
 
 def sliding(dimensions: int = 2, frames: int = 9, rate_hz: float = 30.0) -> MotionPrimitive:
-    """A single joint whose root slides: positions are linear in the scores, one axis each, with one Gaussian."""
+    """Return a model of a single joint that slides: each score moves it along one axis.
+
+    The mixture has one Gaussian.
+    """
     skeleton = Skeleton(("root",), np.array([-1]), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     basis = SplineBasis.clamped(frames, 5)
     mean = np.zeros((5, 7))

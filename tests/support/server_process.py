@@ -57,12 +57,12 @@ class MareyProcess:
         self.process.wait(30)
 
     def wait_until_dead(self, seconds: float = 60) -> int:
-        """Wait until the process has ended by itself."""
+        """Wait until the process has ended without a signal from the test; return its exit status."""
         assert self.process is not None
         return self.process.wait(seconds)
 
     def stop(self) -> int | None:
-        """Stop the server with SIGTERM if it is running."""
+        """Stop the server with SIGTERM if it is running; return the exit status, or None if it was never started."""
         if self.process is None:
             return None
         if self.process.poll() is None:
@@ -90,7 +90,7 @@ class ServerProcess(MareyProcess):
             self.environment["MAREY_DATABASE_URL"] = database_url
 
     def start(self, *, workers: int = 0, fault: str | None = None) -> Self:
-        """Start the server, and wait until it is ready."""
+        """Start the server, wait until it is ready, and return this object."""
         environment = self.environment | ({"MAREY_FAULT": fault} if fault else {})
         self.spawn(["marey_client.cli", "serve", "--workers", str(workers)], environment)
         assert self.process is not None
@@ -106,7 +106,7 @@ class ServerProcess(MareyProcess):
 
     @property
     def token(self) -> str:
-        """Token of the first administrator."""
+        """The token of the first administrator."""
         return (self.data / "admin.token").read_text().strip()
 
     def client(self, *, patient: bool = True, port: int | None = None) -> Marey:
@@ -125,7 +125,10 @@ class WorkerProcess(MareyProcess):
     """`python -m marey_worker`, started separately, so that it outlives the server."""
 
     def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
-        """Start the worker, which finds the server by itself."""
+        """Start the worker, and return this object.
+
+        The worker connects to the server without further help of the test.
+        """
         environment = {"MAREY_FAULT": fault} if fault else {}
         arguments = ["marey_worker", "--attached", "--server", url, "--name", name, "--cache", str(folder / "cache")]
         self.spawn(arguments, environment, stdin=f"{token}\n".encode())

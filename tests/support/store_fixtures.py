@@ -20,7 +20,7 @@ ALL_SCOPES = ("read", "write", "jobs", "work", "admin")
 
 
 def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
-    """Return a chain of joints `j0`, `j1`, ..."""
+    """Return the document of a skeleton whose joints `j0`, `j1` and so on form a chain."""
     chain = [{"name": f"j{i}", "parent": i - 1, "offset": [0, bone_m if i else 0, 0]} for i in range(joints)]
     return {"schema": "marey/skeleton@1", "joints": chain}
 
@@ -50,7 +50,7 @@ WRITE = RequiredRole(Role.CONTRIBUTOR, "write")
 
 
 def requiring(required: RequiredRole, function: Callable[..., Any]) -> Any:
-    """Run `function` as a request whose operation declares `required`."""
+    """Return a function that runs `function` as an operation that declares the role `required`."""
 
     def run(tx: Transaction, *args: Any, **kwargs: Any) -> Any:
         tx.required_role = required
@@ -60,7 +60,7 @@ def requiring(required: RequiredRole, function: Callable[..., Any]) -> Any:
 
 
 def declared(method: str, path: str) -> RequiredRole:
-    """Return what the operation of an address declares."""
+    """Return the role that the operation with this method and path declares."""
     (found,) = (resource for resource in RESOURCES if resource.path == path)
     return found.operations[method].required_role
 
@@ -96,7 +96,10 @@ class Lab:
         required: RequiredRole = READ,
         **kwargs: Any,
     ) -> Any:
-        """Run a read as the owner or as `who`, by an operation that declares `required`."""
+        """Run a function that reads, as the owner or as `who`, and return its result.
+
+        The operation of the request declares the role `required`.
+        """
         return self.database.read(who or self.owner, requiring(required, function), *args, **kwargs)
 
     def write(
@@ -107,7 +110,10 @@ class Lab:
         required: RequiredRole = WRITE,
         **kwargs: Any,
     ) -> Any:
-        """Run a write as the owner or as `who`, by an operation that declares `required`."""
+        """Run a function that writes, as the owner or as `who`, and return its result.
+
+        The operation of the request declares the role `required`.
+        """
         return self.database.write(who or self.owner, requiring(required, function), *args, **kwargs)
 
     def events(self, after: int = 0, **kwargs: Any) -> list[Event]:
@@ -117,12 +123,12 @@ class Lab:
         return found
 
     def make_public(self) -> None:
-        """Let everybody read the project."""
+        """Make the project public, so that every user can read it."""
         change = ProjectChange(visibility=Visibility.PUBLIC)
         self.write(projects.change_project, self.name, change, expected_rev=None)
 
     def add_skeleton(self, name: str = "rig", **kwargs: Any) -> Item:
-        """Return a new skeleton."""
+        """Create a skeleton in the project, and return it."""
         request = ItemCreate(name=name, parts={"hierarchy": skeleton_tree(**kwargs)})
         return self.write(items.create_item, self.name, Kind.SKELETON, request)
 
@@ -137,7 +143,7 @@ class Lab:
         info: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> Item:
-        """Return a new clip of random poses."""
+        """Create a clip of random poses in the project, and return it."""
         parts = {"motion": motion_tree(skeleton, **kwargs)} | ({"info": info} if info else {})
         request = ItemCreate(name=name, collection=collection, tags=tags, parts=parts)
         return self.write(items.create_item, self.name, Kind.CLIP, request, who=who)

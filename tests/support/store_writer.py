@@ -22,7 +22,7 @@ FILES = [f"file {number}".encode() * 1000 for number in range(3)]
 
 
 def publish(tx: Transaction) -> Any:
-    """Publish three small studies that refer to the files."""
+    """Publish three small items of the kind `study` that refer to the blobs of `FILES`."""
     row = projects.require(tx, "lab")
     trees = [{"n": n, "blob": blobs.digest_of(data)} for n, data in enumerate(FILES)]
     drafts = [items.Draft(f"d{n}", Kind.STUDY, f"study {n}", {"study": tree}, "a/b") for n, tree in enumerate(trees)]

@@ -31,7 +31,7 @@ def wandering_tracks(count: int = 8, seed: int = 3) -> list[Track]:
 
 
 def with_mirrored(tracks: list[Track]) -> MatchingDatabase:
-    """A database of the tracks and their mirrored twins."""
+    """Return a database of the tracks and of their mirrored copies."""
     both = sorted(
         (one for track in tracks for one in (track, mirrored_track(track)._replace(uid=f"{track.uid}~mirrored"))),
         key=lambda track: track.uid,
@@ -45,12 +45,12 @@ def with_mirrored(tracks: list[Track]) -> MatchingDatabase:
 
 
 def simulated(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) -> list[TrialRecord]:
-    """Return the records of the whole suite."""
+    """Return the records of all trials of the suite."""
     return run_suite(database, options, trials=suite_trials(options))
 
 
 def evaluated(database: MatchingDatabase, options: EvaluationOptions = OPTIONS) -> EvaluationResult:
-    """Evaluate the database, without a baseline."""
+    """Return the evaluation of the database, without a baseline."""
     return assemble(database, options, suite_trials(options), simulated(database, options))
 
 
@@ -71,7 +71,7 @@ def same_to_the_bit(
 
 
 def places(database: MatchingDatabase, rows: Ints32) -> list[tuple[str, int]]:
-    """Clip and frame of each row; parts of clips are named and counted as in the whole clip."""
+    """Return clip and frame of each row; a row of a part of a clip has the name and the frame of the whole clip."""
     found = []
     for index, row in zip(database.clip_of_row[rows].tolist(), rows.tolist(), strict=True):
         clip = database.clips[index]

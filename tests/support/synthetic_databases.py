@@ -45,7 +45,7 @@ def studio_body() -> MatchingBody:
 
 
 def gait_pose(frames: int, speed_m_s: float, phase: float = 0.0) -> NDArray[np.float64]:
-    """Compute pose features (frames, 15) that repeat with the stride and grow with the speed."""
+    """Return pose features (frames, 15) that repeat with the stride and grow with the speed."""
     angle = 2 * np.pi * (0.8 + 0.25 * speed_m_s) * np.arange(frames) / 60 + phase
     amplitude = 0.1 + 0.1 * speed_m_s
     return np.stack([amplitude * np.sin(angle + 0.7 * d) for d in range(POSE_DIMENSIONS)], axis=1)
@@ -81,7 +81,10 @@ def random_tracks(count: int, seed: int) -> list[Track]:
 
 
 def mirrored_track(track: Track) -> Track:
-    """Reflect a track in x; the first half of the pose's dimensions is the left side, the second the right."""
+    """Return a track reflected in x.
+
+    The first half of the dimensions of the pose is the left side, the second half is the right side.
+    """
     mirror = np.array([-1.0, 1.0])
     left, right, middle = track.pose[:, :6], track.pose[:, 6:12], track.pose[:, 12:]
     signs = np.array([-1.0, 1.0, 1.0])
@@ -131,13 +134,13 @@ def synthetic_database(
 
 
 def index_of(database: MatchingDatabase) -> SearchIndex:
-    """Return the database's rows, ready for search."""
+    """Return the search index of the normalised rows of a database."""
     normalised = (database.features - database.normaliser.offset) / database.normaliser.scale
     return build_index(normalised, database.starts, database.selectable)
 
 
 def fitted(features: NDArray[np.float64]) -> Normaliser:
-    """Fit means and one scale per group by their definitions, without weights."""
+    """Return a normaliser with the means and one scale per group, computed by their definitions, without weights."""
     spread = features.std(axis=0)
     groups = ((0, 15), (15, 21), (21, 27))
     scale = np.concatenate([np.full(stop - start, max(spread[start:stop].mean(), 1e-3)) for start, stop in groups])
@@ -166,7 +169,10 @@ def _features(track: Track, wraps: bool) -> NDArray[np.float64]:
 
 
 def _unwound(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Extend a loop by its next rounds as far as it looks ahead; the closing step is the mean of its neighbours."""
+    """Return headings and positions of a loop, followed by those of its next rounds.
+
+    The step from the last frame to the first one is the mean of its neighbours.
+    """
     heading, position = track.headings, track.positions
 
     def local(step: int) -> tuple[NDArray[np.float64], float]:
@@ -207,7 +213,7 @@ def switches(record: TrialRecord) -> int:
 
 
 def on_the_circle(record: TrialRecord) -> tuple[np.ndarray, np.ndarray]:
-    """Compute speeds in m/s and turn rates in deg/s after the approach."""
+    """Return the speeds in m/s and the turn rates in deg/s after the approach."""
     speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1) * 60
     turn_rate = np.degrees(np.diff(record.headings)) * 60
     return speed[180:], turn_rate[180:]

@@ -203,7 +203,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_report_header() -> str:
-    """Name the folder of real motion capture."""
+    """Return a line that names the folder of real motion capture, or says that there is none."""
     folder = os.environ.get(MOCAP_VARIABLE)
     if folder:
         return f"real motion capture: {folder}"
@@ -218,7 +218,7 @@ def pytest_testnodedown(node: object) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Print what the tier left out, by reason."""
+    """Print how many tests this tier has left out, by reason."""
     left_out = config.stash[LEFT_OUT]
     terminalreporter.write_line(f"tier {config.getoption('tier')} left out {left_out.total()} tests")
     for reason, count in left_out.items():

@@ -96,7 +96,10 @@ def _of_guest(operation: Operation, *, public: bool) -> frozenset[int]:
 
 
 def _of_attempt(person: Person, operation: Operation) -> frozenset[int]:
-    """An attempt reads its inputs and writes through its own operations; an ended one repeats what ended it."""
+    """Return the statuses that an operation may answer to the token of an attempt.
+
+    A running attempt may use the operations for attempts; one that has ended may only repeat its last request.
+    """
     if person.standing == "ended":
         return LET_THROUGH if operation.replays else OVER
     return LET_THROUGH if operation.access is Access.ATTEMPT or operation.attempts else FORBIDDEN

@@ -61,7 +61,7 @@ CALLERS = (
 
 @dataclass
 class World:
-    """What there is, and who is what."""
+    """Expected contents of the server, and the roles of its users."""
 
     public: set[str] = field(default_factory=set)
     roles: dict[tuple[str, str], Role] = field(default_factory=dict)
@@ -377,7 +377,7 @@ class Program:
         return owners == [user]
 
     def _call(self, caller: Caller, method: str, path: str, expected: int, **rest: Any) -> httpx.Response:
-        """Send a request; note a difference if its status or a mark in its answer is not as expected."""
+        """Send a request and return the answer; record a difference if its status or a mark in it is unexpected."""
         self.calls += 1
         answer = self.people.client(self.tokens[caller]).request(method, path, **rest)
         if answer.status_code != expected:

@@ -25,7 +25,7 @@ from marey_schemas.options.imports import ImportOptions
 
 @pytest.fixture(scope="session", params=BACKENDS)
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
-    """The server of all ways over one kind of database."""
+    """A server that all tests with one kind of database share."""
     folder = tmp_path_factory.mktemp("server")
     with contextlib.ExitStack() as after:
         if request.param == "sqlite":
@@ -38,14 +38,14 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="session")
 def marey(server: ServerProcess) -> Iterator[Marey]:
-    """The first administrator's client."""
+    """The client of the first administrator."""
     with server.client() as client:
         yield client
 
 
 @pytest.fixture
 def new_lab(marey: Marey) -> Iterator[Callable[[], ProjectHandle]]:
-    """Makes the project `lab`, which is gone after the test."""
+    """Function that creates the project `lab`, which is deleted after the test."""
     with contextlib.ExitStack() as after:
 
         def make() -> ProjectHandle:
@@ -73,7 +73,7 @@ def run(server: ServerProcess, tmp_path: Path) -> CommandLine:
 
 @pytest.fixture
 def lab_of(new_lab: Callable[[], ProjectHandle]) -> Callable[..., ProjectHandle]:
-    """Makes the project `lab` of these files and folders, in a collection."""
+    """Function that creates the project `lab` and imports files and folders into one of its folders."""
 
     def make(*paths: Path, collection: str = "walks") -> ProjectHandle:
         project = new_lab()

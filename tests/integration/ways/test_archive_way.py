@@ -60,7 +60,7 @@ def away(project: ProjectHandle, run: CommandLine) -> Iterator[ProjectHandle]:
 
 
 def clip(project: ProjectHandle, name: str) -> ClipHandle:
-    """The clip with a name."""
+    """Return the clip with this name."""
     (found,) = (one for one in project.clips.list() if one.name == name)
     return found
 

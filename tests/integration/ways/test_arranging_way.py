@@ -60,7 +60,10 @@ def run(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
 ) -> Command:
-    """Runs a command, in which `lab` stands for the test's project; what it printed, with the same name for that."""
+    """Function that runs a command and returns its output.
+
+    The arguments and the output name the project of the test `lab`.
+    """
     monkeypatch.setenv("MAREY_URL", server.url)
     monkeypatch.setenv("MAREY_DATA", str(server.data))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))

@@ -63,7 +63,10 @@ def test_the_commands_of_the_page_commit_results(run: CommandLine, project: Proj
 
 
 def submit_after_others(project: ProjectHandle) -> Job:
-    """Submit a job that commits, and that starts only after several others, so that somebody can commit before it."""
+    """Submit a job that commits, and return it.
+
+    It starts after several other jobs, so that another user can commit before it does.
+    """
     (rig,) = (one for one in project.skeletons.list() if one.name == "target")
     inputs = {"clips": (CollectionInput(collection="gaits/raw"),), "skeleton": ItemInput(item=rig.id)}
     before: tuple[str, ...] = ()

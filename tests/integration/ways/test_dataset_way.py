@@ -46,12 +46,12 @@ class Walker:
         return [self.run(*shlex.split(line, comments=True)[1:]).stdout for line in block.splitlines()]
 
     def clip(self, name: str) -> ClipHandle:
-        """The clip in the folder of the dataset."""
+        """Return the clip with this name in the folder of the dataset."""
         (found,) = (one for one in self.project.clips.list() if one.name == name)
         return found
 
     def comment(self, name: str, text: str) -> None:
-        """Change the description of a clip."""
+        """Replace the comment in the description of a clip."""
         clip = self.clip(name)
         clip.put_info(clip.info().model_copy(update={"comment": text}))
 

@@ -23,7 +23,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "compare-revisions.md"
 
 @pytest.fixture
 def clip(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ClipHandle:
-    """A walk with four revisions: imported, trimmed, with other comments."""
+    """A walk with four revisions: imported, trimmed, and twice with another comment."""
     (tmp_path / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.5, 4.0)))
     project = lab_of(tmp_path / "walk.bvh", collection="raw")
     (made,) = project.clips.list()

@@ -35,7 +35,7 @@ CHANGED = "walk-003"
 
 @pytest.fixture
 def lab(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandle:
-    """A project with a skeleton that came with a clip, and beside it a folder of takes that are not there yet."""
+    """A project with one skeleton; a folder beside its file contains takes that are not imported yet."""
     write_takes(tmp_path, TAKES)
     return lab_of(tmp_path / "game.bvh", collection="rigs")
 
@@ -46,7 +46,7 @@ def skeleton_path(lab: ProjectHandle) -> str:
 
 
 def attempts(marey: Marey, jobs: dict[str, Any]) -> dict[str, int]:
-    """How often somebody worked on each step, its tasks counted."""
+    """Return the number of attempts of each step, including those of its tasks."""
     counts = {}
     for name, job in jobs.items():
         tasks = [one.id for one in marey.jobs.list("lab", filters={"parent": job["id"]})]

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.parametrize("server", ["sqlite"], indirect=True, scope=
 
 @pytest.fixture(scope="module")
 def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two walks and a broken file, in folders."""
+    """A folder with a walk and a broken file, and a subfolder with another walk."""
     folder = tmp_path_factory.mktemp("takes")
     (folder / "turns").mkdir()
     (folder / "walk.bvh").write_bytes(write_bvh(generate_gait(1.3, 0.0, 2.0)))
@@ -50,7 +50,7 @@ def project(marey: Marey, request: pytest.FixtureRequest) -> ProjectHandle:
 
 
 def target_skeleton(project: ProjectHandle) -> SkeletonHandle:
-    """A skeleton of another rig, by way of a file that holds a pose of it."""
+    """Create a skeleton of another rig in the project, and return its handle."""
     from marey_motion.documents import mapping_to_document, skeleton_to_document
     from marey_motion.rigs import guess_axes, map_joints
 

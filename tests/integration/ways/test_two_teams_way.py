@@ -66,12 +66,12 @@ def told(run: CommandLine, server: ServerProcess, other_server: ServerProcess) -
 
 
 def blocks() -> list[list[str]]:
-    """The commands of each block of the page."""
+    """Return the lines of each block of commands on the page."""
     return [found.splitlines() for found in re.findall(r"```sh\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)]
 
 
 def clip(project: ProjectHandle, name: str) -> ClipHandle:
-    """The clip with a name."""
+    """Return the clip with this name."""
     (found,) = (one for one in project.clips.list() if one.name == name)
     return found
 
@@ -173,5 +173,5 @@ def test_what_cannot_be_pushed_is_refused_with_a_remedy(
 
 
 def other_address(project: ProjectHandle) -> str:
-    """The address of the project's server under a name for which there is no login."""
+    """Return another address of the project's server, for which no login is stored."""
     return project.transport.url.replace("127.0.0.1", "localhost")

@@ -1,4 +1,4 @@
-"""Two runs of the benchmarks make one table."""
+"""Comparison of two runs of the benchmarks in one table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SMALL, LARGE = (Row("DTW", f"{frames} x {frames}", f"{ms} ms") for frames, ms in
 
 
 def cells(table: str) -> list[list[str]]:
-    """Split the lines below the headings into their cells."""
+    """Return the cells of each line of a table below its headings."""
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
 
 

@@ -1,4 +1,4 @@
-"""In-process server of a client's tests."""
+"""Simulated server for tests of the client."""
 
 import pytest
 from tests.support.scripted_server import ScriptedServer

@@ -1,4 +1,4 @@
-"""The command line where no server is needed."""
+"""Command line, where no server is needed."""
 
 import contextlib
 import json
@@ -53,7 +53,7 @@ def marey(
 
 
 def marey_here(arguments: list[str], env: dict[str, str], cwd: Path) -> CompletedProcess[str]:
-    """Run a command in this process: to start one takes long."""
+    """Run a command in this process, because starting a process takes long; return its result."""
     with mock.patch.dict(os.environ, env), contextlib.chdir(cwd):
         return run_here(arguments)
 
@@ -67,7 +67,7 @@ PROJECT = {
 
 @pytest.fixture
 def nowhere(tmp_path: Path) -> dict[str, str]:
-    """A user without stored logins, and a server that is not there."""
+    """Environment of a user without stored logins, with the address of a server that does not exist."""
     return {
         "XDG_CONFIG_HOME": str(tmp_path), "MAREY_DATA": str(tmp_path), "MAREY_URL": "http://127.0.0.1:9",
         "MAREY_TOKEN": "marey_very_secret",
@@ -75,7 +75,7 @@ def nowhere(tmp_path: Path) -> dict[str, str]:
 
 
 def a_job(**fields: Any) -> Job:
-    """A job of which only these fields are looked at."""
+    """Return a job with these fields; other fields are missing."""
     return Job.model_construct(**fields)
 
 

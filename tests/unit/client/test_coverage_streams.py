@@ -26,7 +26,7 @@ def said(request: httpx.Request) -> dict[str, Any]:
 
 
 def counted(request: httpx.Request) -> httpx.Response:
-    """Answers as a server that has taken what is said."""
+    """Return the answer of a server that has accepted the frames of the request."""
     frames = said(request)
     count = sum(len(frames[name]) for name in ("poses", "roots") if name in frames)
     body = {

@@ -14,7 +14,7 @@ RATE_HZ = 30.0
 
 
 def clip(path_m: Floats) -> ClipHandle:
-    """A clip whose root goes along `path_m`, (frames, 3)."""
+    """Return a clip whose root moves along `path_m` (frames, 3)."""
     translations = np.asarray(path_m, dtype=np.float32)
     summary = {"frames": len(translations), "frame_rate_hz": RATE_HZ}
     motion = SimpleNamespace(root_translations=translations)

@@ -41,7 +41,10 @@ def job(**fields: Any) -> dict[str, Any]:
 
 
 def answer(request: httpx.Request) -> httpx.Response:
-    """A project with three clips, one tagged as a loop, of a skeleton whose mapping was edited."""
+    """Answer as a server whose project has three clips, one of which is tagged as a loop.
+
+    The mapping of their skeleton was edited.
+    """
     path, query = request.url.path, dict(request.url.params)
     if path.endswith("/jobs"):
         return httpx.Response(202, json=job())

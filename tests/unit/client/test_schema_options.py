@@ -32,7 +32,7 @@ def typed(arguments: str, options: OptionsOf) -> Chosen:
     got: list[Chosen] = []
 
     def command(params: Chosen) -> None:
-        """Remember what was typed."""
+        """Record the values that were typed."""
         got.append(params)
 
     one = typer.Typer()

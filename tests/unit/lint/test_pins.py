@@ -19,7 +19,7 @@ def name_of(requirement: str) -> str:
 
 
 def required(extra: str) -> set[str]:
-    """Names that an extra requires, with those of the extras that it includes."""
+    """Return the names that an extra requires, with those of the extras that it includes."""
     names: set[str] = set()
     for one in PYPROJECT["project"]["optional-dependencies"][extra]:
         included = re.match(r"marey\[(.*)\]", one)

@@ -16,7 +16,7 @@ LONG = "\n".join("x = 1" for _ in range(70)) + "\n"
 
 
 def house(modules: dict[str, str], pages: dict[str, str] | None = None) -> House:
-    """A house of modules by name, in the folders that their names say."""
+    """Return the modules with these names and texts as a `House`; paths follow from the names."""
     found = {name: Module(name, ROOT / f"{name.replace('.', '/')}.py", text) for name, text in modules.items()}
     return House(found, {ROOT / name: text for name, text in (pages or {}).items()})
 

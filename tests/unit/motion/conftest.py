@@ -46,7 +46,7 @@ TIPS = {
 
 @pytest.fixture
 def body() -> Skeleton:
-    """A human of 22 joints in T-pose."""
+    """A human skeleton of 22 joints in T-pose."""
     names = [name for name, _, _ in BODY]
     return Skeleton(
         joint_names=tuple(names),
@@ -59,7 +59,7 @@ def body() -> Skeleton:
 
 @pytest.fixture
 def tumbling() -> Callable[..., Clip]:
-    """Make a clip of a skeleton in which all joints turn at random, and some move."""
+    """Function that returns a clip of a skeleton in which all joints rotate at random, and some move."""
 
     def make(skeleton: Skeleton, frames: int = 70, translated: tuple[int, ...] = (), seed: int = 0) -> Clip:
         random = np.random.default_rng(seed)

@@ -19,7 +19,7 @@ POINTS = 9
 
 
 def cloud(frames: int, seed: int, points: int = POINTS) -> Floats:
-    """(frames, points, 3) of a body that wanders over the ground."""
+    """Return points (frames, points, 3) of a body that wanders over the ground."""
     random = np.random.default_rng(seed)
     return (
         random.normal(size=(frames, points, 3)) * 0.4 + random.normal(size=(frames, 1, 3)) + np.array((2.0, 1.0, -5.0))
@@ -32,7 +32,10 @@ def on_the_ground(points: Floats, turn_rad: float, x: float, z: float) -> Floats
 
 
 def minimised(a: Floats, b: Floats, weights: Floats) -> float:
-    """The least weighted mean of squared distances of points a, b (P, 3) over turns and shifts, found by search."""
+    """Return the least weighted mean of squared distances of points a, b (P, 3) over turns and shifts.
+
+    The minimum is found by search.
+    """
     shares = weights / weights.sum()
 
     def cost(parameters: Floats) -> float:

@@ -1,4 +1,4 @@
-"""Aligned sets to documents and back."""
+"""Conversion of aligned sets to documents and back."""
 
 from dataclasses import replace
 from typing import Any
@@ -28,7 +28,7 @@ def aligned() -> AlignedSet:
 
 
 def stored(aligned: AlignedSet, media_type: str = JSON) -> list[StoredExample]:
-    """As a store would keep them, and in another order."""
+    """Encode and decode the examples of a set; return them in reverse order."""
     examples = []
     for number, one in enumerate(aligned.clips):
         tree = example_to_tree(aligned, one, digest=DIGEST)

@@ -16,7 +16,7 @@ STEPS = ((1, 1), (1, 0), (0, 1))
 
 
 def plain_total(costs: Floats) -> float:
-    """The textbook recursion, cell by cell."""
+    """Return the total cost of the best path, by the recursion of textbooks, cell by cell."""
     n, m = costs.shape
     totals = np.full((n + 1, m + 1), np.inf)
     totals[0, 0] = 0.0
@@ -26,7 +26,7 @@ def plain_total(costs: Floats) -> float:
 
 
 def all_ways(n: int, m: int, max_run: int | None = None) -> Iterator[list[tuple[int, int]]]:
-    """Every way from the first cell to the last, as lists of cells."""
+    """Yield every path from the first cell to the last one, as a list of cells."""
 
     def go(cells: list[tuple[int, int]], run_step: tuple[int, int] | None, run: int) -> Iterator[list[tuple[int, int]]]:
         i, j = cells[-1]
@@ -48,7 +48,10 @@ def cheapest_way(costs: Floats, max_run: int | None = None) -> float | None:
 
 
 def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int], int]]:
-    """(layer, step, layer that the step leads to); a cell stands once in each layer.
+    """Return (layer, step, layer to which the step leads) for each step; each layer contains every cell once.
+
+    A layer is defined by the last steps of a path: 0 is a step in both motions, then 1 to `max_run` steps in a row in
+    the first motion alone, then equally many in the second alone. Without a limit there is one layer.
 
     Layers are what a way has done last: 0 a step in both motions, then 1 to `max_run` steps in a row in the first
     alone, then as many in the second alone. Without a limit there is one layer.
@@ -66,7 +69,7 @@ def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int]
 
 
 def step_graph(n: int, m: int, max_run: int | None) -> Ints:
-    """Nodes (e,) that each edge leads from and to; the node of a cell in a layer is its place in (layers, n, m)."""
+    """Return the nodes (2, e) at which each edge starts and ends; a node is an index into (layers, n, m)."""
     cells = np.arange(n * m).reshape(n, m)
     edges = [
         np.stack(
@@ -78,14 +81,17 @@ def step_graph(n: int, m: int, max_run: int | None) -> Ints:
 
 
 def shortest_way(costs: Floats, edges: Ints) -> float:
-    """From the first cell to the last in any layer, by Dijkstra's algorithm; an edge costs the cell it leads to."""
+    """Return the cost of the best path from the first cell to the last one, by Dijkstra's algorithm.
+
+    An edge costs as much as the cell to which it leads. The path may end in any layer.
+    """
     nodes = edges.max() + 1
     graph = coo_array((costs.ravel()[edges[1] % costs.size], tuple(edges)), shape=(nodes, nodes)).tocsr()
     return costs[0, 0] + dijkstra(graph, indices=0)[costs.size - 1 :: costs.size].min()
 
 
 def walking_points(frames: int, speed: float = 1.0, phase: float = 0.0, points: int = 5, seed: int = 0) -> Floats:
-    """(frames, points, 3) that swing like limbs."""
+    """Return points (frames, points, 3) that swing like limbs."""
     random = np.random.default_rng(seed)
     centres, swings, delays = (random.normal(size=(points, 3)) for _ in range(3))
     angle = speed * np.arange(frames)[:, None, None] / 8.0 + phase

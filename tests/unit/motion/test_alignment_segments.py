@@ -87,7 +87,7 @@ def test_the_labels_that_most_examples_have_are_the_common_ones() -> None:
 
 @st.composite
 def sectioned(draw: Callable[..., Any]) -> tuple[Floats, list[int], list[int]]:
-    """Costs of two motions with the same number of sections."""
+    """Draw costs of two motions with the same number of sections, and the bounds of the sections."""
     count = draw(st.integers(1, 4))
     lengths = st.integers(1, 12)
     bounds = [np.concatenate(([0], np.cumsum(draw(st.lists(lengths, min_size=count, max_size=count))))) for _ in "ab"]

@@ -19,7 +19,10 @@ from marey_motion.motion import Motion
 
 @st.composite
 def paths(draw: Callable[..., Any]) -> Ints32:
-    """Ways of allowed steps through at least two frames of each motion, mostly with no more than three in a row."""
+    """Draw paths of allowed steps through at least two frames of each motion.
+
+    Most have at most three steps in a row in one motion.
+    """
     steps = draw(st.lists(st.sampled_from(["11", "11", "10", "01", "110", "1000", "0001", "01111"]), min_size=1))
     moves = {"11": [(1, 1)], "10": [(1, 0), (1, 1)], "01": [(0, 1), (1, 1)]}
     cells = [(0, 0)]

@@ -23,7 +23,7 @@ def walk() -> Clip:
 
 @pytest.fixture(scope="module")
 def standing() -> Clip:
-    """Two seconds of the rest pose, a T, on the floor."""
+    """Two seconds of the rest pose, a T-pose, on the floor."""
     skeleton = studio_skeleton()
     poses = np.zeros((120, 3 + 4 * skeleton.joint_count), np.float32)
     poses[:, 3::4] = 1.0

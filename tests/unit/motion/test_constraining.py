@@ -42,7 +42,7 @@ def arm(walk: Clip) -> TwoBoneLimb:
 
 
 def _jolt(skeleton: Skeleton, motion: Motion) -> float:
-    """The greatest change of a joint's velocity between frames, metres per frame."""
+    """Return the greatest change of a joint's velocity between frames, in metres per frame."""
     return float(np.abs(np.diff(motion.positions(skeleton), 2, axis=0)).max())
 
 

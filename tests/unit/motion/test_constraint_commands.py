@@ -34,7 +34,7 @@ def game_walk(walk: Clip) -> Clip:
 
 
 def _edited(clip: Clip, *commands: dict[str, Any]) -> EditedClip:
-    """What comes of commands that were saved as JSON and read again."""
+    """Return the result of commands that were stored as JSON and read again."""
     document = EditDocument.model_validate({"commands": commands})
     again = EditDocument.model_validate_json(json.dumps(document.model_dump(mode="json", by_alias=True)))
     assert again == document

@@ -22,7 +22,7 @@ def poses_of(kinds: list[int]) -> Poses:
 
 
 def least_cost(before: Poses, after: Poses) -> float:
-    """Search all sequences of runs."""
+    """Return the least cost over all sequences of runs."""
     n, m = before.frame_count, after.frame_count
     places = np.stack(np.meshgrid(np.arange(n), np.arange(m), indexing="ij"), axis=-1).reshape(-1, 2)
     costs = np.minimum(frame_costs(before, after, places), 2.0 * UNMATCHED).reshape(n, m)

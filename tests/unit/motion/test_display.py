@@ -30,7 +30,7 @@ def arc(speed: float, turn_rate_deg: float, seconds: float, travel_deg: float = 
 
 @pytest.fixture(scope="module")
 def database() -> MatchingDatabase:
-    """Walks and runs, straight and in both directions round, each by another walker."""
+    """Walks and runs of different walkers, straight ahead, and to the left and right."""
     paths = [arc(speed, turn, 6.0) for speed in (1.0, 2.0, 3.5) for turn in (-60.0, 0.0, 60.0)]
     clips = [
         SourceClip(f"clip_{number:02d}", f"arc {number}", generate_along(path)) for number, path in enumerate(paths)
@@ -58,7 +58,7 @@ def record(database: MatchingDatabase) -> TrialRecord:
 
 
 def undisturbed(database: MatchingDatabase, first: int, ticks: int) -> TrialRecord:
-    """A record that plays rows one after the other on the root that they were recorded on."""
+    """Return the record of a trial that plays consecutive rows on the root with which they were recorded."""
     rows = np.arange(first, first + ticks, dtype=np.int32)
     nothing = np.full(ticks, np.nan)
     return TrialRecord(
@@ -74,7 +74,10 @@ def undisturbed(database: MatchingDatabase, first: int, ticks: int) -> TrialReco
 
 
 def jump(database: MatchingDatabase, before: int, after: int, ticks: int = 60) -> TrialRecord:
-    """Half of the ticks from `before` on, then those from `after` on, on a root that stands."""
+    """Return the record of a trial that plays rows from `before` on, and after half of the ticks rows from `after` on.
+
+    The root does not move.
+    """
     rows = np.concatenate((before + np.arange(ticks // 2), after + np.arange(ticks - ticks // 2))).astype(np.int32)
     return replace(undisturbed(database, 0, ticks), rows=rows, positions=np.zeros((ticks, 2)), headings=np.zeros(ticks))
 

@@ -42,7 +42,7 @@ def pixels_of(png: bytes) -> Ints:
 
 
 def cell(pixels: Ints, row: int, column: int, columns: int) -> Ints:
-    """The pixels of one figure's ground; columns counts figures."""
+    """Return the pixels around one figure; `columns` is the number of figures in a row."""
     width = (PAGE_WIDTH - 2 * MARGIN) / columns
     left, top = MARGIN + column * width, HEADER + row * ROW + TITLE
     return pixels[round(top * DPI) : round((top + STAGE) * DPI), round(left * DPI) : round((left + width) * DPI)]

@@ -45,7 +45,7 @@ def coloured(figure: Figure, colour: str) -> list[PathPatch]:
 
 
 def points_of(patch: PathPatch) -> Floats:
-    """The points of a drawn path, (n, 2), in inches."""
+    """Return the points (n, 2) of a drawn path, in inches."""
     return np.asarray(patch.get_path().vertices)
 
 

@@ -21,7 +21,7 @@ WALK = Layer(
 
 
 def labelled(layer: Layer) -> list[str | None]:
-    """The label of every frame, None where there is none."""
+    """Return the label of every frame, None for frames without a label."""
     labels: list[str | None] = [None] * layer.frame_count
     for segment in layer.segments:
         labels[segment.start : segment.end] = [segment.label] * (segment.end - segment.start)
@@ -181,12 +181,12 @@ commands = st.one_of(
 
 
 def segment_at(layer: Layer, frame: int) -> Segment:
-    """The segment that holds a frame."""
+    """Return the segment that contains a frame."""
     return next(one for one in layer.segments if one.start <= frame < one.end)
 
 
 def expected(before: Layer, command: str, given_: dict[str, Any]) -> list[str | None]:
-    """The label of every frame after a command that was accepted, painted frame by frame."""
+    """Return the expected label of every frame after an accepted command, computed frame by frame."""
     labels_ = labelled(before)
     if command == "create_segment":
         labels_[given_["start"] : given_["end"]] = [given_["label"]] * (given_["end"] - given_["start"])

@@ -98,7 +98,7 @@ def outcome_of(commands: list[AnyCommand]) -> tuple[EditedClip, ...] | MotionErr
 
 
 def frames_after(clip: Clip, commands: list[AnyCommand]) -> int | None:
-    """How many frames a list of commands makes, where that is easily told."""
+    """Return the number of frames after a list of commands, or None if it is not easy to compute."""
     frames = clip.frame_count
     for command in commands:
         if isinstance(command, Trim):

@@ -1,4 +1,4 @@
-"""Clips put after one another."""
+"""Concatenation of clips."""
 
 from dataclasses import replace
 from math import degrees
@@ -141,7 +141,7 @@ def lowest_foot(clip: Clip) -> float:
 
 
 def turning_and_jolting(clip: Clip) -> np.ndarray:
-    """The most that the body turns from frame to frame, and that the root's steps differ from one to the next."""
+    """Return the largest turn of the body between frames (rad), and the largest change of the root's steps (m)."""
     jolts = np.diff(clip.root_translations.astype(np.float64), 2, axis=0)
     return np.array((np.abs(np.diff(np.unwrap(heading_of(clip)))).max(), np.linalg.norm(jolts, axis=-1).max()))
 
@@ -172,7 +172,7 @@ def test_bodies_under_a_static_root_are_joined_as_bodies_that_are_the_root(blend
 
 
 def with_turning_root(clip: Clip, rate_rad_s: float) -> Clip:
-    """The clip under a root that turns, which the hips undo, so that the body goes where it went."""
+    """Return the clip with a root that turns, and hips that undo this turn, so that the body moves as before."""
     under = under_static_root(clip)
     turns = quaternions.from_axis_angle((0.0, 1.0, 0.0), rate_rad_s / clip.frame_rate_hz * np.arange(clip.frame_count))
     back = quaternions.conjugate(turns)

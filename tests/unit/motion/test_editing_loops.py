@@ -1,4 +1,4 @@
-"""Loops that close."""
+"""Conversion of clips to loops without a visible seam."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def seam_of(clip: Clip) -> LoopSeam:
 
 
 def accelerations_around_the_seam(clip: Clip, seam: LoopSeam) -> np.ndarray:
-    """Change of the steps of any joint around the seam, metres per frame."""
+    """Return the change of the steps of any joint around the seam, in metres per frame."""
     rounds = continue_motion(Motion.of(clip), seam, 3, 3)
     both = rounds.positions(clip.skeleton)[: 3 + 3]
     return np.linalg.norm(np.diff(both, n=2, axis=0), axis=-1).max(axis=1)

@@ -1,4 +1,4 @@
-"""Frames kept, and clips cut into pieces."""
+"""Selection of ranges of frames, and cutting of clips into pieces."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Noise taken out."""
+"""Removal of noise from motions."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ METHODS = ("savitzky_golay", "gaussian")
 
 
 def still_on_a_line(frames: int = 50) -> Clip:
-    """One pose that travels along a straight line."""
+    """Return a clip of one pose that travels along a straight line."""
     pose = np.repeat(make_walk(seconds=0.2).poses[:1].astype(np.float64), frames, axis=0)
     pose[:, :3] += np.arange(frames)[:, None] * [0.01, 0.002, -0.03]
     return Clip(make_walk(seconds=0.2).skeleton, 60.0, pose.astype(np.float32))

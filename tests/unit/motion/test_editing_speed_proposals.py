@@ -1,4 +1,4 @@
-"""Pauses, and reaches of a hand."""
+"""Annotation of pauses, and of movements in which a hand reaches for something."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,10 @@ RISE_S, HOLD_S = 1.0, 1.5
 
 
 def raised(starts_s: list[float], *, joint: str = "RightArm", seconds: float = 10.0, heading_rad: float = 0.0) -> Clip:
-    """Somebody who stands, and lifts an arm sideways to the shoulder at each of some times, holds it and lowers it."""
+    """Return a clip of a standing body that lifts an arm to the shoulder at each of the times `starts_s`.
+
+    The body holds the arm sideways, then lowers it.
+    """
     clip = generate_gait(0.0, 0.0, seconds, RATE_HZ)
     times = np.arange(clip.frame_count) / RATE_HZ
     lifted = np.zeros(clip.frame_count)

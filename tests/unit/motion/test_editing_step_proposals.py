@@ -1,4 +1,4 @@
-"""Walks and runs cut into steps."""
+"""Division of walks and runs into steps."""
 
 from collections import Counter
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Rates and speeds, mirrored bodies."""
+"""Changes of frame rate and speed, and mirroring."""
 
 from math import degrees
 

@@ -23,7 +23,7 @@ def mirrored(root: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
 
 
 def side_step(speed_m_s: float, duration_s: float, *, towards_deg: float) -> tuple[Floats, Floats]:
-    """Facing +z and going another way."""
+    """Return positions and headings of a root that faces +z and moves in the direction `towards_deg`."""
     times = np.arange(round(duration_s * RATE_HZ) + 1) / RATE_HZ
     direction = np.array([np.sin(np.radians(towards_deg)), np.cos(np.radians(towards_deg))])
     return speed_m_s * times[:, None] * direction, np.zeros_like(times)

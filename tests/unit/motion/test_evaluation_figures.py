@@ -435,7 +435,7 @@ def test_evaluations_of_little_are_compared(little: str, other: EvaluationResult
 
 
 def standing() -> EvaluationResult:
-    """A clip that stands but for rounding: its windows and what the trials recorded."""
+    """Return the evaluation of a clip that stands still except for rounding errors."""
     made = tiny(
         (DatabaseClip("only", "only", "", 0, 900),),
         EvaluationOptions(speeds_m_s=(1.0,), turn_rates_deg_s=(0.0,), duration_s=6.0),

@@ -19,7 +19,7 @@ THRESHOLD = 1.5
 
 
 def straight_set() -> MatchingDatabase:
-    """Walks straight ahead at both speeds of the grid, and no turns."""
+    """Return a database of straight walks at both speeds of the grid, without turns."""
     return synthetic_database(named([arc_track(1.0, 0.0, 6.0), arc_track(2.0, 0.0, 6.0)]))
 
 

@@ -32,13 +32,13 @@ def body_of(clip: Clip) -> MatchingBody:
 
 
 def afterwards(clip: Clip, body: MatchingBody) -> Windows:
-    """The windows of a whole clip at its own rate, as evaluations count them."""
+    """Return the windows of a whole clip at its own rate, as evaluations compute them."""
     root = simulation_root(Motion.of(clip).positions(clip.skeleton), body, clip.frame_rate_hz)
     return sliding_windows(root.positions, root.headings, clip.frame_rate_hz)
 
 
 def cut(count: int, lengths: tuple[Any, ...]) -> Iterator[slice]:
-    """Slices of `count` frames, their lengths taken in turn."""
+    """Yield consecutive slices of `count` frames, whose lengths are taken from `lengths` in turn."""
     start, turn = 0, 0
     while start < count:
         yield slice(start, start + lengths[turn % len(lengths)])
@@ -64,7 +64,7 @@ def differences(found: Windows, wanted: Windows) -> float:
 def circling(
     speed_m_s: float, turn_rate_deg_s: float, duration_s: float, rate_hz: float = RATE_HZ
 ) -> tuple[Floats, Floats]:
-    """A root that goes at constant speed along where it faces: positions and headings."""
+    """Return positions and headings of a root that moves at constant speed in the direction that it faces."""
     turn_rate = math.radians(turn_rate_deg_s)
     headings = turn_rate * np.arange(round(duration_s * rate_hz) + 1, dtype=np.float64) / rate_hz
     steps = speed_m_s / rate_hz * np.stack((np.sin(headings), np.cos(headings)), axis=-1)

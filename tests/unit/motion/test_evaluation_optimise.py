@@ -24,7 +24,7 @@ AIM = OptimisationOptions(objective=ObjectiveOptions(seconds=0.002), max_steps=6
 
 @pytest.fixture(scope="module")
 def pool() -> MatchingDatabase:
-    """A set of wandering clips, and two turns that may be added."""
+    """A database of random clips, and of two turns that may be added."""
     turns = [arc_track(2.0, turn_rate, 6.0, uid=uid) for uid, turn_rate in zip(TURNS, (50.0, -50.0), strict=True)]
     return synthetic_database([*wandering_tracks(), *turns])
 

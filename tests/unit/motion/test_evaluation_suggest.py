@@ -171,7 +171,10 @@ REAL = EvaluationOptions(duration_s=15.0, families=("circle",))
 
 @pytest.fixture(scope="module")
 def bandai(mocap: Path) -> tuple[MatchingDatabase, MatchingDatabase]:
-    """Walks, runs and others that hardly turn; and turns of another collection, on the body of the first."""
+    """A database of walks and runs that hardly turn, and one of turns from another collection.
+
+    Both use the body of the first collection.
+    """
     straight, turns = (
         [SourceClip(path.stem, path.stem, read_motion(path.read_bytes(), path.name).clip) for path in paths]
         for paths in (

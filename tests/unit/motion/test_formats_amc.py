@@ -27,7 +27,10 @@ def refusal(amc: str = AMC, asf: str = ASF) -> FormatError:
 
 
 def by_definition(root: list[float], thigh: list[float], shin: float) -> np.ndarray:
-    """Positions of root, thigh, shin, sole and the sole's tip: each bone turns by C M C⁻¹ against its parent."""
+    """Return positions of root, thigh, shin, sole and the sole's tip, computed by the definition of the format.
+
+    Each bone rotates by C M C⁻¹ relative to its parent.
+    """
 
     def fixed(order: str, angles: list[float]) -> np.ndarray:
         return Rotation.from_euler(order.lower(), angles, degrees=True).as_matrix()
@@ -86,7 +89,7 @@ def test_radians_are_read_as_radians() -> None:
 
 
 def in_radians(text: str, *angles: str) -> str:
-    """The text with these ends of lines, each as it stands there, in radians."""
+    """Return the text with these angles, which end lines, converted to radians."""
     for angle in angles:
         words = [word if word.isalpha() else repr(float(np.radians(float(word)))) for word in angle.split()]
         text = text.replace(f" {angle}\n", f" {' '.join(words)}\n")

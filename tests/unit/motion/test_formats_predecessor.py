@@ -120,7 +120,7 @@ def test_skeletons_survive_both_forms(body: Skeleton, form: SkeletonForm) -> Non
 
 
 def described(document: dict[str, Any]) -> list[dict[str, Any]]:
-    """All nodes of a skeleton document, whichever form it has."""
+    """Return all nodes of a skeleton document, in either of its forms."""
     if "jointDescs" in document:
         return list(document["jointDescs"])
     nodes = [document["root"]]

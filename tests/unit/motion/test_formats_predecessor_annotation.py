@@ -1,4 +1,4 @@
-"""The predecessor's annotations, in and out."""
+"""Reading and writing of the predecessor's annotations."""
 
 import json
 from collections.abc import Callable

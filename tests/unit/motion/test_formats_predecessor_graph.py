@@ -1,4 +1,4 @@
-"""The predecessor's graphs of models, in and out."""
+"""Reading and writing of the predecessor's graphs of models."""
 
 import copy
 import json

@@ -31,7 +31,7 @@ def read(document: dict[str, Any], encoding: Encoding = "json", **options: Any) 
 
 
 def their_poses(document: dict[str, Any], scores: Floats) -> tuple[Floats, Floats]:
-    """Root positions in metres and rotations (w, x, y, z) as the predecessor evaluates them, frame by frame."""
+    """Return root positions in metres and rotations w, x, y, z, computed frame by frame as the predecessor does."""
     flat = "mean_spatial_vector" in document
     mean, vectors = (
         np.array(document[f"{name}_spatial{end}"] if flat else document["sspm"][name])

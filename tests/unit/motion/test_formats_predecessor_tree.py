@@ -1,4 +1,4 @@
-"""The predecessor's cluster trees, in and out."""
+"""Reading and writing of the predecessor's cluster trees."""
 
 import copy
 import json

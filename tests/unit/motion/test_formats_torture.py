@@ -98,7 +98,10 @@ def test_broken_files_are_read_or_refused_and_nothing_else(choice: int, source: 
 
 @st.composite
 def clips(draw: st.DrawFn) -> Clip:
-    """Any tree of up to twelve joints with any names, some of them translated, moving at random."""
+    """Draw a clip of a random tree of up to twelve joints with any names, which move at random.
+
+    Some of the joints are translated.
+    """
     count = draw(st.integers(1, 12))
     parents = [-1, *(draw(st.integers(0, joint - 1)) for joint in range(1, count))]
     names = draw(

@@ -34,7 +34,7 @@ Count = Callable[[Any, str], Counter[str]]
 
 @pytest.fixture
 def count(monkeypatch: pytest.MonkeyPatch) -> Count:
-    """Counts the calls of functions of modules, by name."""
+    """Function that counts the calls of a function of a module, by name."""
     calls: Counter[str] = Counter()
 
     def watch(module: ModuleType, name: str) -> Counter[str]:

@@ -46,7 +46,7 @@ ITERATIVE = (solve_ccd, solve_least_squares)
 
 @pytest.fixture(params=["studio", "game", "tumbled"])
 def skeleton(request: pytest.FixtureRequest, body: Skeleton) -> Skeleton:
-    """Three bodies; the joints of the last one have local axes that point anywhere."""
+    """Three skeletons; the joints of the last one have random local axes."""
     if request.param == "studio":
         return studio_skeleton()
     return game_skeleton() if request.param == "game" else _with_odd_axes(body)
@@ -60,7 +60,7 @@ def limb_of(body: Skeleton, start: str, middle: str, end: str) -> TwoBoneLimb:
 
 
 def _with_odd_axes(body: Skeleton) -> Skeleton:
-    """The same rest pose, described in local frames turned at random."""
+    """Return the same rest pose with local axes that are rotated at random."""
     frames = quaternions.normalise(np.random.default_rng(3).normal(size=(body.joint_count, 4)))
     above = np.concatenate((quaternions.identity(1), frames[body.parents[1:]]))
     return replace(
@@ -72,7 +72,7 @@ def _with_odd_axes(body: Skeleton) -> Skeleton:
 
 
 def _moved(skeleton: Skeleton, frames: int = 12, seed: int = 1, size_rad: float = 0.3) -> Motion:
-    """The rest pose with every joint turned a little."""
+    """Return the rest pose with every joint rotated a little."""
     random = np.random.default_rng(seed)
     turns = quaternions.from_rotation_vector(random.normal(0.0, size_rad, (frames, skeleton.joint_count, 3)))
     rotations = np.asarray(quaternions.multiply(skeleton.rest_rotations, turns), dtype=np.float64)
@@ -94,7 +94,7 @@ def _spins(skeleton: Skeleton, motion: Motion, joint: int) -> np.ndarray:
 
 
 def _targets_everywhere(skeleton: Skeleton, motion: Motion) -> list[Target]:
-    """One of each kind, near where the joints are, with tool tips and partial axes."""
+    """Return one target of each kind near the present positions, also with offsets and with some axes only."""
     random = np.random.default_rng(5)
     places = motion.positions(skeleton)
     wrist, ankle, head = (_joint(skeleton, name) for name in ("left_wrist", "right_ankle", "head"))
@@ -430,7 +430,10 @@ def test_a_limb_that_is_straight_or_folded_bends_about_its_hinge(body: Skeleton)
 
 
 def _bending_leg(body: Skeleton, bends_rad: np.ndarray, aside_rad: float) -> tuple[Motion, TwoBoneLimb]:
-    """A hanging left leg whose knee goes through these bends, forwards, each with so much of it aside."""
+    """Return a hanging left leg whose knee bends forwards by these angles, and its limb.
+
+    The axis of the knee is turned aside by `aside_rad`.
+    """
     frames = len(bends_rad)
     rotations = np.repeat(body.rest_rotations[None], frames, axis=0)
     limb = limb_ending_at(body, map_joints(body), body.index_of("LeftFoot"), guess_axes(body, map_joints(body)))

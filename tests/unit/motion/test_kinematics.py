@@ -19,7 +19,7 @@ from marey_motion.skeleton import EndSite, Skeleton
 
 
 def reference(clip: Clip) -> tuple[Floats, Floats]:
-    """Positions and rotations one frame and joint at a time, with another library's rotations."""
+    """Return positions and rotations, computed for one frame and joint at a time with another library."""
     skeleton = clip.skeleton
     sites = skeleton.end_sites
     positions = np.zeros((clip.frame_count, skeleton.joint_count + len(sites), 3))
@@ -128,7 +128,7 @@ def test_a_falling_body_has_its_velocity_in_every_frame() -> None:
 
 
 def facing(heading: Floats, tilt: float = 0.0) -> Floats:
-    """Left and right hip of a body that faces `heading`, leaning to its side."""
+    """Return the positions of the left and right hip of a body that faces `heading` and leans to its side."""
     left = np.stack((np.cos(heading) * np.cos(tilt), np.full_like(heading, np.sin(tilt)), -np.sin(heading)), axis=1)
     return np.stack((0.1 * left, -0.1 * left), axis=1)
 

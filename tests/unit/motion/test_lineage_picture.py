@@ -46,7 +46,7 @@ def graph_of(*revisions: LineageRevision, links: list[tuple[int, int]], **member
 
 
 def retargeted(count: int, name: str = "walk", **members: Any) -> LineageGraph:
-    """An evaluation of `count` retargeted clips, the first of which is outdated."""
+    """Return the lineage of an evaluation of `count` retargeted clips, the first of which is outdated."""
     raw = [revision(f"raw/{name} {place}", -2, newest=1 + (place == 0)) for place in range(count)]
     results = [revision(f"target/{name} {place}", -1, job="job_retarget") for place in range(count)]
     start = revision(f"{name} report", 0, kind=Kind.EVALUATION, job="job_evaluate")

@@ -33,7 +33,7 @@ def built(
 
 
 def stood(database: MatchingDatabase) -> NDArray[np.float32]:
-    """(N, J, 3) joints of all rows, their poses hung from their own roots as the database's docstring says."""
+    """Return the joint positions (N, J, 3) of all rows in the world, computed as the docstring of the database says."""
     poses = database.poses.astype(np.float64)
     poses[:, [0, 2]] = rotated(poses[:, [0, 2]], database.root_headings) + database.root_positions
     poses[:, 3:7] = quaternions.multiply(about_vertical(database.root_headings), poses[:, 3:7])
@@ -46,7 +46,7 @@ def stood(database: MatchingDatabase) -> NDArray[np.float32]:
 
 
 def on_the_ground(clip: Clip, turn_rad: float, shift: tuple[float, float]) -> Clip:
-    """The clip turned about the vertical and put elsewhere."""
+    """Return the clip rotated about the vertical and shifted on the ground."""
     poses = clip.poses.astype(np.float64)
     poses[:, [0, 2]] = rotated(poses[:, [0, 2]], turn_rad) + shift
     poses[:, 3:7] = quaternions.multiply(about_vertical(np.array(turn_rad)), poses[:, 3:7])
@@ -54,7 +54,10 @@ def on_the_ground(clip: Clip, turn_rad: float, shift: tuple[float, float]) -> Cl
 
 
 def game_walk() -> tuple[Clip, MatchingBody]:
-    """A walk of a skeleton whose root stands on the ground below the pelvis, and has other local axes."""
+    """Return a walk of a skeleton whose root is on the ground below the pelvis, and its body.
+
+    The root has other local axes than the world.
+    """
     target = game_skeleton()
     source = WALK.skeleton
     mapping, target_mapping = map_joints(source), map_joints(target)
@@ -64,7 +67,10 @@ def game_walk() -> tuple[Clip, MatchingBody]:
 
 
 def left_behind(clip: Clip) -> tuple[Clip, MatchingBody]:
-    """The clip under a reference joint that stays where it is, turned; its hips move by position channels."""
+    """Return the clip below a rotated reference joint that does not move, and its body.
+
+    The hips move by position channels.
+    """
     plain = clip.skeleton
     start = np.array(quaternions.from_axis_angle((0.2, 1.0, 0.1), 0.7))
     skeleton = Skeleton(

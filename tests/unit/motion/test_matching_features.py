@@ -24,7 +24,7 @@ def built(clip: Clip, options: DatabaseOptions = DEFAULTS) -> MatchingDatabase:
 
 
 def moved(clip: Clip) -> Clip:
-    """With a spine and a wrist that move against their parents."""
+    """Return the clip with a spine and a wrist that move relative to their parents."""
     joints = tuple(sorted(BODY.standard_joints[name] for name in ("spine", "left_wrist")))
     seconds = np.arange(clip.frame_count)[:, None, None] / 60.0
     translations = clip.skeleton.offsets[list(joints)] + 0.02 * np.sin(3.0 * seconds + np.arange(6).reshape(2, 3))

@@ -74,7 +74,7 @@ def test_a_circle_without_approach_is_followed_exactly() -> None:
 
 @pytest.fixture(scope="module")
 def grid() -> dict[tuple[float, float], object]:
-    """Ten seconds of every pair of speed and turn rate."""
+    """Tracks of ten seconds for every pair of speed and turn rate."""
     return {(v, w): arc_track(v, w, 10.0) for v in np.arange(1.0, 3.01, 0.25) for w in np.arange(-100.0, 100.1, 25.0)}
 
 

@@ -25,7 +25,7 @@ def built(clip: Clip, options: DatabaseOptions = LOOPS, *, loop: bool = True) ->
 
 
 def stride_frames(clip: Clip) -> int:
-    """Frames after which the walk repeats itself best."""
+    """Return the number of frames after which the walk repeats itself best."""
     database = built(clip, DatabaseOptions(), loop=False)
     points = database.pose_points[60:]
     lengths = np.arange(30, 120)

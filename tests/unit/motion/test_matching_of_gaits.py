@@ -35,7 +35,7 @@ def circle(speed: float, turn_rate_deg: float, **options: float) -> Trial:
 
 
 def take(uid: str, *segments: tuple[float, float, float]) -> SourceClip:
-    """A walk or run along segments of (seconds, speed in m/s, turn rate in deg/s)."""
+    """Return a walk or run along segments of (seconds, speed in m/s, turn rate in deg/s)."""
     path = RootPath(tuple(PathSegment(seconds, speed, float(np.radians(turn))) for seconds, speed, turn in segments))
     return SourceClip(uid, uid, generate_along(path))
 
@@ -62,7 +62,7 @@ def offsets(record: TrialRecord, trial: Trial) -> np.ndarray:
 
 
 def static_errors(record: TrialRecord, trial: Trial) -> tuple[float, float]:
-    """Bias of speed in m/s and of turn rate in deg/s, after the approach."""
+    """Return the mean error of the speed in m/s and of the turn rate in deg/s, after the approach."""
     first = round(trial.approach_s * 60)
     speed = np.linalg.norm(np.diff(record.positions, axis=0), axis=1)[first:].mean() * 60
     turn_rate = np.degrees(np.diff(record.headings))[first:].mean() * 60
@@ -188,7 +188,7 @@ def test_the_mirrored_dataset_mirrors_the_result(
 
 
 def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, int]]:
-    """Source clip and frame of each displayed row."""
+    """Return the source clip and the frame of each displayed row."""
     found = []
     for row in record.rows.tolist():
         clip = database.clips[database.clip_of_row[row]]
@@ -272,7 +272,7 @@ def test_a_loop_of_two_strides_walks_on_for_half_a_minute() -> None:
 
 
 def best_stride(walk: Clip) -> int:
-    """Frames after which the pose repeats."""
+    """Return the number of frames after which the pose repeats best."""
     rotations = walk.rotations[300:].astype(np.float64)
     distances = [np.linalg.norm(rotations[lag] - rotations[0]) for lag in range(40, 100)]
     return 40 + int(np.argmin(distances))

@@ -22,7 +22,7 @@ METHODS: tuple[Method, ...] = ("boxes", "scan", "auto")
 
 
 def true_costs(rows: Floats, query: Floats, weights: Floats | None = None) -> Floats:
-    """(N,) squared distances, summed in the order of the dimensions."""
+    """Return the squared distances (N,) of rows from a query, summed in the order of the dimensions."""
     costs = np.zeros(len(rows))
     for d in range(rows.shape[1]):
         difference = rows[:, d] - query[d]
@@ -45,7 +45,7 @@ def clips_of(rows: int, frames: int) -> Ints:
 
 
 def gait_like(rows: int, dimensions: int, rng: Generator) -> Floats:
-    """Clips of 90 rows, each a few harmonics of its own stride about its own mean."""
+    """Return clips of 90 rows, each the sum of a few harmonics of its own stride about its own mean."""
     clips = -(-rows // 90)
     time = np.arange(90)[:, None, None] / 60
     orders = np.arange(1, 4)
@@ -91,7 +91,7 @@ DATABASES = (gait_like, gaussian, quantised, constant, denormal, tiny_squares, f
 
 
 def queries_for(rows: Floats, count: int, rng: Generator) -> Floats:
-    """Rows, rows moved by a little or by a float32 step, and mixtures of two."""
+    """Return queries: rows, rows moved by a little or by one step of float32, and mixtures of two rows."""
     first, second = rng.integers(0, len(rows), (2, count))
     queries = rows[first].copy()
     half = rows.shape[1] // 2

@@ -23,7 +23,7 @@ def partners_of(skeleton: Skeleton) -> NDArray[np.int32]:
 
 
 def wild(skeleton: Skeleton, seed: int, *, translated: tuple[int, ...] = ()) -> Clip:
-    """Frames of arbitrary rotations, one per joint."""
+    """Return a clip of random rotations, one frame for each joint."""
     rng = np.random.default_rng(seed)
     rotations = rng.standard_normal((20, skeleton.joint_count, 4))
     rotations /= np.linalg.norm(rotations, axis=-1, keepdims=True)
@@ -38,7 +38,7 @@ def same_motion(a: Clip, b: Clip) -> bool:
 
 
 def with_rest_pose(skeleton: Skeleton, turns: NDArray[np.float64]) -> Skeleton:
-    """The same bones with other local axes: each joint's frame turned by `turns` (J, 4)."""
+    """Return the skeleton with other local axes: the frame of each joint is rotated by `turns` (J, 4)."""
     parents = np.concatenate(([[1.0, 0.0, 0.0, 0.0]], turns[skeleton.parents[1:]]))
     offsets = quaternions.rotate_vectors(quaternions.conjugate(parents), skeleton.offsets)
     rest = quaternions.multiply(quaternions.multiply(quaternions.conjugate(parents), skeleton.rest_rotations), turns)
@@ -55,13 +55,16 @@ def random_turns(count: int, seed: int) -> NDArray[np.float64]:
 
 
 def own_axes() -> Skeleton:
-    """The studio skeleton with arbitrary local axes, different on both sides."""
+    """Return the studio skeleton with random local axes, which differ between both sides."""
     plain = studio_skeleton()
     return with_rest_pose(plain, random_turns(plain.joint_count, 3))
 
 
 def raised_arm() -> Skeleton:
-    """The studio skeleton whose left arm points up and whose right leg points sideways at rest; axes as the world's."""
+    """Return the studio skeleton whose left arm points up and whose right leg points sideways at rest.
+
+    The local axes are parallel to those of the world.
+    """
     plain = studio_skeleton()
     offsets = plain.offsets.copy()
     quarter = quaternions.from_axis_angle((0.0, 0.0, 1.0), 0.5 * np.pi)

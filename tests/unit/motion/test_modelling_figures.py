@@ -268,7 +268,7 @@ def test_search_errors_are_drawn_beside_each_other() -> None:
 
 
 def headless(aligned: AlignedSet) -> AlignedSet:
-    """The same motions of a skeleton that knows no joint by its name."""
+    """Return the same motions on a skeleton whose joint names are unknown."""
     old = aligned.skeleton
     names = tuple(f"j{number}" for number in range(old.joint_count))
     bare = Skeleton(names, old.parents, old.offsets, old.rest_rotations)
@@ -282,7 +282,7 @@ def alike(aligned: AlignedSet, count: int) -> AlignedSet:
 
 
 def backwards(aligned: AlignedSet) -> AlignedSet:
-    """Motions that stay below the floor and go backwards."""
+    """Return motions that stay below the floor and move backwards."""
     clips = []
     for clip in aligned.clips:
         moved = clip.motion.root_translations * (1.0, 1.0, -3.0) - (0.0, 2.5, 0.0)

@@ -24,7 +24,7 @@ CHANNELS = 11
 
 
 def some(examples: int = 12, seed: int = 0, rank: int | None = None) -> Floats:
-    """Coefficients (examples, 8, 11) of full rank, or of a lower one."""
+    """Return coefficients (examples, 8, 11) of full rank, or of the rank `rank`."""
     random = np.random.default_rng(seed)
     if rank is None:
         return random.standard_normal((examples, 8, CHANNELS))
@@ -142,7 +142,7 @@ def test_signs_of_components_do_not_depend_on_the_order_of_the_examples() -> Non
 
 
 def turning(turns: float, frames: int = 60) -> Floats:
-    """One joint that turns about y, (frames, 1, 4)."""
+    """Return the rotations (frames, 1, 4) of one joint that turns about y."""
     angles = np.linspace(0.0, 2.0 * np.pi * turns, frames)
     return quaternions.from_axis_angle((0.0, 1.0, 0.0), angles).astype(np.float64)[:, None]
 

@@ -16,7 +16,7 @@ from marey_schemas.options.modelling import MixtureOptions
 
 
 def two_kinds(examples: int = 200, dimensions: int = 3, apart: float = 8.0, seed: int = 0) -> Floats:
-    """Examples of two well separated kinds, 3 to 2."""
+    """Return examples of two well separated kinds, in the ratio 3 to 2."""
     random = np.random.default_rng(seed)
     kinds = random.random(examples) < 0.6
     return random.standard_normal((examples, dimensions)) + apart * np.where(kinds, 0.5, -0.5)[:, None]

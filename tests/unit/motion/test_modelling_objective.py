@@ -44,7 +44,7 @@ EVERY_KIND = (
 
 
 def world(primitive: MotionPrimitive, latents: Floats, frame: float) -> tuple[AnyFloats, AnyFloats]:
-    """Positions (n, J, 3) and rotations (n, J, 4) at a canonical frame, in the world."""
+    """Return positions (n, J, 3) and rotations (n, J, 4) in the world, at a canonical frame."""
     poses = primitive.poses(latents, [frame])[:, 0]
     turn = quaternions.from_axis_angle((0.0, 1.0, 0.0), PLACEMENT.heading_rad)
     positions = quaternions.rotate_vectors(turn, forward_kinematics(primitive.skeleton, poses))
@@ -63,7 +63,7 @@ def frame_of(primitive: MotionPrimitive, at: float | str) -> float:
 
 
 def plain_error(primitive: MotionPrimitive, joints: dict[str, int], latents: Floats, constraint: Any) -> AnyFloats:
-    """The error of one constraint, from whole poses."""
+    """Return the error of one constraint, computed from whole poses."""
     frame = frame_of(primitive, constraint.at)
     positions, rotations = world(primitive, latents, frame)
     match constraint:
@@ -107,7 +107,7 @@ def test_errors_are_those_of_the_whole_motions() -> None:
 
 
 def kept_within(count: int) -> tuple[MotionPrimitive, Floats]:
-    """A primitive whose motions last 0.9 to 1.1 s, and latent vectors of which many would last longer or shorter."""
+    """Return a model whose motions last 0.9 to 1.1 s, and latent vectors of which many would last shorter or longer."""
     free, _ = walking()
     latents = free.sample(count, 1)
     lasting = free.durations_s(latents)
@@ -135,7 +135,7 @@ def test_times_are_those_of_motions_that_are_kept_within_their_range() -> None:
 
 
 def cut_off(count: int) -> tuple[MotionPrimitive, Floats]:
-    """A primitive whose steps are cut off at half the range that its latent vectors draw, and such vectors."""
+    """Return a model that limits its time steps to the middle half of those of its latent vectors, and such vectors."""
     free, _ = walking()
     latents = free.sample(count, 1)
     drawn = np.log(np.diff(free.time_functions(latents), axis=1))

@@ -44,7 +44,7 @@ def objective_of(primitive: MotionPrimitive, constraints: tuple[Any, ...], joint
 def posterior(
     primitive: MotionPrimitive, constraints: tuple[Any, ...], joints: dict[str, int], weight: float
 ) -> Callable[..., Any]:
-    """½ Σ w (e / σ)² - λ ln p, from errors alone."""
+    """Return the function ½ Σ w (e / σ)² - λ ln p of a latent vector, computed from the errors alone."""
     objective = objective_of(primitive, constraints, joints)
     scales = np.array(
         [one.weight / tolerance**2 for one, tolerance in zip(constraints, tolerances(constraints), strict=True)]
@@ -82,7 +82,7 @@ def test_without_constraints_the_result_is_the_mean() -> None:
 
 
 def slopes_of(cost: Callable[..., Any], latents: Floats) -> list[float]:
-    """By central differences."""
+    """Return the derivatives of a cost, computed by central differences."""
     return [(cost(latents + 1e-5 * one) - cost(latents - 1e-5 * one)) / 2e-5 for one in np.eye(len(latents))]
 
 

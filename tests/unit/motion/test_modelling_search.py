@@ -30,7 +30,7 @@ EVERYTHING = 10**6
 
 
 def search_all(objective: Objective, tree: SampleTree, *, top: int = 1) -> FoundSamples:
-    """Evaluate every sample, without the tree."""
+    """Return the best samples, found by evaluating all samples without the tree."""
     costs = objective.costs(tree.samples.astype(np.float64))
     chosen = np.lexsort((np.arange(len(costs)), costs))[:top]
     return FoundSamples(chosen, tree.samples[chosen].astype(np.float64), costs[chosen], len(costs))
@@ -51,7 +51,7 @@ TARGETS = st.tuples(st.floats(-0.5, 0.8), st.floats(0.5, 1.5), st.floats(0.0, 1.
 
 
 def plain_beam(objective: Objective, tree: SampleTree, candidates: int) -> tuple[float, int]:
-    """The best sample by a beam, one node at a time."""
+    """Return the cost and the index of the best sample that a beam search finds, one node at a time."""
 
     def cost(latent: NDArray[Any]) -> float:
         return float(objective.costs(np.asarray(latent, dtype=np.float64)[None])[0])
@@ -190,9 +190,12 @@ def test_what_lies_between_samples_is_told_from_samples_and_costs_what_it_says()
 
 
 def own_keyframes(**options: Any) -> tuple[list[Objective], SampleTree, list[tuple[JointPositionConstraint]], Floats]:
-    """A model of walks is asked to put the left wrist where each of its examples has it at the keyframe.
+    """Return one search for each example of a model of walks.
 
-    Objectives by example, the model's tree, constraints by example, and the latent vectors (m, L) of the examples.
+    A search puts the left wrist where its example has it at the keyframe.
+
+    Returns the objectives by example, the tree of the model, the constraints by example, and the latent vectors (m, L)
+    of the examples.
     """
     aligned, joints = walks(24), standard_joints()
     primitive = train_primitive(aligned, ModelOptions(leave_one_out=False, report_samples=0, **options)).primitive

@@ -53,7 +53,7 @@ def test_places_that_unseen_takes_reached_are_found_and_met(mocap: Path) -> None
 
 
 def _on_one_skeleton(clips: list[Clip]) -> list[Clip]:
-    """All clips on the skeleton of the first."""
+    """Return all clips on the skeleton of the first one."""
 
     def rigged(skeleton: Skeleton) -> tuple[Skeleton, JointMapping, dict[str, JointAxes]]:
         mapping = map_joints(skeleton)

@@ -11,7 +11,7 @@ COUNTS = [*range(1, 130), 1000, 4097]
 
 
 def samples(count: int, dtype: type[np.floating]) -> list[np.ndarray]:
-    """Random values, rounded ones that repeat and have negative zeros, tiny ones and some with a value missing."""
+    """Return random values, rounded values that repeat and contain negative zeros, tiny values, and some with a NaN."""
     values = np.random.default_rng(count).normal(size=count)
     missing = values.copy()
     missing[count // 3] = np.nan

@@ -23,7 +23,7 @@ CHAIN = Skeleton(
 
 
 def swinging(frames: int, rate_hz: float) -> Clip:
-    """A chain on a smooth course, the same motion at any rate."""
+    """Return a clip of a chain that swings smoothly; the motion is the same at any frame rate."""
     seconds = np.arange(frames) / rate_hz
     poses = np.zeros((frames, 15))
     poses[:, 0], poses[:, 1], poses[:, 2] = np.sin(seconds), 1.0, 0.5 * seconds**2

@@ -51,12 +51,12 @@ def plan_between(source: Actor | SimpleNamespace, target: Actor | SimpleNamespac
 
 
 def resting(skeleton: Skeleton) -> Clip:
-    """A clip of one frame at rest."""
+    """Return a clip of one frame in the rest pose."""
     return Clip(skeleton, 60.0, np.concatenate((skeleton.offsets[0], skeleton.rest_rotations.ravel()))[None])
 
 
 def tumbling(skeleton: Skeleton, frames: int = 200, seed: int = 4) -> Clip:
-    """Rotations of any kind, half turns among them, that no body makes."""
+    """Return a clip of random rotations, some of them half turns, which no body can perform."""
     generator = np.random.default_rng(seed)
     rotations = quaternions.normalise(generator.normal(size=(frames, skeleton.joint_count, 4)))
     rotations[0] = quaternions.identity()
@@ -92,7 +92,7 @@ def real(mocap: Path) -> dict[str, Actor]:
 
 
 def degrees_between(a: AnyFloats, b: AnyFloats) -> AnyFloats:
-    """Angles between directions, exact for small ones."""
+    """Return the angles between directions in degrees, exact for small angles."""
     a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(float), b.astype(float)))
     return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
@@ -147,7 +147,7 @@ def assert_changes_nothing(plan: RetargetPlan) -> None:
 
 
 def assert_pelvis_travels(source: Actor, target: Actor, clip: Clip, result: Clip, plan: RetargetPlan) -> None:
-    """As far as the source's, times the scale."""
+    """Check that the pelvis of the result moves like that of the source, times the scale."""
     expected = plan.scale * kinematics.global_positions(clip)[:, source.joint("pelvis")].astype(np.float64)
     found = kinematics.global_positions(result)[:, target.joint("pelvis")].astype(np.float64)
     assert np.abs(found - expected).max() < 1e-6
@@ -160,14 +160,14 @@ def assert_same_motion(result: Clip, expected: Clip) -> None:
 
 
 def after_rest_pose(clip: Clip) -> Clip:
-    """The clip with the rest pose as a frame before it."""
+    """Return the clip with the rest pose as an additional first frame."""
     return Clip(
         clip.skeleton, clip.frame_rate_hz, np.concatenate((resting(clip.skeleton).poses, clip.poses), dtype=np.float32)
     )
 
 
 def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
-    """The skeleton with both arms lowered at rest, from reaching out sideways."""
+    """Return the skeleton with both arms lowered at rest, from a pose that stretches them out sideways."""
     rest = skeleton.rest_rotations.copy()
     for name, sign in (("LeftArm", -1.0), ("RightArm", 1.0)):
         arm = skeleton.index_of(name)
@@ -177,7 +177,7 @@ def with_lowered_arms(skeleton: Skeleton, angle_deg: float) -> Skeleton:
 
 
 def algorithm_1(source: SimpleNamespace, target: Actor, plan: RetargetPlan, frame: int) -> Floats:
-    """Local rotations (K, 4) of one pose as the paper's Algorithm 1 finds them, joint by joint."""
+    """Return the local rotations (K, 4) of one pose, computed joint by joint as in Algorithm 1 of the paper."""
     source_global = kinematics.global_rotations(source.clip).astype(np.float64)[frame]
     target_global = quaternions.identity(target.skeleton.joint_count)
     local = target.skeleton.rest_rotations.copy()
@@ -345,7 +345,7 @@ def test_translations_of_the_source_move_its_pelvis_but_stretch_no_bone(game: Ac
 
 
 def with_moved_joints(actor: Actor, *standards: Any, by_m: float = 0.08) -> Clip:
-    """The actor's clip with joints that move against their parents, each its own way."""
+    """Return the actor's clip with joints that move relative to their parents, each in a different way."""
     joints = sorted(actor.joint(standard) for standard in standards)
     time = np.arange(actor.clip.frame_count)[:, None, None] / 20.0
     ways = by_m * np.sin(time + np.arange(3 * len(joints)).reshape(1, -1, 3))
@@ -378,7 +378,7 @@ def test_bones_that_translations_moved_are_told_with_their_joints(studio: Actor,
 
 
 def bones_followed_by_numpy(clip: Clip, joints: dict[str, int]) -> tuple[AnyFloats, dict[str, float]]:
-    """Rotations (F, 4·J) and largest turns in degrees, by the formula in numpy, bone by bone."""
+    """Return rotations (F, 4·J) and largest turns in degrees, computed by the formula in numpy, bone by bone."""
     still = replace(clip, translations=None, translated_joints=())
     rigid, moved = (kinematics.global_positions(one).astype(np.float64) for one in (still, clip))
     turned, largest = kinematics.global_rotations(clip).astype(np.float64), {}

@@ -22,14 +22,14 @@ PARTS = ("trunk", "left arm", "left leg", "right arm", "right leg")
 
 
 def at_rest(skeleton: Skeleton, axes: dict[str, JointAxes], name: str) -> tuple[AnyFloats, AnyFloats]:
-    """Twist and swing of a joint in the world of the rest pose."""
+    """Return twist and swing axis of a joint in the world, in the rest pose."""
     rotation = skeleton.rest_global_rotations[skeleton.index_of(name)]
     twist, swing = (quaternions.rotate_vectors(rotation, axis) for axis in (axes[name].twist, axes[name].swing))
     return twist, swing
 
 
 def with_arms(body: Skeleton, direction_left: tuple[float, float, float]) -> Skeleton:
-    """The body with straight arms in another direction; the right arm mirrors the left one."""
+    """Return the body with straight arms in another direction; the right arm mirrors the left one."""
     offsets = body.offsets.copy()
     for name in ("LeftForeArm", "LeftHand"):
         length = np.linalg.norm(offsets[body.index_of(name)])
@@ -109,7 +109,7 @@ def test_a_hand_with_fingers_swings_across_its_palm(body: Skeleton) -> None:
 
 
 def reframed(clip: Clip, seed: int) -> tuple[Clip, AnyFloats]:
-    """The same motion on a rig with other local frames, and with all its bones on odd lines at rest."""
+    """Return the same motion on a rig with other local axes, whose bones have random directions at rest."""
     body = clip.skeleton
     random = np.random.default_rng(seed)
     frames = quaternions.normalise(random.normal(size=(body.joint_count, 4)))
@@ -127,7 +127,7 @@ def reframed(clip: Clip, seed: int) -> tuple[Clip, AnyFloats]:
 
 @pytest.fixture
 def exercising(body: Skeleton) -> Clip:
-    """Knees and elbows bend and the body turns, from a T-pose with the arms let down."""
+    """A clip that begins in a T-pose with lowered arms; then knees and elbows bend and the body turns."""
     frames = 50
     phase = np.linspace(0, 4 * np.pi, frames)
     rotations = quaternions.identity(frames, body.joint_count)

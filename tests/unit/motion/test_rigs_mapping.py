@@ -93,7 +93,7 @@ RIGS = {
 
 
 def renamed(body: Skeleton, rig: tuple[str, str, tuple[str, str]]) -> tuple[Skeleton, dict[str, str]]:
-    """The body under another rig's names, with the names expected of each standard joint."""
+    """Return the body with the names of another rig, and the expected name for each standard joint."""
     centre, of_left, (left, right) = rig
     limbs = of_left.split()
     names = dict(zip(("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"), centre.split(), strict=True))
@@ -116,7 +116,7 @@ def test_a_known_rig_is_recognised_and_every_joint_gets_its_standard_name(body: 
 
 
 def with_a_sword(skeleton: Skeleton, hand: int) -> Skeleton:
-    """The skeleton with two joints more that hang from a hand and reach farther than its fingers."""
+    """Return the skeleton with two more joints that hang from a hand and reach farther than its fingers."""
     return replace(
         skeleton,
         joint_names=(*skeleton.joint_names, "grip", "blade"),
@@ -204,7 +204,7 @@ def marked(skeleton: Skeleton, mark: Callable[..., Any]) -> Skeleton:
 
 
 def with_index_fingers(body: Skeleton) -> Skeleton:
-    """The body with three joints of an index finger on each hand, as most rigs call them."""
+    """Return the body with three joints of an index finger on each hand, named as in most rigs."""
     names, parents = list(body.joint_names), list(body.parents)
     for side in ("Left", "Right"):
         for level in (1, 2, 3):
@@ -269,7 +269,7 @@ def anonymous(skeleton: Skeleton) -> Skeleton:
 
 
 def with_chains(skeleton: Skeleton, *chains: Any) -> Skeleton:
-    """The skeleton with more joints: chains of (name of the joint it hangs on, offset, and the offsets below it)."""
+    """Return the skeleton with more joints: chains of (parent joint, offset, and the offsets of further joints)."""
     parents, offsets = list(skeleton.parents), [*skeleton.offsets]
     for parent, *bones in chains:
         for place, bone in enumerate(bones):
@@ -280,7 +280,7 @@ def with_chains(skeleton: Skeleton, *chains: Any) -> Skeleton:
 
 
 def with_twist_joints(skeleton: Skeleton, *names: Any) -> Skeleton:
-    """The skeleton with a joint more in the middle of the bones that lead to these joints."""
+    """Return the skeleton with one more joint in the middle of each bone that leads to these joints."""
     parents, offsets, order = list(skeleton.parents), [*skeleton.offsets], list(range(skeleton.joint_count))
     for name in names:
         joint = skeleton.index_of(name)
@@ -300,7 +300,7 @@ def with_twist_joints(skeleton: Skeleton, *names: Any) -> Skeleton:
 
 
 def both(parent: str, first: tuple[Any, ...], *others: Any) -> list[Any]:
-    """A chain on the left and its mirror image on the right."""
+    """Return a chain on the left and its mirror image on the right."""
     return [(parent, *((side * x, y, z) for x, y, z in (first, *others))) for side in (1, -1)]
 
 

@@ -37,7 +37,7 @@ def walk() -> Clip:
 
 
 def in_axes(clip: Clip, axes: np.ndarray) -> Clip:
-    """The same motion written down in other axes, which may be mirrored ones."""
+    """Return the same motion in other axes, which may be mirrored."""
     skeleton, sense = clip.skeleton, round(np.linalg.det(axes))
     turned = Skeleton(
         skeleton.joint_names,
@@ -100,7 +100,7 @@ def test_someone_lying_is_not_stood_up_silently(walk: Clip) -> None:
 
 
 def on_one_line(clip: Clip) -> Clip:
-    """The same motion of a skeleton whose bones all lie along x at rest, as those of some exporters do."""
+    """Return the same motion of a skeleton whose bones all point along x at rest, as some exporters write it."""
     skeleton = clip.skeleton
     line = np.array([1.0, 0.0, 0.0])
     bones = np.stack(
@@ -134,7 +134,7 @@ def test_a_rest_pose_on_one_line_tells_no_upward_axis_but_the_motion_does(walk: 
 
 
 def _fallen(walk: Clip) -> np.ndarray:
-    """One frame, held: the body lies along z, three metres up, far from any ground."""
+    """Return poses of a body that lies still along z, three metres above the ground."""
     poses = np.repeat(walk.poses[:1], 20, axis=0)
     poses[:, :3] = [0.0, 3.0, 5.0]
     poses[:, 3:7] = [np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]
@@ -142,7 +142,7 @@ def _fallen(walk: Clip) -> np.ndarray:
 
 
 def on_all_fours(facing: float) -> Clip:
-    """A body on hands and feet that crawls three metres along z, winding a little, towards +z or −z."""
+    """Return a clip of a body that crawls three metres along z on hands and feet, towards +z or −z."""
     places = {
         "Hips": (None, (0, 0.6, 0)),
         "Spine": ("Hips", (0, 0.6, 0.4)),

@@ -1,4 +1,4 @@
-"""Kernels are compiled ahead of the first file."""
+"""Compilation of kernels before the first file is read."""
 
 import os
 import subprocess
@@ -56,7 +56,7 @@ def test_a_module_that_imports_the_compiler_or_kernels_is_a_source_of_kernels(
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package of one kernel that was compiled, and whose origin is recorded."""
+    """A package with one compiled kernel and a recorded origin."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(warm_up, "PACKAGE", tmp_path)
     monkeypatch.setattr(warm_up, "STAMP", tmp_path / "__pycache__" / "kernels-compiled")

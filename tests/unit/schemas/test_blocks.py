@@ -18,7 +18,7 @@ from marey_schemas.encoding.blocks import BlockError
 
 
 def any_bits() -> st.SearchStrategy[NDArray[Any]]:
-    """Arrays of every travelling dtype and shape with any bit patterns: NaN payloads, infinities, denormals, -0.0."""
+    """Return a strategy for arrays of every allowed dtype and shape with any bit patterns, such as NaN and -0.0."""
 
     def of(dtype: str) -> st.SearchStrategy[NDArray[Any]]:
         shapes = hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=9)
@@ -28,7 +28,7 @@ def any_bits() -> st.SearchStrategy[NDArray[Any]]:
 
 
 def poses(frames: int, joints: int, seed: int = 0) -> NDArray[np.float32]:
-    """Smooth unit quaternions with a little noise behind a root translation: what a motion looks like."""
+    """Return poses like those of a motion: root translations, then smooth unit quaternions with a little noise."""
     random = np.random.default_rng(seed)
     time_s = np.arange(frames)[:, None, None] / 60
     phase, size = random.uniform(0, 6.28, (2, 1, joints, 4))

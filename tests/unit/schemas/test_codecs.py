@@ -32,7 +32,7 @@ def refusal(data: bytes, media_type: str, *, keep_blocks: bool = False, **limits
 
 
 def write(tree: Any, media_type: str) -> bytes:
-    """A message as another program would write it."""
+    """Return a message as another program would encode it."""
     if media_type == JSON:
         return json.dumps(tree).encode()
     return bytes(msgpack.packb(tree)) if media_type == MSGPACK else bytes(bson.encode(tree))

@@ -1,4 +1,4 @@
-"""Edits as documents."""
+"""Documents of edits."""
 
 import json
 from typing import Any

@@ -27,7 +27,7 @@ def server() -> Iterator[ForkServer]:
 
 
 def ids_from(child: ConnectedChild) -> list[int]:
-    """Ask a child for the process that loaded its module, its parent, itself and its session."""
+    """Return the ids of four processes: the one that loaded the child's module, its parent, itself, and its session."""
     child.send(b"who")
     answer = child.receive(WAIT_S)
     assert answer is not None

@@ -1,4 +1,4 @@
-"""Graphs of models: what holds together."""
+"""Documents of graphs of models, and the conditions that they must meet."""
 
 import copy
 from collections.abc import Callable

@@ -31,7 +31,7 @@ TIDY = declare()
 
 @pytest.fixture
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[EntryPoint]]:
-    """Entry points of other distributions, as the test fills them in."""
+    """Entry points of other packages; the test adds them to the list."""
     entries: list[EntryPoint] = []
     monkeypatch.setattr(job_kinds, "entry_points", lambda group: [e for e in entries if e.group == group])
     job_kinds.job_kinds.cache_clear()

@@ -6,7 +6,7 @@ from marey_schemas.lru import LruCache
 
 
 class Counting:
-    """Makes values and remembers for which keys."""
+    """Requests values from a cache, and records the keys for which values had to be computed."""
 
     def __init__(self, cache: LruCache[str, bytes], size: int = 100) -> None:
         self.cache = cache

@@ -24,7 +24,7 @@ def plan(*choices: dict[str, Any]) -> ModelPlan:
 
 
 def wiring(made: ModelPlan) -> dict[str, dict[str, Any]]:
-    """Inputs of every step, as they would be sent, in the order of the steps."""
+    """Return the inputs of every step in the form in which they are sent, in the order of the steps."""
     pipeline = model_pipeline(made)
     dumped = pipeline.model_dump(mode="json", exclude_unset=True)["steps"]
     return {name: dumped[name].get("inputs", {}) for name in order_steps(pipeline)}

@@ -19,7 +19,7 @@ UNITS = {
 
 
 def declared() -> list[type[Options]]:
-    """Every set of options that the room declares."""
+    """Return every class of options that the package declares."""
     modules = [importlib.import_module(f"{room.__name__}.{one.name}") for one in pkgutil.iter_modules(room.__path__)]
     found = {
         value

@@ -24,7 +24,7 @@ UNSENT_BYTES = 8 * 2**20
 
 
 class Kept(HTTPServer):
-    """Server that keeps its connections and answers nothing."""
+    """Server that keeps connections open and sends no answers."""
 
     streams: list[IOStream]
 

@@ -23,7 +23,7 @@ LIMITS = ChildLimits(children=2, requests=4, memory_mb=256, processor_s=1, wall_
 
 @pytest.fixture(scope="module", params=[False, pytest.param(True, marks=ONLY_WITH_FORKS)], ids=["single", "forked"])
 def children(request: pytest.FixtureRequest) -> Iterator[Children]:
-    """Two children, each of which loads modules, or which are forked from a process that has loaded them."""
+    """A pool of two child processes, which load modules themselves or are forked with modules loaded."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MAREY_DATABASE_URL", "postgresql://marey:hunter2@db/marey")
         patch.setenv("MAREY_TOKEN", "hunter2")
@@ -38,12 +38,12 @@ def run(pool: Children, function: str, payload: bytes = b"", *, caller: str = "r
 
 
 def start(pool: Children, function: str, payload: bytes = b"", *, caller: str = "rita") -> ChildTask[bytes]:
-    """Start a function in a child."""
+    """Start a function in a child process, and return its task."""
     return pool.submit(caller, f"{FUNCTIONS}:{function}", lambda: payload, bytes, lambda reason, work: None)
 
 
 def until(condition: Callable[[], Any]) -> None:
-    """Wait for a condition."""
+    """Wait until a condition is true; fail after some seconds."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline
@@ -51,7 +51,7 @@ def until(condition: Callable[[], Any]) -> None:
 
 
 def wait_for(pool: Children, folder: Path, name: str, *, caller: str) -> ChildTask[bytes]:
-    """Start a function that waits for a file, and wait until a child runs it."""
+    """Start a function that waits for a file, wait until a child runs it, and return its task."""
     task = start(pool, "wait_for", str(folder / name).encode(), caller=caller)
     until(lambda: (folder / name).exists() or task.future.done())
     assert not task.future.done(), task.future.exception()
@@ -59,17 +59,17 @@ def wait_for(pool: Children, folder: Path, name: str, *, caller: str) -> ChildTa
 
 
 def let_go(folder: Path, name: str) -> None:
-    """Let a function that waits return."""
+    """Create the file for which a function waits, so that it returns."""
     (folder / f"{name}.go").touch()
 
 
 def note(ended: list[str], caller: str, _future: object) -> None:
-    """Note whose order ended."""
+    """Record the caller whose task has ended."""
     ended.append(caller)
 
 
 def process_id(pool: Children) -> int:
-    """Return the process that ran a short function."""
+    """Return the id of the process that has run a short function."""
     return int(run(pool, "echo").split()[-1])
 
 

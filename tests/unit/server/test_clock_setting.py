@@ -26,7 +26,7 @@ Jump = Callable[[int], None]
 
 @pytest.fixture
 def jump(monkeypatch: pytest.MonkeyPatch) -> Jump:
-    """Set the clock of the machine ahead of the true time."""
+    """Function that makes the clock of the machine show a later time."""
     real = time.time_ns
 
     def set_ahead(by_ns: int) -> None:

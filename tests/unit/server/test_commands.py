@@ -27,7 +27,7 @@ def upgrade_in(folder: Path) -> None:
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """A data folder with a database that its server left."""
+    """A data folder with the database of a server that was stopped."""
     folder = tmp_path / "data"
     open_database(Settings(data=folder)).close()
     return folder
@@ -124,7 +124,7 @@ def test_a_token_that_cannot_be_made_is_refused_in_a_sentence(
 
 
 def start(**settings: Any) -> None:
-    """What `serve` begins with."""
+    """Create or open the database, as `serve` does first."""
     open_database(Settings(**settings)).close()
 
 

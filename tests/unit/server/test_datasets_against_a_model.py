@@ -50,7 +50,7 @@ class Made(NamedTuple):
 
 
 class Model:
-    """Commits and refs as plain dictionaries."""
+    """Expected commits, branches and tags, as dictionaries."""
 
     def __init__(self) -> None:
         self.commits: dict[str, Made] = {}
@@ -61,7 +61,7 @@ class Model:
         return {} if digest is None else self.commits[digest].state
 
     def ancestors(self, commits: Iterable[str]) -> set[str]:
-        """The commits and all that they follow."""
+        """Return these commits and all commits before them."""
         found: set[str] = set()
         waiting = list(commits)
         while waiting:
@@ -72,7 +72,7 @@ class Model:
         return found
 
     def bases(self, ours: str, theirs: str) -> set[str]:
-        """The nearest common commits."""
+        """Return the nearest common commits of two commits (the merge bases)."""
         shared = self.ancestors([ours]) & self.ancestors([theirs])
         return shared - self.ancestors(parent for one in shared for parent in self.commits[one].parents)
 
@@ -83,7 +83,7 @@ class Model:
         return found
 
     def origin(self, digest: str, path: str) -> str:
-        """The commit that last changed the item at a path."""
+        """Return the commit that last changed the item at a path."""
         made = self.commits[digest]
         for parent in made.parents:
             if self.commits[parent].state.get(path) == made.state[path]:
@@ -92,7 +92,7 @@ class Model:
 
 
 def merged(base: State, ours: State, theirs: State, take: Side | None) -> tuple[State, set[str]]:
-    """The three-way merge of three states, and the paths in conflict."""
+    """Return the three-way merge of three states, and the paths with conflicts."""
     result: dict[str, int | None] = {}
     conflicts = set()
     for path in PATHS:
@@ -109,14 +109,14 @@ def merged(base: State, ours: State, theirs: State, take: Side | None) -> tuple[
 
 @contextmanager
 def refused(*codes: str) -> Iterator[None]:
-    """Expect an error with one of the codes."""
+    """Check that the `with` block raises an error with one of these codes."""
     with pytest.raises(ApiProblem) as caught:
         yield
     assert caught.value.error_code in codes, caught.value.detail
 
 
 class DatasetMachine(RuleBasedStateMachine):
-    """People who change one dataset."""
+    """Users who change one dataset."""
 
     serial = itertools.count()
 
@@ -361,7 +361,7 @@ class DatasetMachine(RuleBasedStateMachine):
 
 @pytest.fixture
 def known_items(lab: Lab) -> dict[str, str]:
-    """The ids of items with three revisions by path; no two revisions have the same content."""
+    """The ids of items with three revisions, by path; all revisions have different content."""
 
     def make(tx: Transaction) -> dict[str, str]:
         tx.principal = lab.owner

@@ -21,7 +21,7 @@ SetFree = Callable[[int], None]
 
 @pytest.fixture
 def set_free(monkeypatch: pytest.MonkeyPatch) -> SetFree:
-    """Pretend that a disk has a number of free bytes beside the reserve."""
+    """Function that simulates a disk with this number of free bytes in addition to the reserve."""
 
     def set_bytes(free: int) -> None:
         def usage(folder: Path) -> SimpleNamespace:

@@ -22,7 +22,7 @@ from marey_server.store.transaction import Transaction
 
 @contextmanager
 def open_transaction(database: Database) -> Iterator[Transaction]:
-    """A transaction that commits at the end of the block, on a connection of its own."""
+    """Yield a transaction on a separate connection; it is committed after the `with` block."""
     with database.engine.connect() as connection, connection.begin():
         yield Transaction(connection, SYSTEM, database.clock, database.blobs)
 
@@ -67,7 +67,7 @@ class Overlap:
             self.received.append(one.subject)
 
     def end(self) -> None:
-        """Commit what is open, and read the rest."""
+        """Commit all open transactions, and read the remaining events."""
         for name in list(self.open):
             self.turn(name)
         self.lab.database.write(SYSTEM, events.number_events)
@@ -143,7 +143,7 @@ def test_many_events_are_numbered_in_parts(lab: Lab, monkeypatch: pytest.MonkeyP
 
 
 def older_rows(database: Database) -> list[dict[str, Any]]:
-    """Rows of a feed whose order, by transaction, is not the order of insertion; on SQLite it is."""
+    """Return rows of events; on Postgres, their order by transaction differs from the order of insertion."""
     transactions = [0] * 6 if database.is_sqlite else [9, 5, 9, 7, 5, 8]
     common = {"at_us": 1, "project_id": None, "kind": "old", "subject": "s", "body": {}}
     return [{**common, "seq": 10 * (n + 1), "xid": xid} for n, xid in enumerate(transactions)]

@@ -71,7 +71,10 @@ def test_events_are_for_members_and_administrators(lab: Lab) -> None:
 
 
 def once(tx: Transaction, key: str = "k", fingerprint: str = "f", *, fail: bool = False) -> StoredAnswer | None:
-    """A request that counts up the project's title, once per key."""
+    """Append to the title of the project, but only once for each idempotency key.
+
+    Returns the stored answer of an earlier request with the key, or None.
+    """
     stored = idempotency.begin(tx, key, fingerprint)
     if stored is not None:
         return stored

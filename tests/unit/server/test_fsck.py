@@ -31,7 +31,7 @@ FILE = b"HIERARCHY" * 1000
 
 
 class FullLab(Lab):
-    """A lab with a bit of everything."""
+    """Project that contains at least one row of every table that is checked."""
 
     def __init__(self, database: Database) -> None:
         super().__init__(database)

@@ -16,7 +16,7 @@ USUAL = "http://127.0.0.1:8460"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with a data folder at its usual place that holds a token."""
+    """The working directory, which contains a data folder with a token at its default place."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "marey-data").mkdir()
     (tmp_path / "marey-data" / "admin.token").write_text("marey_very_secret")

@@ -1,4 +1,4 @@
-"""Periodic chores of a server."""
+"""Periodic work of a server."""
 
 import asyncio
 from pathlib import Path

@@ -15,7 +15,7 @@ from marey_server.store.items import Draft
 
 
 def read_file(name: str, *, joints: int = 3, seed: int = 0) -> Any:
-    """A file that was read: a skeleton and a clip on it; the clip has `joints` of the skeleton's three."""
+    """Return the result of reading a file: a skeleton of three joints, and a clip with `joints` of them."""
     rig = f"{name}#skeleton"
     motion = motion_tree({"output": rig}, joints=joints, seed=seed)
     drafts = (

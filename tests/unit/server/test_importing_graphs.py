@@ -24,7 +24,7 @@ def parts() -> tuple[Mapping[str, Any], dict[str, Any]]:
 
 
 def add_models(lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], *paths: Any) -> dict[str, str]:
-    """The same model in several places; ids by path."""
+    """Create the same model at several paths; return the ids by path."""
     found, hierarchy = parts
     model = {**found["model"], "skeleton": {"output": "rig"}, "provenance": {}}
     drafts = [Draft("rig", Kind.SKELETON, "rig", {"hierarchy": hierarchy}, reuse="by_content")]
@@ -40,7 +40,7 @@ def add_models(lab: Lab, parts: tuple[Mapping[str, Any], dict[str, Any]], *paths
 
 
 def models_of(lab: Lab, *names: Any) -> list[str]:
-    """Ids of the models that the nodes of a graph in the folder `g` get."""
+    """Return the ids of the models that the nodes of a graph in the folder `g` refer to."""
     nodes = {("idle", name): GraphNode("?", "idle", (("idle", name),)) for name in names}
     graph = PredecessorGraph(nodes, ("idle", names[0]))
     draft = lab.read(graph_draft, "lab", ImportedGraph("graph", "g", (), graph, "graph.json", f"sha256:{'3' * 64}"))

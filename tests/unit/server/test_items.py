@@ -95,7 +95,7 @@ def cut_part(
     joints: Any = None,
     arrays: str = "encoded",
 ) -> dict[str, Any]:
-    """Some frames and joints of a part."""
+    """Return some frames and joints of a part."""
     tree = items.load_part(tx, items.find_part(tx, "lab", kind, item_id, part))
     return items.cut_part(tree, frames, joints, encoded=arrays == "encoded")
 

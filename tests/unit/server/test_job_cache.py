@@ -15,7 +15,7 @@ TRIM: dict[str, Any] = {"commands": [{"command": "trim", "stop": 3}]}
 
 
 def clips(desk: Desk, *names: str, collection: str = "walks") -> list[str]:
-    """Clips of one skeleton; their ids."""
+    """Create clips of one skeleton, and return their ids."""
     skeleton = Draft("rig", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}, collection="rigs")
     motion = motion_tree({"output": "rig"})
     drafts = [Draft(f"clip {name}", Kind.CLIP, name, {"motion": motion}, collection=collection) for name in names]
@@ -23,7 +23,7 @@ def clips(desk: Desk, *names: str, collection: str = "walks") -> list[str]:
 
 
 def annotations(desk: Desk, clip: str) -> dict[str, str]:
-    """A folder with one annotation of a clip, as the input of jobs."""
+    """Create a folder with one annotation of a clip; return the folder as the input of a job."""
     said = {"schema": "marey/annotation@1", "clip": {"item": clip, "revision": 1}, "layer": "a", "segments": []}
     desk.publish(Draft("said", Kind.ANNOTATION, "said", {"annotation": said}, collection="said"))
     return {"collection": "said"}

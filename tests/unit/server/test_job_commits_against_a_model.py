@@ -41,7 +41,7 @@ which = st.integers(0, 1_000)
 
 @dataclass
 class Running:
-    """Job of the model, which an attempt runs."""
+    """Expected state of a job that an attempt runs."""
 
     id: str
     lease: Lease
@@ -54,7 +54,7 @@ class Running:
 
 @dataclass
 class Model:
-    """Branches as plain dictionaries."""
+    """Expected branches, as dictionaries."""
 
     heads: dict[str, State] = field(default_factory=dict)
     commits: dict[str, int] = field(default_factory=dict)
@@ -95,7 +95,7 @@ def applied(state: State, changes: dict[str, int | None]) -> State:
 
 
 class CommittingMachine(RuleBasedStateMachine):
-    """Workers and people who change one dataset."""
+    """Workers and users who change one dataset."""
 
     serial = itertools.count()
 

@@ -19,7 +19,7 @@ STRANGER, OTHER = Client("192.0.2.1", known=False), Client("192.0.2.2", known=Fa
 
 @pytest.fixture
 def release() -> Iterator[threading.Event]:
-    """An event that ends whatever waits for it, at the latest with the test."""
+    """An event for which tests let calls wait; it is set at the end of the test at the latest."""
     event = threading.Event()
     yield event
     event.set()
@@ -106,7 +106,7 @@ def test_closing_without_waiting_cancels_what_is_queued(release: threading.Event
 
 
 class Tree:
-    """Decoded body."""
+    """Decoded body of a request."""
 
 
 def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:

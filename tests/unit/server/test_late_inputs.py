@@ -31,7 +31,7 @@ def make(desk: Desk, job: str, *names: str, **facts: Any) -> None:
 
 
 def square(desk: Desk) -> list[list[str]]:
-    """Do every squaring there is; the names of the things squared, attempt by attempt."""
+    """Complete all jobs of the kind `square`; return the names of the inputs of each attempt."""
     seen = []
     while leases := desk.claim_many(kinds=("square",)):
         for lease in sorted(leases, key=lambda lease: lease.position or 0):

@@ -24,7 +24,7 @@ Edges = Collection[tuple[int, int]]
 
 
 def study(lab: Lab, name: str, *sources: Published, role: str = "of", content: object = 1) -> Published:
-    """Publish a revision of a study that was made from others."""
+    """Publish a revision of a study with other items as sources, and return it."""
     draft = Draft(
         name, Kind.STUDY, name, {"study": {"of": name, "content": content}}, reuse="by_name",
         sources={role: [(one.item, one.revision) for one in sources]},

@@ -18,7 +18,7 @@ SLOW = ("marey_motion", "marey_server.motions.reading")
 
 
 def imports_in(function: ast.FunctionDef) -> set[int]:
-    """The lines at which a function imports the motion library."""
+    """Return the lines at which a function imports the motion library."""
     imports = (node for node in ast.walk(function) if isinstance(node, ast.ImportFrom))
     return {node.lineno for node in imports if (node.module or "").startswith(SLOW)}
 

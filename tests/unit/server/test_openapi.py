@@ -1,4 +1,4 @@
-"""The published description against the routes it describes."""
+"""The OpenAPI document, compared with the routes that it describes."""
 
 import json
 import re

@@ -32,7 +32,7 @@ def chain(number: int = 0) -> dict[str, Any]:
 
 
 def work_off(desk: Desk) -> int:
-    """Do whatever there is to do; how many attempts that took."""
+    """Complete all jobs that can be claimed; return the number of attempts."""
     attempts = 0
     while leases := desk.claim_many():
         for lease in leases:

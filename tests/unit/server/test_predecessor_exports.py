@@ -18,7 +18,7 @@ Part = Literal["model", "tree", "alignment"]
 
 @pytest.fixture(scope="module")
 def stored() -> tuple[Mapping[str, Any], dict[str, Any]]:
-    """The parts of a model with its tree, as they are stored when they are imported, and the skeleton's hierarchy."""
+    """The parts of an imported model with its tree, and the hierarchy of its skeleton."""
     parts, hierarchy = models.imported()
     model = {**parts["model"], "skeleton": {"item": "skeleton_1", "revision": 1}}
     return {"model": model, "tree": {**parts["tree"], "model_digest": FILE}}, hierarchy

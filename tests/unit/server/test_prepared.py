@@ -159,7 +159,7 @@ def test_a_broken_connection_is_told_as_such(database: Database) -> None:
 
 
 def prepared_statements() -> Iterator[str]:
-    """The names of all prepared statements of the store, by module."""
+    """Yield the names of all prepared statements of the store, by module."""
     for module in pkgutil.walk_packages(store.__path__, "marey_server.store."):
         for name, value in vars(importlib.import_module(module.name)).items():
             kept = value.values() if isinstance(value, dict) else (value,)

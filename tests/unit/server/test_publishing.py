@@ -137,7 +137,7 @@ def test_ids_of_a_batch_are_in_the_order_of_its_drafts(lab: Lab) -> None:
 
 @pytest.fixture
 def statements(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The statements that were run, those with many sets of values once."""
+    """List of the SQL statements that were run; one statement with many sets of values counts once."""
     run: list[str] = []
     event.listen(lab.database.engine, "before_cursor_execute", lambda *given: run.append(given[2]))
     straight = prepared._run
@@ -151,7 +151,7 @@ def statements(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def batch_of(count: int, *, start: int = 0, name: str = "walk") -> list[Draft]:
-    """Drafts of a skeleton, and of clips with a source each."""
+    """Return drafts of a skeleton and of `count` clips, each with one source."""
     drafts = [replace(rig_draft(), item_name=f"rig of {name}")]
     for number in range(start, start + count):
         drafts += [clip_draft(f"{name} {number}", seed=number)]
@@ -252,7 +252,7 @@ def test_what_was_made_from_something_that_changed_is_stale_through_any_number_o
 
 
 def item_that_was_added_to(lab: Lab) -> tuple[Published, Published]:
-    """A clip, what was made of it, and a clip made of that which got a further part because of itself."""
+    """Publish a clip, and a clip made of it that gets a part which has this clip as its source; return both clips."""
     clip, _ = publish(lab, clip_draft(), rig_draft())
     (step,) = publish(lab, Draft("s", Kind.STUDY, "step", {"study": {"n": 1}}, sources={"clips": [(clip.item, 1)]}))
     made, _ = publish(lab, replace(clip_draft("made", seed=1), sources={"step": [(step.item, 1)]}), rig_draft())
@@ -348,7 +348,7 @@ def test_references_are_followed_before_what_refers(refers: dict[str, Any]) -> N
 
 
 def model_drafts(**changes: Any) -> Iterator[Draft]:
-    """A model with its tree, and their skeleton."""
+    """Yield the drafts of a model with its tree, and of their skeleton."""
     parts, hierarchy = imported()
     model = {**parts["model"], "skeleton": {"output": "rig"}, "provenance": {}, **changes}
     yield Draft("walk", Kind.MODEL, "walk", {"tree": parts["tree"], "model": model})

@@ -114,7 +114,7 @@ def meets(field: str, operator: str, value: Any, wanted: Any) -> bool:
 
 
 def selects(lab: QueriedLab, query: Query, clip: Item) -> bool:
-    """Evaluate a query for one clip."""
+    """Return whether a query selects a clip."""
     if isinstance(query, Negation):
         return not selects(lab, query.query, clip)
     if not isinstance(query, Condition):

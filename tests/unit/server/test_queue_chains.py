@@ -301,7 +301,7 @@ def a_survey(desk: Desk, tasks: int = 3, **fields: Any) -> str:
 
 
 def kept_bytes(desk: Desk, lease: Lease, data: bytes) -> str:
-    """Bytes that an attempt has sent."""
+    """Upload bytes as an attempt, and return their digest."""
     return desk.database.write(desk.attempt(lease), blobs.put_blob, data)
 
 

@@ -36,7 +36,7 @@ class StoppedClock(AdjustableClock):
 
 @pytest.fixture
 def clock() -> AdjustableClock:
-    """The clock of `database`, at which no try comes back by itself."""
+    """The clock of `database`, which stands still, so that limits do not expire by themselves."""
     return StoppedClock()
 
 

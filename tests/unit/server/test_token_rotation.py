@@ -32,7 +32,7 @@ FIRST, SECOND = "a" * 32, "b" * 32
 
 @pytest.fixture
 def chief(database: Database) -> Principal:
-    """The administrator, who creates tokens."""
+    """The administrator who creates tokens."""
     database.write(SYSTEM, users.ensure_first_administrator)
     return database.read(SYSTEM, users.administrator_principal)
 

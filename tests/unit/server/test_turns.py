@@ -13,7 +13,7 @@ STRANGER = Client("192.0.2.1", known=False)
 
 
 class Arrivals:
-    """Requests in the order in which they begin."""
+    """Requests of clients, and the order in which they begin."""
 
     def __init__(self) -> None:
         self.turns = Turns()

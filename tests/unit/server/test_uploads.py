@@ -38,7 +38,10 @@ def send(lab: Lab, upload_id: str, pieces: tuple[Any, ...], data: bytes = DATA) 
 
 
 def finish(lab: Lab, upload_id: str) -> uploads.StoredUpload:
-    """Hash and finish an upload as a server does that has received none of its bytes."""
+    """Finish an upload, and return its state.
+
+    The bytes are hashed again, as by a server process that has not received them.
+    """
     hashes = UploadHashes(lab.database)
     upload = lab.read(uploads.read_upload, upload_id)
     if upload.is_received:
@@ -128,14 +131,14 @@ def test_uploads_that_nobody_continues_are_dropped(lab: Lab, clock: AdjustableCl
 
 @pytest.fixture(params=["database", "directory"])
 def backed(request: pytest.FixtureRequest, lab: Lab, tmp_path: Path) -> Lab:
-    """A lab whose blobs are in the database, or in files."""
+    """A project whose blobs are in the database, or in files."""
     if request.param == "directory":
         lab.database.blobs = DirectoryBlobs(tmp_path / "blobs")
     return lab
 
 
 def sent(lab: Lab, data: bytes, digest: str | None = None) -> str:
-    """Upload bytes in pieces of a MiB, without finishing."""
+    """Upload bytes in pieces of one MiB without finishing the upload; return its id."""
     upload = lab.write(uploads.create_upload, len(data), digest=digest)
     for start in range(0, len(data), 2**20):
         lab.write(uploads.append, upload.id, start, data[start : start + 2**20])

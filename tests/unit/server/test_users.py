@@ -60,7 +60,7 @@ def sign_up(database: Database, chief: Principal, name: str, password: str | Non
 
 
 def check(database: Database, name: str, password: str) -> Principal:
-    """Sign in as a server does: the password is compared outside of transactions."""
+    """Sign in as a server does, and return the principal; the password is compared outside of transactions."""
     stored = database.read(ANONYMOUS, users.stored_hash, name)
     if not passwords.password_matches(password, stored):
         raise users.wrong_password()
@@ -409,7 +409,7 @@ def test_use_of_a_token_is_noted_once_an_hour(database: Database, chief: Princip
 
 @pytest.fixture
 def running(lab: Lab) -> str:
-    """A job of the lab's contributor with a running attempt, and the attempt's token."""
+    """The token of a running attempt of a job that the contributor submitted."""
     project_id = lab.read(projects.read_project, "lab").id
     issued = issue_attempt_token()
 

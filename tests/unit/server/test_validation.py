@@ -1,4 +1,4 @@
-"""Query parameters and bodies against their models."""
+"""Validation of query parameters and bodies by their models."""
 
 import json
 from typing import Any
@@ -16,7 +16,7 @@ from marey_server.http.validation import decode_body, parse_query, validate_body
 
 
 class Query(PageQuery):
-    """A query for tests."""
+    """Query parameters for tests."""
 
     tag_in: CommaSeparated = Field((), alias="tag.in")
 

@@ -29,7 +29,7 @@ def user_names(database: Database) -> list[str]:
 
 @pytest.fixture
 def submit_all(database: Database) -> Callable[..., Any]:
-    """Submits writes while another one holds the lane, so that they wait together; their futures."""
+    """Function that submits writes while another write runs, so that all of them wait; it returns their futures."""
 
     def submit(*functions: Any) -> list[Future[Any]]:
         let_go = threading.Event()

@@ -74,7 +74,10 @@ def put(path: str, parts: dict[str, str], *tags: str) -> dict[str, Any]:
 
 
 def example() -> Example:
-    """Two versions of a clip that refers to a skeleton and names a file; the second one removes another entry."""
+    """Return an archive of two versions of a clip, which refers to a skeleton and names a file.
+
+    The second version removes another entry.
+    """
     made = Example()
     skeleton = made.revision("skeleton", {"hierarchy": made.document({"schema": "marey/skeleton@1", "joints": []})})
     poses = made.array(POSES)
@@ -114,7 +117,10 @@ def test_an_archive_gives_back_versions_documents_arrays_and_files() -> None:
 
 
 def later_part() -> tuple[Example, dict[str, Any]]:
-    """An archive of the second version alone, in which the entry keeps a part, and the line of its change."""
+    """Return an archive of the second version alone, and the line of its change.
+
+    The entry keeps a part of the first version.
+    """
     whole = example()
     made = Example(head=whole.head)
     line = put("a/walk", {"motion": digest_of(b"motion"), "info": made.document({"schema": "marey/clip-info@1"})})

@@ -25,18 +25,18 @@ some_changes = st.dictionaries(keys, st.none() | values, max_size=60)
 
 
 def numbered(count: int, step: int = 1) -> Entries:
-    """Entries with the keys `take-00000`, `take-00001` and so on."""
+    """Return entries with the keys `take-00000`, `take-00001` and so on."""
     return {f"take-{number:05d}": {"number": number} for number in range(0, count, step)}
 
 
 def stored(entries: Mapping[str, Value]) -> tuple[ChunksInMemory, str]:
-    """A store with a tree, and the tree's root."""
+    """Return a store that contains a tree of these entries, and the root of the tree."""
     store = ChunksInMemory()
     return store, build(store, sorted(entries.items()))
 
 
 def changed(entries: Entries, changes: Mapping[str, Value | None]) -> Entries:
-    """The entries after changes."""
+    """Return the entries after changes; None removes an entry."""
     return {key: value for key, value in {**entries, **changes}.items() if value is not None}
 
 

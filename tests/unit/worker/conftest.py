@@ -11,7 +11,7 @@ from tests.support.fake_server import FakeServer
 
 @pytest.fixture
 def server() -> Iterator[FakeServer]:
-    """A server that speaks the worker protocol."""
+    """A simulated server that speaks the worker protocol."""
     fake = FakeServer()
     yield fake
     fake.close()
@@ -19,7 +19,7 @@ def server() -> Iterator[FakeServer]:
 
 @pytest.fixture
 def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[StartWorker]:
-    """Starts workers of `server`, which end with the test."""
+    """Function that starts a worker of `server`; the workers end with the test."""
     workers: list[AttachedWorker] = []
 
     def start(*options: str, env: dict[str, str] | None = None, token_file: Path | None = None) -> AttachedWorker:
@@ -34,7 +34,7 @@ def start_worker(server: FakeServer, tmp_path: Path) -> Iterator[StartWorker]:
 
 @pytest.fixture(scope="module")
 def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeServer]:
-    """A server with one worker of one slot, for tests that need no worker of their own: to start one takes long."""
+    """A simulated server with a worker that several tests share, because starting a worker takes long."""
     fake, folder = FakeServer(), tmp_path_factory.mktemp("worker")
     worker = AttachedWorker(fake, folder)
     yield fake

@@ -23,7 +23,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
-    """A walk ahead and one backward; nothing is kept of earlier tests."""
+    """A project with a walk forwards and a walk backwards, and without cached skeletons of earlier tests."""
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
     add_clip(made, "walk", generate_gait(1.4, 0.0, 5.0))
@@ -32,7 +32,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
 
 
 def annotated(project: ProjectInMemory, **said: Any) -> ProjectInMemory:
-    """The project with one annotation of its walk as the input of `cut`."""
+    """Add an annotation of the walk to the input of `cut`, and return the project."""
     document = Annotation.model_validate({"clip": {"item": "clip_walk", "revision": 1}, "layer": "mine", **said})
     number = len(project.inputs.get("annotations", ()))
     project.parts[f"annotation_{number}", 1, "annotation"] = document.model_dump(mode="json", by_alias=True)

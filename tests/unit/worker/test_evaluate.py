@@ -20,7 +20,7 @@ from marey_worker.kinds import evaluate
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
-    """Three walks; nothing is kept of earlier tests."""
+    """A project with three walks, and without cached skeletons of earlier tests."""
     monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = ProjectInMemory(tmp_path)
     for turn_rate in (-50, 0, 50):

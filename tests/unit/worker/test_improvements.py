@@ -22,7 +22,7 @@ from marey_worker.kinds import compare, evaluate, optimise, suggest, sweep
 
 
 class LoggedProject(ProjectInMemory):
-    """A project that keeps what jobs log."""
+    """Project that records what jobs log."""
 
     def log(self, text: str) -> None:
         self.lines = [*getattr(self, "lines", []), text]
@@ -30,7 +30,7 @@ class LoggedProject(ProjectInMemory):
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoggedProject:
-    """Three walks and one that no trial asks for; nothing is kept of earlier tests."""
+    """A project with three walks and a clip that no trial needs, and without cached skeletons of earlier tests."""
     monkeypatch.setattr(matching_clips, "_cache", LruCache(max_entries=1))
     made = LoggedProject(tmp_path)
     for speed, turn_rate in ((1.25, -50), (1.25, 0), (1.25, 50), (4.0, 0)):
@@ -39,7 +39,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoggedProject:
 
 
 def evaluated(project: LoggedProject, name: str, clips: tuple[Any, ...]) -> PinnedInput:
-    """An evaluation of some clips, as the project keeps it."""
+    """Evaluate some clips; return the evaluation as an input of a job."""
     every = project.inputs.get("clips", ())
     project.inputs["clips"] = clips
     evaluate.gather(project, PARAMS, [evaluate.run(project, PARAMS)])
@@ -50,7 +50,7 @@ def evaluated(project: LoggedProject, name: str, clips: tuple[Any, ...]) -> Pinn
 
 
 def of_taller_person(clip: Clip) -> Clip:
-    """The same motion with longer bones."""
+    """Return the same motion with longer bones."""
     poses = clip.poses.copy()
     poses[:, 1] *= 1.1  # the hips' height; the path on the ground stays
     return replace(clip, skeleton=replace(clip.skeleton, offsets=clip.skeleton.offsets * 1.1), poses=poses)

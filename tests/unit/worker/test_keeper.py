@@ -22,7 +22,7 @@ LOST = LeaseLost(Problem(type="", title="", status=409, detail="lost", instance=
 
 
 class Api:
-    """Answers heartbeats; `answers` says with what."""
+    """Simulated server that answers heartbeats."""
 
     def __init__(self) -> None:
         self.heard: list[Progress | None] = []

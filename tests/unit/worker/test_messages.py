@@ -50,7 +50,7 @@ def test_items_arrive_with_their_times() -> None:
 
 
 class Child:
-    """A child that keeps what it is sent."""
+    """Simulated child process that records the messages it receives."""
 
     def __init__(self) -> None:
         self.received: list[Any] = []

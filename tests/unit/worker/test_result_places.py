@@ -35,7 +35,7 @@ STEPS = AnnotateParams.model_validate({"proposal": {"method": "steps"}})
 
 @pytest.fixture
 def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
-    """Two walks of one skeleton; nothing is kept of earlier tests."""
+    """A project with two walks of one skeleton, and without cached skeletons of earlier tests."""
     monkeypatch.setattr(skeleton_cache, "_skeletons", LruCache(max_entries=4))
     monkeypatch.setattr(skeleton_cache, "_plans", LruCache(max_entries=4))
     made = ProjectInMemory(tmp_path)
@@ -47,7 +47,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ProjectInMemory:
 
 
 def move(project: ProjectInMemory, into: str, **of_all: Any) -> None:
-    """Let every clip be what another job made."""
+    """Change the fields of all clips that are inputs, and the folder of the results."""
     project.into = into
     project.inputs["clips"] = tuple(pin.model_copy(update=of_all) for pin in project.inputs["clips"])
 

@@ -22,7 +22,7 @@ from marey_worker.kinds import retarget
 
 
 def counted_follows(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Count the calls of the function that computes where bones point."""
+    """Return a list of the clips for which `follow_moved_bones` is called from now on."""
     calls = []
 
     def follow(clip: Clip, joints: dict[str, int]) -> FollowedBones:

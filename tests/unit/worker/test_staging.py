@@ -9,14 +9,17 @@ from tests.support.fake_server import FakeServer
 
 
 def being_stored(server: FakeServer, **terms: object) -> str:
-    """Submit a job of two results, which the server does not store before the job is taken out of `slow`."""
+    """Submit a job with two results, and return its id.
+
+    The server stores the results only after the job was removed from `slow`.
+    """
     server.slow.add(job := f"maker{len(server.leased) + len(server.jobs)}")
     server.submit("make", {"results": 2}, job=job, **terms)
     return job
 
 
 def running(server: FakeServer, folder: Path, how: str = "wait") -> str:
-    """Submit a job that runs until `let_go`, and wait until it runs."""
+    """Submit a job that runs until `let_go`, wait until it runs, and return its id."""
     job = server.submit("misbehave", {"how": how, "folder": str(folder)})
     server.until((folder / "started").exists)
     return job

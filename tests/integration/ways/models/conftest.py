@@ -19,7 +19,7 @@ EXAMPLES = 12
 
 @pytest.fixture(scope="module")
 def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProjectHandle]:
-    """A project with a dozen aligned walks of two steps, and two of another alignment."""
+    """A project with twelve aligned walks of two steps, and two walks of another alignment."""
     project = marey.create_project(ProjectCreate(name="lab"))
     folder = tmp_path_factory.mktemp("takes")
     write_steps(folder)

@@ -77,7 +77,7 @@ def _hoard(folder: Path) -> None:
 
 
 def _wait(folder: Path) -> dict[str, bool]:
-    """Make the file `started`, and wait until somebody makes the file `go`."""
+    """Create the file `started`, and wait until the file `go` exists."""
     (folder / "started").touch()
     while not (folder / "go").exists():
         time.sleep(0.01)
@@ -85,7 +85,7 @@ def _wait(folder: Path) -> dict[str, bool]:
 
 
 def _fork_and_raise() -> dict[str, bool]:
-    """Let a copy of this process fail, which must not be taken for the job."""
+    """Raise an error in a forked copy of this process; the job must not fail because of it."""
     if os.fork() == 0:
         raise ArithmeticError("raised in a copy")
     time.sleep(1)
@@ -98,7 +98,7 @@ def _sleep(seconds: float) -> dict[str, bool]:
 
 
 def _give_up_early(context: Context) -> None:
-    """Fail while answers are still on their way."""
+    """Raise an error while requested documents are still being sent."""
     pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
     reading = context.documents([pin] * 20, "motion")
     next(reading)
@@ -112,7 +112,7 @@ def _put(context: Context) -> dict[str, str]:
 
 
 def _read_late(context: Context, folder: Path) -> dict[str, bool]:
-    """Ask for more documents than the pipe holds, and leave the second answer there until the file `go` is made."""
+    """Request more documents than the pipe can hold, and do not read the second one until the file `go` exists."""
     pin = PinnedInput(item="clip_1", revision=1, kind="clip", name="walk", collection="")
     reading = context.documents([pin] * 20, "motion")
     next(reading)
