@@ -201,7 +201,7 @@ class _Fire:
         deadline = time.monotonic() + PATIENCE_S
         while not (begun := [step for step in self._begun() if self._left[step] > 0]):
             if self._run.ended or time.monotonic() > deadline:
-                raise RuntimeError(f"there was nobody left to kill: {self._run}; use more takes")
+                raise RuntimeError(f"no worker began a further step, so none was killed: {self._run}; use more takes")
             time.sleep(0.05)
         for step in begun:
             self._left[step] -= 1

@@ -257,7 +257,7 @@ def test_frames_that_make_no_sense_are_refused_and_change_nothing(
         (stream, {"poses": poses.astype(np.int32)}, "<f4 or <f8"),
         (stream, {"poses": np.zeros((5000, poses.shape[1]), np.float32)}, "at most 4096"),
         (stream, {"poses": poses, "roots": np.zeros((10, 3))}, "not both"),
-        (stream, {"poses": poses, "translated_joints": ["Hips"]}, "give translations and translated_joints together"),
+        (stream, {"poses": poses, "translated_joints": ["Hips"]}, "translations and translated_joints: give both"),
         (stream, {"roots": far}, "from the origin"),
         (stream, {"poses": poses * np.float32(1e30)}, "has length"),
         (stream, {"poses": np.hstack((poses[:, :3] + 1e30, poses[:, 3:]))}, "from the origin"),

@@ -58,7 +58,7 @@ def clip(used: str, place: float) -> dict[str, Any]:
 
 @pytest.fixture
 def gaits(owner: httpx.Client) -> Callable[..., Any]:
-    """Create the dataset `gaits` with skeletons `a` and `b` in its folder; return a function that commits this folder."""
+    """Create the dataset `gaits` with skeletons `a` and `b` in its folder; return a function to commit the folder."""
     for name in ("a", "b"):
         ok(owner.post(f"{LAB}/skeletons", json=skeleton(name, f"Joint {name}")), 201)
     ok(owner.post(f"{LAB}/datasets", json={"name": "gaits", "collection": "gaits"}), 201)

@@ -70,7 +70,7 @@ def logout(context: typer.Context) -> None:
 def create_user(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Name that the user signs in with.")],
-    display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
+    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
     administrator: Annotated[
         bool, typer.Option("--administrator", help="Make the user an administrator, with all rights.")
     ] = False,
@@ -177,7 +177,7 @@ def enable_user(context: typer.Context, name: UserName) -> None:
 def change_user(
     context: typer.Context,
     name: UserName,
-    display_name: Annotated[str | None, typer.Option(help="Name shown to people.")] = None,
+    display_name: Annotated[str | None, typer.Option(help="Name that is shown to other users.")] = None,
     administrator: Annotated[
         bool | None, typer.Option(help="Give the user the rights of an administrator, or take them away.")
     ] = None,

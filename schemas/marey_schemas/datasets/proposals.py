@@ -91,7 +91,7 @@ class CheckReport(Request):
     link: Annotated[str, StringConstraints(max_length=2000, pattern=r"^https?://[^\s\x00-\x1f\x7f]+$")] | None = Field(
         None, description="Address of a page about the check."
     )
-    text: str = Field("", max_length=MOST_TEXT, description="Result in words.")
+    text: str = Field("", max_length=MOST_TEXT, description="Result of the check, as text.")
 
 
 class ProposalMerge(Request):

@@ -50,7 +50,7 @@ class MotionDocument(Request):
                 f"poses: the array has {width} columns, but {len(self.joints)} joints need {3 + 4 * len(self.joints)}"
             )
         if (self.translations is None) != (not self.translated_joints):
-            raise ValueError("give translations and translated_joints together")
+            raise ValueError("translations and translated_joints: give both or neither")
         if self.translations is not None and self.translations.shape != (frames, len(self.translated_joints), 3):
             raise ValueError(
                 f"translations: the array has the shape {self.translations.shape}, but must have "
@@ -97,7 +97,7 @@ class TakeRecord(Request):
     action: str | None = Field(None, description="What the performer does.")
     take: str | None = Field(None, max_length=64, description="Take, as the studio numbers it.")
     shoot_day: date | None = Field(None, description="Day of the recording.")
-    select: Literal["best", "good", "no good"] | None = Field(None, description="Choice of the director.")
+    select: Literal["best", "good", "no good"] | None = Field(None, description="Rating of the take by the director.")
     licence: str | None = Field(None, description="Licence of the recording.")
     capture_system: str | None = Field(None, description="System that recorded the motion.")
     consent_until: date | None = Field(None, description="Last day of the performer's consent.")

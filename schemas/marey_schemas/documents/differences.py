@@ -211,7 +211,7 @@ class MappingDifference(Answer):
 class ModelDifference(Answer):
     """Differences between the trainings of two models. Changed options are listed in `Difference.fields`."""
 
-    examples: tuple[int, int] = Field(description="Numbers of training examples.")
+    examples: tuple[int, int] = Field(description="Number of training examples of the earlier and of the later model.")
     examples_added: tuple[str, ...] = ()
     examples_removed: tuple[str, ...] = ()
     mean_log_likelihood: tuple[float | None, float | None] = Field(

@@ -73,7 +73,7 @@ class MixtureDocument(Request):
     """K normal distributions over latent vectors of L numbers."""
 
     weights: Vector = Field(description="[K] positive weights with a sum of 1.")
-    means: Matrix = Field(description="[K, L]")
+    means: Matrix = Field(description="[K, L] means of the distributions.")
     covariances: Stack = Field(description="[K, L, L] symmetric, positive definite covariance matrices.")
 
     @model_validator(mode="after")
@@ -142,7 +142,7 @@ class MotionPrimitiveDocument(Request):
     )
     skeleton: RevisionRef | OutputRef
     joints: tuple[JointName, ...] = Field(
-        min_length=1, max_length=MOST_JOINTS, description="Order of the joints' rotations."
+        min_length=1, max_length=MOST_JOINTS, description="Names of the joints, in the order of their rotations."
     )
     frame_rate_hz: float = Field(
         gt=0, le=100_000, allow_inf_nan=False, description="Rate of the canonical frames, in hertz."

@@ -94,7 +94,7 @@ class Split(NamedCommand):
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if any(after <= before for before, after in pairwise(self.at)):
-            raise ValueError("at: the frames must increase")
+            raise ValueError("at: the frames must be in increasing order, each only once")
         return self
 
 

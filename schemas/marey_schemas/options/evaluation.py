@@ -58,7 +58,9 @@ class EvaluationOptions(Grid):
     approach_s: float = Field(
         3.0, ge=0, le=60, allow_inf_nan=False, description="Seconds straight ahead before the circle."
     )
-    duration_s: float = Field(30.0, ge=1, le=600, allow_inf_nan=False, description="Seconds on the circle.")
+    duration_s: float = Field(
+        30.0, ge=1, le=600, allow_inf_nan=False, description="Duration of the circle in seconds, after the approach."
+    )
     switch_speed_m_s: Speed = Field(4.0, description="The other speed of switching trials, in metres per second.")
     switch_every_s: float = Field(
         5.0, ge=0.5, le=600, allow_inf_nan=False, description="Seconds that each speed of a switching trial lasts."

@@ -136,7 +136,9 @@ class ControllerOptions(Options):
         allow_inf_nan=False,
         description="Half-life in seconds of the offset from the old motion after a switch.",
     )
-    root_inertialisation: bool = Field(True, description="Also blend the root's velocity.")
+    root_inertialisation: bool = Field(
+        True, description="Whether the blend after a switch also includes the root's velocity."
+    )
     selection: Selection = Field(
         "features",
         description="Cost of the search. features: the weighted features; pose_distance: the published cost, "

@@ -46,7 +46,7 @@ def test_modules_that_import_downwards_are_no_circle() -> None:
 
 def test_a_folder_of_26_modules_is_full() -> None:
     full = {f"marey_x.m{number}": "" for number in range(26)}
-    assert messages(folders.find(house(full))) == ["26 modules, more than 25; make rooms of them"]
+    assert messages(folders.find(house(full))) == ["26 modules, more than 25; divide them into folders"]
     del full["marey_x.m0"]
     assert not list(folders.find(house(full)))
 
