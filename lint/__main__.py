@@ -27,7 +27,7 @@ RULES: Mapping[str, Callable[[House], Iterator[Offence]]] = {
 
 
 def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:
-    """Find every offence that has no exception, with the name of its rule."""
+    """Yield every offence that has no exception, with the name of its rule."""
     reasons = read_exceptions()
     for rule in reasons.keys() - RULES.keys():
         yield "exceptions", Offence(root, 1, rule, f"no rule is called {rule}")
@@ -37,7 +37,7 @@ def check(house: House, root: Path) -> Iterator[tuple[str, Offence]]:
 
 
 def main() -> int:
-    """Check, or lower the baseline of the wording."""
+    """Print every offence; return the exit status, 1 if there are any. With `--shrink`, lower the baseline instead."""
     parser = argparse.ArgumentParser(prog="python -m lint", description=__doc__)
     parser.add_argument("--shrink", action="store_true", help="lower the counts in wording.toml to what is left")
     house = read_house(ROOT)

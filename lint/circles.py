@@ -1,4 +1,4 @@
-"""Rule: no module imports itself over others, neither at its top, nor in a function, nor for types only."""
+"""Rule: no module imports itself through other modules, neither at its top, nor in a function, nor for types only."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lint.sources import House, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find a circle of imports in each package that has one."""
+    """Yield one circle of imports for each package that has one."""
     for package in sorted({name.partition(".")[0] for name in house.modules}):
         names = sorted(name for name in house.modules if name.partition(".")[0] == package)
         try:

@@ -1,4 +1,4 @@
-"""Rule: a class has a name of its own in all packages together."""
+"""Rule: the name of a class is unique in all packages together."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lint.sources import House, Module, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find classes whose names are taken by another class."""
+    """Yield the classes whose name another class has, too."""
     found: dict[str, list[tuple[Module, int]]] = defaultdict(list)
     for module in house.modules.values():
         for _, node in module.definitions:

@@ -16,7 +16,7 @@ _MADE_BY_GIT = ("Merge ", 'Revert "', "fixup! ", "squash! ", "amend! ")
 
 
 def faults_of(subject: str) -> list[str]:
-    """List what is wrong with a subject; empty when nothing is."""
+    """Return descriptions of what is wrong with a subject; empty if nothing is."""
     if subject.startswith(_MADE_BY_GIT):
         return []
     faults = []
@@ -33,7 +33,7 @@ def faults_of(subject: str) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Check the message in the file that is named, or that of the newest commit."""
+    """Check the subject in the named file, or that of the newest commit; return the exit status."""
     if arguments:
         message = Path(arguments[0]).read_text("utf-8")
     else:

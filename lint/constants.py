@@ -1,4 +1,4 @@
-"""Rule: a constant is declared once. Two modules that give one name the same value share a fact."""
+"""Rule: a constant is declared once, so no two modules give the same name the same value."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lint.sources import House, Module, Offence
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find constants that another module declares with the same name and the same literal value."""
+    """Yield the constants that another module declares with the same name and the same literal value."""
     found: dict[tuple[str, str], list[tuple[Module, int]]] = defaultdict(list)
     for module in house.modules.values():
         for name, value, line in _constants(module.tree):
@@ -23,7 +23,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _constants(tree: ast.Module) -> Iterator[tuple[str, str, int]]:
-    """Every name in capitals that the module itself gives a literal value: its name, its value and its line."""
+    """Yield name, value and line of each constant: a name in capitals to which the module assigns a literal value."""
     for node in tree.body:
         if not isinstance(node, ast.Assign):
             continue

@@ -22,7 +22,7 @@ _NAMES = re.compile(r"^([\w*]+(?:, [\w*]+)*)(?= : |    |$)", re.MULTILINE)
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find public functions of the library whose docstrings lack something."""
+    """Yield the public functions of the library whose docstrings lack something."""
     for module in house.modules.values():
         if module.name.partition(".")[0] != PACKAGE or module.name.endswith(KERNELS):
             continue
@@ -32,7 +32,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def public_functions(tree: ast.Module | ast.ClassDef, within: str = "") -> Iterator[tuple[str, Function]]:
-    """List the functions and methods without underscore, except properties and overloads, which only add types."""
+    """Yield functions and methods without underscore, except properties and overloads, which only add types."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from public_functions(node, f"{within}{node.name}.")
@@ -45,7 +45,7 @@ def _is_exempt(function: Function) -> bool:
 
 
 def problem_of(function: Function) -> str:
-    """Describe the first thing that a function's docstring lacks, or nothing."""
+    """Return a description of the first thing that a function's docstring lacks; empty if nothing is missing."""
     text = ast.get_docstring(function) or ""
     if not text:
         return "has no docstring"

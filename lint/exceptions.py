@@ -15,12 +15,12 @@ BASELINE = Path(__file__).with_name("wording.toml")
 
 
 def read_exceptions(path: Path = EXCEPTIONS) -> dict[str, dict[str, str]]:
-    """Read the reason of each exception by rule and subject."""
+    """Return the reasons of exceptions, by rule and subject."""
     return tomllib.loads(path.read_text("utf-8"))
 
 
 def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[str, str]) -> Iterator[Offence]:
-    """Leave out offences that have a reason, and report reasons that no offence needs any more.
+    """Yield the offences without a reason, and an offence for each reason that no offence needs any more.
 
     The keys of `reasons` are subjects, or patterns of them such as "marey_server.handlers.*".
     """
@@ -35,12 +35,12 @@ def apply_exceptions(rule: str, offences: Iterable[Offence], reasons: Mapping[st
 
 
 def read_baseline(path: Path = BASELINE) -> dict[str, int]:
-    """Read how many offences against the wording each file may have."""
+    """Return the number of offences against the wording that each file may have, by path."""
     return tomllib.loads(path.read_text("utf-8")) if path.exists() else {}
 
 
 def apply_baseline(offences: Iterable[Offence], allowed: Mapping[str, int], root: Path) -> Iterator[Offence]:
-    """Report the offences of files that have more than they may, and counts that are larger than they need to be."""
+    """Yield the offences of files that have more than they may, and counts that are larger than necessary."""
     by_file: dict[str, list[Offence]] = {}
     for offence in offences:
         by_file.setdefault(shown(offence.path, root), []).append(offence)

@@ -1,4 +1,4 @@
-"""Rule: a function has at most 40 lines without signature, a module at most 400; docstrings do not count."""
+"""Rule: a function has at most 40 lines without its signature, a module at most 400; docstrings do not count."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MOST_LINES_OF_MODULE = 400
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find functions and modules that are too long to be read at once."""
+    """Yield the functions and modules that have too many lines."""
     for module in house.modules.values():
         documented = [node for _, node in module.definitions]
         lines = module.lines - sum(docstring_lines(node) for node in (module.tree, *documented))
@@ -29,13 +29,13 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def docstring_lines(node: Definition | ast.Module) -> int:
-    """Count the lines of a docstring."""
+    """Return the number of lines of a docstring, 0 if there is none."""
     if ast.get_docstring(node, clean=False) is None:
         return 0
     return (node.body[0].end_lineno or 0) - node.body[0].lineno + 1
 
 
 def body_lines(node: Definition) -> int:
-    """Count the lines of a definition after its docstring."""
+    """Return the number of lines of a definition after its docstring."""
     body = node.body[1:] if ast.get_docstring(node, clean=False) is not None else node.body
     return (node.end_lineno or 0) - body[0].lineno + 1 if body else 0

@@ -1,4 +1,4 @@
-"""Rule: a list of known words is written once. Formats, roles, kinds and states are declared in `marey_schemas`."""
+"""Rule: a list of known words is written once: formats, roles, kinds and states are declared in `marey_schemas`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FEWEST_WORDS = 3
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find literal collections that repeat words of one vocabulary outside of the module that declares it."""
+    """Yield the literal collections that repeat words of a vocabulary outside of the module that declares it."""
     vocabularies = dict(_vocabularies(house))
     for module in house.modules.values():
         for node in ast.walk(module.tree):
@@ -26,7 +26,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _vocabularies(house: House) -> Iterator[tuple[tuple[str, str], set[str]]]:
-    """Every enumeration of texts in the schemas: its home, its name and its words."""
+    """Yield every enumeration of texts in the schemas: its module and name, and its words."""
     for module in house.modules.values():
         if not module.name.startswith("marey_schemas"):
             continue

@@ -34,7 +34,7 @@ def pins_in(text: str) -> dict[str, str]:
 
 
 def layers_of(layer: str | None) -> Iterator[str]:
-    """Yield a layer and those below it."""
+    """Yield a layer and the layers below it."""
     while layer is not None:
         yield layer
         layer = BELOW[layer]
@@ -56,7 +56,7 @@ def split(every: dict[str, str], needed: dict[str, set[str]]) -> dict[str, list[
 
 
 def main(options: Sequence[str]) -> int:
-    """Resolve all layers together and write their files."""
+    """Resolve all layers together and write their files; return the exit status."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     files = {layer: ROOT / FOLDER / f"{layer}.txt" for layer in BELOW}
     known = "\n".join(path.read_text("utf-8") for path in files.values() if path.exists())

@@ -1,4 +1,4 @@
-"""Rule: a module of fewer than 60 lines has two importers, or belongs into its only one."""
+"""Rule: a module of fewer than 60 lines is imported by at least two modules; otherwise it belongs into its importer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FEWEST_IMPORTERS = 2
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find small modules with fewer than two importers."""
+    """Yield the small modules with fewer than two importers."""
     for name, module in house.modules.items():
         importers = house.importers[name]
         if module.is_package or module.lines >= FEWEST_LINES or len(importers) >= FEWEST_IMPORTERS:

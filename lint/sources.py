@@ -46,12 +46,12 @@ class Module:
 
     @cached_property
     def tree(self) -> ast.Module:
-        """The syntax tree."""
+        """The syntax tree of the module."""
         return ast.parse(self.text)
 
     @cached_property
     def lines(self) -> int:
-        """The number of lines."""
+        """The number of lines of the module."""
         return len(self.text.splitlines())
 
     @cached_property
@@ -104,7 +104,7 @@ def _imported(module: Module, known: dict[str, Module]) -> Iterator[str]:
 
 
 def read_house(root: Path) -> House:
-    """Read every module of the product below a checkout, its pages, and the other places that may use its names."""
+    """Return all modules and pages of the product in a checkout, and the other files that may use its names."""
     modules = [
         read_module(path, root / folder)
         for folder, package in PACKAGES.items()
@@ -121,7 +121,7 @@ def read_house(root: Path) -> House:
 
 
 def read_module(path: Path, root: Path) -> Module:
-    """Read a module whose name is its path below `root`."""
+    """Return the module in a file; its name follows from its path below `root`."""
     parts = path.relative_to(root).with_suffix("").parts
     is_package = parts[-1] == "__init__"
     return Module(".".join(parts[:-1] if is_package else parts), path, path.read_text("utf-8"), is_package)

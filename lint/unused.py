@@ -1,4 +1,4 @@
-"""Rule: code that only tests call is dead. Every function, class and method is named by other code of the product.
+"""Rule: no code is used by tests alone: other code of the product names every function, class and method.
 
 Names count, not bindings: a method is used when any code names an attribute like it. Names in the docs' code blocks
 and in benchmarks count, too: their readers are users of the SDK and of the library. Only the function that contains a
@@ -29,7 +29,7 @@ _ENTRY_DECORATORS |= {"writes", "overload", "field_serializer", "model_serialize
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find definitions that nothing but tests refers to."""
+    """Yield the definitions that no code but tests names."""
     named = _named(house)
     for module in house.modules.values():
         for name, node in module.definitions:
@@ -44,7 +44,7 @@ def find(house: House) -> Iterator[Offence]:
 
 
 def _unused_locals(module: Module, name: str, outer: Function) -> Iterator[Offence]:
-    """Find functions inside a function that the function does not name."""
+    """Yield the functions inside a function that this function does not name."""
     named = {node.id for node in ast.walk(outer) if isinstance(node, ast.Name)}
     for node in _locals(outer):
         if node.name not in named and not node.decorator_list:
@@ -78,7 +78,7 @@ def _is_of_format(module: Module, node: Definition) -> bool:
 
 
 def _named(house: House) -> Counter[str]:
-    """Count every mention of a name, other than its definition and imports of it."""
+    """Return how often each name is used, other than in its definition and in imports of it."""
     named: Counter[str] = Counter()
     for module in house.modules.values():
         named.update(_mentions(module))

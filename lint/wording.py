@@ -56,7 +56,7 @@ _CODE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 
 
 def find(house: House) -> Iterator[Offence]:
-    """Find texts and names that are not plain English."""
+    """Yield the texts and names that are not plain English."""
     for module in house.modules.values():
         yield from _in_module(module)
     for path, text in house.pages.items():
