@@ -24,7 +24,7 @@ ENOUGH_BYTES = 4 << 30
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Discard compiled kernels if any has changed, once, before tests are spread over processes."""
+    """Discard all compiled kernels if one of them has changed, before tests are distributed to processes."""
     if not hasattr(config, "workerinput"):
         discard_outdated_kernels()
         keep_files_in_memory()
@@ -32,7 +32,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def keep_files_in_memory() -> None:
-    """Put what tests write where there is no disk to wait for, if there is room and nobody chose a place.
+    """Put the files of tests in memory if there is enough space and no other place was chosen.
+
+    Databases wait for the disk at each of many thousand commits. Tests kill processes, but never the machine, so no
+    test depends on what survives a power failure.
 
     Databases wait for the disk at each of many thousand commits. Tests kill processes, never the machine: none can find
     what a power cut would lose.
@@ -44,6 +47,6 @@ def keep_files_in_memory() -> None:
 
 
 def keep_bytecode() -> None:
-    """Let the processes that tests start use the bytecode of those before them."""
+    """Let the processes that tests start use the bytecode that earlier processes have stored."""
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False

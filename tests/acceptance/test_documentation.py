@@ -1,4 +1,4 @@
-"""The documentation says what the code does, and its links lead somewhere."""
+"""Pages of the documentation, compared with the code, and their links."""
 
 import re
 import shlex

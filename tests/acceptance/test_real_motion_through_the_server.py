@@ -1,4 +1,4 @@
-"""Every BVH of a real collection goes through the server and comes back right, in every form."""
+"""Upload of every BVH file of a real collection to a server, and its download in every format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example of docs/how-to/record-what-is-missing.md, run as it stands there."""
+"""The example of docs/how-to/record-what-is-missing.md, which is run unchanged."""
 
 import math
 import re

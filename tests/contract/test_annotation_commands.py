@@ -1,4 +1,4 @@
-"""The commands of annotations as they travel are those that are carried out."""
+"""Commands of annotations: those in documents are those that can be applied."""
 
 import inspect
 from typing import get_args

@@ -1,4 +1,4 @@
-"""Every row of the table of file formats has what it promises: a reader, a writer, and endings of its own."""
+"""Every format in the table of file formats has a reader, a writer and endings of its own, as the table says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jobs that commit their outputs while processes die and others commit: all of it is visible, or nothing, and once."""
+"""Jobs that commit their outputs while processes are killed: all outputs of a job are visible once, or none."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Seen(NamedTuple):
 
 
 def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
-    """Return what a reader sees of a job, of its outputs with their lineage, and of its commit on a branch."""
+    """Return what readers see of a job: its state, its outputs with their lineage, and its commit on a branch."""
     made = gaits.desk.outputs(job_id)
     graphs = [gaits.read(items.read_lineage_graph, "lab", one.kind, one.item, LineageRequest()) for one in made]
     head = gaits.head(branch) if branch in gaits.branches() else None
@@ -74,7 +74,7 @@ def seen(gaits: CommittingDesk, job_id: str, branch: str = "main") -> Seen:
 
 
 def dies_when_it_completes(desk: Desk, url: str, lease: Lease, fault: str) -> bool:
-    """Complete an attempt in a process of its own that is killed at a place; return whether it passed that place."""
+    """Complete an attempt in a process that is killed at a fault point; return whether it was killed there."""
     arguments = [url, desk.user.user_id, "ann", f"complete {lease.job} {lease.fence}", ""]
     done = subprocess.run(
         [sys.executable, store_writer.__file__, *map(str, arguments)],

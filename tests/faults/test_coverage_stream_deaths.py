@@ -1,4 +1,4 @@
-"""The server dies while somebody performs: every frame counts once, and the map is that of an undisturbed recording."""
+"""A server that is killed during a recording: every frame counts once, and the coverage equals that without a kill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workers die in the middle of evaluations: only what they were at is repeated, and the result is the same."""
+"""Workers that are killed during evaluations: only the interrupted tasks are repeated, and the result is the same."""
 
 from __future__ import annotations
 

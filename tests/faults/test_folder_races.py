@@ -45,7 +45,7 @@ def places(lab: Lab) -> list[str]:
 
 
 def require_whole_trees(lab: Lab) -> None:
-    """Every folder is in a folder that is there, and every item in one."""
+    """Check that every folder and every item is in a folder that exists."""
     paths = {"", *living(lab)}
     assert [path for path in paths if path.rpartition("/")[0] not in paths] == []
     assert [place for place in places(lab) if place.rpartition("/")[0] not in paths] == []

@@ -1,4 +1,4 @@
-"""Requests that schemathesis generates from the API's document, for minutes as each kind of caller."""
+"""Requests that schemathesis generates from the OpenAPI document, sent for minutes as each kind of caller."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def fuzzed(database: Database, tmp_path: Path) -> Iterator[FuzzedServer]:
 
 
 class Round:
-    """Generated requests of one caller to all operations, again and again with other seeds, until the time is over."""
+    """Generated requests of one caller to all operations, repeated with new seeds until the time is over."""
 
     def __init__(self, fuzzed: FuzzedServer, caller: str) -> None:
         self._fuzzed = fuzzed
@@ -43,7 +43,7 @@ class Round:
         self._faults: list[str] = []
 
     def run(self, seconds: float) -> None:
-        """Send requests, and fail if an answer is not as published or takes too long."""
+        """Send requests, and fail if an answer differs from its declaration or takes too long."""
         end = time.monotonic() + seconds
         for of_seed in itertools.count():
             for operation, mode, name in random.Random(f"{self._caller} {of_seed}").sample(PROBES, len(PROBES)):
@@ -64,7 +64,7 @@ class Round:
         assert took_s < LONGEST_ANSWER_S, f"{case.as_curl_command()} took {took_s:.1f} s"
 
     def _restore(self) -> None:
-        """Restore what earlier requests have ended: owners and administrators delete the project, attempts end."""
+        """Restore what earlier requests have deleted or ended, such as the project and the attempts."""
         house = self._fuzzed.house
         if self._caller in ("owner", "administrator"):
             house.people.client(house.tokens["administrator"]).post("/projects/lab/restore")

@@ -1,4 +1,4 @@
-"""A hostile client at every route, as every kind of caller: the server refuses, survives and changes nothing."""
+"""Attacks on every route, as every kind of caller: the server refuses them, keeps running and changes nothing."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ OWN_BUSINESS = {"leader", "server_state", "event"}
 
 @dataclass
 class Attacked:
-    """A furnished server in a process of its own."""
+    """A server with users, a project and jobs, in a separate process."""
 
     process: ServerProcess
     house: House
     cost: ProcessCost
 
     def faults(self, outcomes: Iterable[Outcome]) -> list[str]:
-        """Return the faults among outcomes, each with the end of what the server has logged."""
+        """Return the outcomes with a fault as text, each with the last lines of the server's log."""
         log = self.process.log.read_text()[-5000:]
         return [f"{one.fault}; the server's log: {log}" for one in outcomes if one.fault]
 

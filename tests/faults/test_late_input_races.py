@@ -1,4 +1,4 @@
-"""Concurrent transactions on late inputs: a job gets them once and completely, or has ended before."""
+"""Concurrent transactions on late inputs: a job gets all of them once, or has ended before."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_job_submitted_while_its_maker_completes_gets_its_inputs(desk: Desk, o
 
 
 def test_identical_jobs_that_get_their_inputs_side_by_side_are_computed_once(desk: Desk, other: Database) -> None:
-    """Two makers of the same thing in one place, each with a job that works on it."""
+    """Two jobs create the same items in the same folder, and another job reads the items of each."""
     first, second = claimed_maker(desk, 0, made=1), claimed_maker(desk, 1, made=1)
     (one,) = desk.submit_many(squares_of(first.job))
     (two,) = desk.submit_many(squares_of(second.job))

@@ -1,4 +1,4 @@
-"""Server and workers die under a pipeline: it goes on, computes nothing twice, and ends in the same results."""
+"""Servers and workers that are killed during a pipeline: it continues, and its results are the same."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def to_game_and_back(lab: ProjectHandle, takes: list[LocalFile], folder: Path) -
 
 
 def assert_made_once(lab: ProjectHandle, run: PipelineRun) -> None:
-    """Every step has succeeded, and every clip is there once, at its first revision, with what it was made from."""
+    """Check that every step has succeeded, and that every clip exists once, at its first revision, with its sources."""
     assert {job.state for job in run.refresh().values()} == {JobState.SUCCEEDED}, run
     for folder, inputs in (("raw", 0), ("game", 2), ("again", 2)):
         clips = list(lab.clips.list(collection=folder))

@@ -1,4 +1,4 @@
-"""Workers are killed at random moments under a pipeline from takes to a model: it ends in the same bytes."""
+"""Workers that are killed at random moments during a pipeline from takes to a model: the results are the same bytes."""
 
 from __future__ import annotations
 

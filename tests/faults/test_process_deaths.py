@@ -1,4 +1,4 @@
-"""Processes die at every fault point: nothing is lost or duplicated, and the store is consistent."""
+"""Processes that are killed at every fault point: nothing is lost or duplicated, and the store is consistent."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def import_game_skeleton(lab: ProjectHandle, folder: Path) -> str:
 
 
 def children_of(server: ServerProcess) -> list[str]:
-    """Return the modules that the children of a server run."""
+    """Return the names of the modules that the child processes of a server run."""
     assert server.process is not None
     return [child.cmdline()[2] for child in psutil.Process(server.process.pid).children()]
 
@@ -121,14 +121,14 @@ def submit_retargets(lab: ProjectHandle, entries: list[ImportEntry], skeleton: s
 
 
 def assert_published_once(lab: ProjectHandle, jobs: list[Job]) -> None:
-    """Every job succeeded, and its one clip is there at its first revision."""
+    """Check that every job succeeded, and that its only clip exists at its first revision."""
     assert {job.state for job in jobs} == {JobState.SUCCEEDED}, [job.failure for job in jobs]
     results = [revision for path, (_, revision) in clips_by_name(lab).items() if path.startswith("game/")]
     assert results == [1] * len(jobs)
 
 
 def assert_made_from_their_clips(marey: Marey, jobs: list[Job]) -> None:
-    """Every job has one result, which was made from the clip of this job."""
+    """Check that every job has one result, which was made from the input clip of this job."""
     for job in jobs:
         [output] = marey.jobs.outputs(job.id)
         [clip] = job.inputs["clips"]
@@ -469,7 +469,7 @@ def test_a_database_that_is_away_for_a_while_delays_work_and_loses_none(
 
 
 def _disturb(database_url: str, seconds: float) -> None:
-    """Hold SQLite's write lock, or end every connection to the Postgres database again and again."""
+    """Hold SQLite's write lock, or close all connections to the Postgres database, again and again."""
     engine = sqlalchemy.create_engine(database_url, isolation_level="AUTOCOMMIT", poolclass=sqlalchemy.NullPool)
     deadline = time.monotonic() + seconds
     with engine.connect() as connection:

@@ -1,4 +1,4 @@
-"""Two writes about one proposal or one branch at once: the second begins before the first has committed."""
+"""Two concurrent writes about one proposal or one branch: the second begins before the first has committed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Act = Callable[..., Any]
 
 
 class Team:
-    """Users of the dataset `gaits`, whose branch `trial` has one commit more than `main`, on two connections."""
+    """Users of the dataset `gaits`, whose branch `trial` has one commit more than `main`, with two connections."""
 
     def __init__(self, lab: Lab, other: Database) -> None:
         self.lab, self.other = lab, other
@@ -41,7 +41,7 @@ class Team:
         self.lab.write(request, *prepared)
 
     def prepared_commit(self, branch: str, name: str) -> tuple[Act, tuple[Any, ...]]:
-        """Return a write that commits a new entry, and its arguments."""
+        """Return the function and arguments of a write that commits a new entry."""
         item = self.lab.add_skeleton(name)
         request = CommitCreate(branch=branch, message=name, changes=(PutEntry(path=name, item=item.id),))
         return datasets.record_commit, (*GAITS, self.lab.read(datasets.prepare_commit, *GAITS, request, required=WRITE))
@@ -55,7 +55,7 @@ class Team:
         return lambda tx: datasets.protect_branch(tx, *GAITS, MAIN, rule, expected_rev=None)
 
     def merge(self, number: int, **fields: Any) -> Act:
-        """Return a write that merges a proposal; the merge is prepared now."""
+        """Return the function and arguments of a write that merges a proposal; the merge is prepared at once."""
         request = ProposalMerge(**fields)
         prepared = self.lab.read(proposals.prepare_acceptance, *GAITS, number, request, required=WRITE)
         return lambda tx: proposals.merge_proposal(tx, *GAITS, number, request, prepared)

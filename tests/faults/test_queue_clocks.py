@@ -1,4 +1,4 @@
-"""Clocks that jump, servers that were away: no lease is revived, none is eternal, the living keep theirs."""
+"""Clocks that jump, and servers that were down: leases neither end early, nor last for ever, nor become valid again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _now_us(tx: Transaction) -> int:
 
 
 def jump_of_wall_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    """Set the wall clock of this host forward or back, as an administrator would."""
+    """Set the wall clock of this machine forward or back, as an administrator could."""
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() + round(seconds * 1e9))
 

@@ -1,4 +1,4 @@
-"""Servers and workers are killed again and again under steady work: nothing acknowledged is lost or doubled.
+"""Servers and workers that are killed again and again under load: no acknowledged write is lost or doubled.
 
 The tier `test` runs short forms. The tier `soak` kills a server 77 times under 8 writers, kills or stops two servers
 and four workers 206 times under 1,800 jobs, and cancels 10,000 jobs at the moment at which they complete.
@@ -55,7 +55,7 @@ SLEEP_S = 4.0
 
 @dataclass
 class Writer:
-    """Client that creates items and tags them; it repeats each request until the server has answered."""
+    """Client that creates items and tags them, and repeats each request until the server has answered."""
 
     url: str
     token: str
@@ -129,7 +129,7 @@ def test_a_server_that_is_killed_under_writers_keeps_each_acknowledged_write_onc
 
 
 def _assert_created_once(client: httpx.Client, created: dict[str, str]) -> None:
-    """Assert that the items are in the project once, with their tags, and that one event reports each creation."""
+    """Check that the items exist once in the project, with their tags, and that one event reports each creation."""
     found = list(_characters(client))
     assert len(found) == len(created)
     assert {item["name"]: item["id"] for item in found} == created
@@ -229,7 +229,7 @@ def _starts(
 
 
 def _kill_or_stop(process: MareyProcess, start: Callable[[], object], *, stops: bool) -> None:
-    """Stop a process for longer than a lease, or kill it and start it again."""
+    """Stop a process for longer than a lease lasts, or kill it and start it again."""
     if stops and isinstance(process, WorkerProcess):
         process.send(signal.SIGSTOP)
         time.sleep(SLEEP_S)
@@ -253,7 +253,7 @@ def _import_walks(lab: ProjectHandle, folder: Path) -> tuple[list[str], str]:
 
 
 def _submit_slowly(lab: ProjectHandle, clips: list[str], skeleton: str, jobs: list[Job]) -> None:
-    """Submit jobs a few at a time, so that there is work until the last kill."""
+    """Submit jobs a few at a time, so that jobs are waiting until the last kill."""
     for number in range(JOBS):
         request: dict[str, Any] = {
             "kind": "retarget",
@@ -307,7 +307,7 @@ def test_a_job_whose_cancellation_is_acknowledged_never_succeeds(
 
 
 def _seeded(what: str) -> random.Random:
-    """Return random numbers of a new seed, which is shown if the test fails."""
+    """Return a random generator with a new seed, which is printed if the test fails."""
     seed = secrets.randbelow(2**32)
     print(f"{what} with the seed {seed}")
     return random.Random(seed)

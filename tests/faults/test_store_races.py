@@ -1,4 +1,4 @@
-"""Two writes of one project at once: members who change members, results of one name, and who was let in before."""
+"""Two concurrent writes in one project: changes of members, results with the same name, and callers who lose access."""
 
 from __future__ import annotations
 

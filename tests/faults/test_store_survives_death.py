@@ -1,4 +1,4 @@
-"""A process that dies while it writes leaves all of the write or nothing; run again, it ends the same."""
+"""A process that is killed while it writes leaves all of the write or nothing; repeated, it has the same result."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ from marey_server.store.blobs import digest_of
 
 
 class Writer:
-    """Runs one kind of work in a process of its own, with a fault or without."""
+    """Process that does one kind of work, with a fault or without."""
 
     def __init__(self, lab: Lab, url: str, folder: str) -> None:
         self._args = [sys.executable, store_writer.__file__, url, lab.owner.user_id, lab.owner.user_name]

@@ -1,4 +1,4 @@
-"""Random calls by callers of every kind against a model of what each may do and know, and holes that it must find."""
+"""Random calls by callers of every kind, compared with a model of their rights, and defects that this must find."""
 
 from __future__ import annotations
 

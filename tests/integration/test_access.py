@@ -1,4 +1,4 @@
-"""Every route times every kind of caller, from the route table itself: who may do what, and that nothing leaks."""
+"""Every route as every kind of caller, generated from the table of routes: rights, and no leaks of content."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -82,13 +82,13 @@ def find_wrong_answers(house: House, routes: tuple[Route, ...]) -> list[str]:
 
 
 def test_every_route_lets_in_whom_it_declares_and_nobody_else(house: House) -> None:
-    """One test for the whole table: a house full of canaries is built once per database."""
+    """One test covers the whole table, so that the project with its contents is created once per database."""
     wrong = find_wrong_answers(house, ROUTES)
     assert not wrong, "\n".join(wrong)
 
 
 def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The negative control: members are changed without asking for the caller's role, and the walk reports it."""
+    """Check that the test above fails if members can be changed without a check of the caller's role."""
     routes = tuple(route for route in ROUTES if route.resource.path == "/projects/{project}/members/{user}")
     assert not find_wrong_answers(house, routes)
 
@@ -102,7 +102,7 @@ def test_a_store_that_checks_no_role_is_found(house: House, monkeypatch: pytest.
 
 
 def test_only_these_routes_ask_for_more_than_a_contributor() -> None:
-    """A second home on purpose: whoever lowers the role of one of them changes this list, too."""
+    """The list repeats the declarations, so that lowering the role of an operation also needs a change here."""
     high = {
         f"{route.operation.method} {route.resource.path}": route.operation.access.value
         for route in ROUTES
@@ -140,7 +140,7 @@ def test_a_change_cannot_be_declared_for_readers() -> None:
 
 
 def is_about_nobody(person: Person, route: Route) -> bool:
-    """Return whether a refusal withholds nothing: a wrong password, or a credential where none is needed."""
+    """Return whether a refusal does not concern rights: a wrong password, or a credential where none is needed."""
     operation = route.operation
     useless = person.standing == "refused" or not person.has(operation.scope)
     return operation.access is Access.ANYONE and (useless or route.template.endswith("/login"))

@@ -30,7 +30,7 @@ def examples_in(files: list[Path], companion: Path | None = None) -> tuple[list[
 
 
 def require_aligned(aligned: AlignedSet, examples: list[SourceExample], body: MatchingBody) -> None:
-    """Every example faces +z where the axes cross, moves like the reference, and is found again in its source."""
+    """Check that every example faces +z at the origin, moves like the reference, and can be restored to its source."""
     reference = next(clip for clip in aligned.clips if clip.uid == aligned.reference).motion.rotations
     for clip, example in zip(aligned.clips, examples, strict=True):
         positions = clip.motion.positions(body.skeleton)

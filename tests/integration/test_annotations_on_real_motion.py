@@ -1,4 +1,4 @@
-"""Proposals on real takes: walks cut into steps, hands that are raised."""
+"""Annotation of real takes: walks divided into steps, and raised hands."""
 
 from collections import Counter
 from collections.abc import Callable

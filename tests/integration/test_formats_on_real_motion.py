@@ -1,4 +1,4 @@
-"""Every file of a collection of real motion capture: read rightly or refused for the right reason."""
+"""Every file of a collection of real motion capture is read correctly, or refused for the right reason."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Z_UP = (
 
 @dataclass(frozen=True)
 class Collection:
-    """What became of every file, and what the collection's manifest says of it."""
+    """The result of reading each file of a collection, and the collection's manifest."""
 
     folder: Path
     outcomes: dict[str, Outcome]
@@ -147,9 +147,9 @@ def test_written_bvh_puts_every_joint_where_another_loader_saw_it_in_the_origina
 
 
 def test_a_take_in_both_formats_is_the_same_take(collection: Collection) -> None:
-    """The BVH of 11_01 is a retargeted, smoothed figure of other proportions that begins with one frame more.
+    """The BVH file of 11_01 has another skeleton and smoothed motion, and begins with one frame more.
 
-    So its root turns exactly as in the AMC, and its hips travel the same path once the figure's size is taken out.
+    Its root turns exactly as in the AMC file, and its hips travel the same path after scaling by the size of the body.
     """
     motions = collection.motions()
     amc, bvh = motions["cmu-amc/11/11_01.amc"], motions["cmu-bvh/11_01.bvh"]

@@ -1,4 +1,4 @@
-"""Matching databases of real takes: some at 120 Hz, some whose hips move under a root that is left behind."""
+"""Matching databases of real takes: some at 120 Hz, some whose hips move relative to a root that does not move."""
 
 import csv
 from pathlib import Path
@@ -82,7 +82,7 @@ def test_roots_are_where_the_bodies_are_and_never_jump(takes: list[SourceClip], 
 
 
 def test_feet_stand_about_as_long_as_feet_do(database: MatchingDatabase) -> None:
-    """A foot of a walk stands most of half the time, one of a run hardly ever holds still."""
+    """In a walk, a foot is on the ground for about half of the time; in a run, for much less."""
     for clip in database.clips:
         share = database.contacts[clip.start : clip.stop].mean()
         speed = np.linalg.norm(courses(database, clip)[0], axis=1).mean()
@@ -93,7 +93,7 @@ def test_feet_stand_about_as_long_as_feet_do(database: MatchingDatabase) -> None
 
 
 def test_mirrored_takes_are_the_takes_in_a_mirror(takes: list[SourceClip]) -> None:
-    """Bodies that were measured are not symmetric to the millimetre; their roots are to a centimetre."""
+    """Measured bodies are not exactly symmetric, but their roots agree to a centimetre."""
     body = body_of(takes[0].clip)
     plain = build_database(takes[:6], body)
     mirrored = build_database(takes[:6], body, DatabaseOptions(mirroring="only"))
@@ -113,7 +113,7 @@ NAMED = {
 
 @pytest.mark.parametrize("collection", SETS)
 def test_takes_go_where_their_names_and_turn_as_far_as_the_manifest_say(mocap: Path, collection: str) -> None:
-    """The manifest has net turns in degrees, positive to the right. The names of some takes have left for right."""
+    """The manifest has net turns in degrees, positive to the right. The names of some takes confuse left and right."""
     with (mocap / "MANIFEST.csv").open(newline="") as table:
         net_turns = {
             row["path"]: -float(row["note"].split("net turn ")[1].split(";")[0])
@@ -134,7 +134,7 @@ def test_takes_go_where_their_names_and_turn_as_far_as_the_manifest_say(mocap: P
 
 
 def test_poses_hung_from_their_roots_are_the_takes(takes: list[SourceClip]) -> None:
-    """Wherever the hips hang in the hierarchy, pose points are where the clip has the joints."""
+    """Pose points equal the joint positions of the clip, wherever the hips are in the hierarchy."""
     body = body_of(takes[0].clip)
     for take in takes[:4]:
         database = build_database([take], body)

@@ -59,7 +59,7 @@ class Model:
 
 
 class Program:
-    """Random steps of several users; every step does the same to the store and to the model.
+    """Random steps of several users; every step makes the same change in the store and in the model.
 
     `main` moves only as the model allows.
     """
@@ -207,7 +207,7 @@ class Program:
         return old and self.rule is not None and self.rule.up_to_date
 
     def compare(self, number: int, before: str, ready: bool) -> None:
-        """Check that a proposal was merged only if the model allows it, and that `main` moved with it alone."""
+        """Check that a proposal was merged only if the model allows it, and that only this moved `main`."""
         one, found = self.models[number], self.lab.read(proposals.read_proposal, *self.gaits, number)
         merged = found.state == "merged"
         assert ready or not merged

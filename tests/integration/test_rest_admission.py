@@ -1,4 +1,4 @@
-"""Bodies of callers who may not send them: refused before any of their bytes is decoded."""
+"""Bodies of callers who may not send them, which are refused before any of their bytes is decoded."""
 
 import gc
 import threading
@@ -27,7 +27,7 @@ MSGPACK = {"Content-Type": "application/msgpack"}
 
 
 def packed(array: np.ndarray[Any, Any]) -> bytes:
-    """Return a document whose one array is sent in blocks."""
+    """Return a document with one array, which is sent in blocks."""
     leaf = {"dtype": array.dtype.str, "shape": list(array.shape), "encoding": "blocks", "data": blocks.encode(array)}
     return msgpack.packb({"name": "walk", "parts": {"motion": {"poses": leaf}}})
 
@@ -138,7 +138,7 @@ def test_a_token_that_was_revoked_writes_nothing_though_its_body_is_decoded_for_
 )
 @pytest.mark.parametrize("path", ["/login", "/projects/lab/clips", "/nowhere"])
 def test_a_refused_request_leaves_nothing_for_the_garbage_collector(server: Server, path: str, body: bytes) -> None:
-    """The collector stops all threads, the longer the more requests wait for it."""
+    """The garbage collector stops all threads, for longer if more requests wait for it."""
     client = server.client(server.make_project())
     gc.collect()
     gc.disable()

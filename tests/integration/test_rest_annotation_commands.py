@@ -1,4 +1,4 @@
-"""Commands on annotations over HTTP: what others do meanwhile, requests that are sent again, and too many of them."""
+"""Commands on annotations over HTTP: concurrent changes, repeated requests, and too many commands."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def segments(client: httpx.Client, annotation: str) -> list[str]:
 
 
 def meanwhile(monkeypatch: pytest.MonkeyPatch, name: str, action: Callable[[], None]) -> None:
-    """Let something happen once while commands of this name are carried out."""
+    """Run a function once, while commands with this name are being applied."""
     carry_out, left = commands.COMMANDS[name], [action]
 
     def interrupted(layer: layers.Layer, **arguments: Any) -> layers.Layer:

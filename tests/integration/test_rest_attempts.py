@@ -1,4 +1,4 @@
-"""Attempts and bound tokens over HTTP: what they read and publish, when they end, and what is decoded for them."""
+"""Attempts and bound tokens over HTTP: what they may read and publish, and when they end."""
 
 import hashlib
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ def study(blob: bytes) -> dict[str, Any]:
 
 @dataclass
 class Desk:
-    """An author with two projects, and a running attempt at a job in one of them."""
+    """An author with two projects, and a running attempt of a job in one of them."""
 
     server: Server
     author: httpx.Client
@@ -63,7 +63,7 @@ class Desk:
         return self.attempt.post(f"{self.place}/outputs", json={"outputs": [output]})
 
     def submit(self) -> tuple[httpx.Client, str, str]:
-        """Submit and claim a job; return the client of its attempt, its place, and its id."""
+        """Submit and claim a job; return the client of its attempt, the path of the attempt, and the id of the job."""
         body = {"kind": "export", "inputs": {"clips": [{"item": self.clip}]}, "cache": "off"}
         assert self.author.post("/projects/lab/jobs", json=body).status_code == 202
         (lease,) = self.worker.post("/leases", json={"worker": "w", "kinds": ["export"]}).json()["leases"]

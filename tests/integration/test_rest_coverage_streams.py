@@ -1,4 +1,4 @@
-"""Coverage of performances over HTTP: frames in any media type, what is missing out, each answer once and for all."""
+"""Coverage of recordings over HTTP: frames in every media type, missing motions, and repeated requests."""
 
 import math
 from collections.abc import Callable

@@ -133,7 +133,7 @@ def test_equal_content_has_the_same_tree_whatever_the_ids(owner: httpx.Client, g
 
 
 def test_references_are_named_by_content(owner: httpx.Client) -> None:
-    """Clips of equal skeletons have equal content, although each names its skeleton by another id."""
+    """Clips on equal skeletons have equal content, although each refers to another skeleton id."""
     trees = []
     for folder in ("one", "two"):
         used = ok(owner.post(f"{LAB}/skeletons", json=skeleton("rig", folder=folder)), 201)["id"]
@@ -298,7 +298,7 @@ def put_mapping(owner: httpx.Client, path: str, joint: str) -> None:
 def test_an_entry_with_parts_of_both_sides_can_be_checked_out(
     owner: httpx.Client, two_branches: Callable[..., None], database: Database
 ) -> None:
-    """No item has the two parts together before the merge stores them."""
+    """No item has both parts before the merge stores them together."""
     two_branches(lambda: put_mapping(owner, "gaits/a", "Pelvis"), lambda: put(owner, "gaits/a", "Pelvis"))
     before = ok(owner.get(f"{LAB}/skeletons"))
     request = {"version": "trial", "write_id": "12345678"}

@@ -1,4 +1,4 @@
-"""Lanes of requests: what servers and workers depend on never waits behind the long work of others."""
+"""Lanes of requests: those on which servers and workers depend never wait behind long requests of others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long bodies become blobs in short transactions, so that the writes of others do not wait for them."""
+"""Long bodies, which are stored as blobs in short transactions so that writes of others do not wait."""
 
 from __future__ import annotations
 

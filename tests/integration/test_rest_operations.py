@@ -29,7 +29,7 @@ SERVE = "import asyncio; from marey_server.app import serve; from marey_server.p
 
 
 class Process:
-    """A server in a process of its own, as an operator runs it."""
+    """A server in a separate process, started as by an operator."""
 
     def __init__(self, folder: Path, **environment: str) -> None:
         self.folder = folder

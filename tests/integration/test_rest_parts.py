@@ -1,4 +1,4 @@
-"""Documents that were sent before: sent again to who may read them, and to nobody else."""
+"""Documents that a client has already: sent again only to callers who may read them."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def refused(response: httpx.Response, status: int, code: str) -> Any:
 
 @dataclass(frozen=True)
 class Team:
-    """Clients of people with the roles of a project, of a stranger (eve), and items that commits can contain."""
+    """Clients of users with each role in the project and of a stranger (eve), and items for commits."""
 
     olga: httpx.Client
     mia: httpx.Client
@@ -286,7 +286,7 @@ def test_a_merge_that_waits_is_prepared_again_if_a_branch_moves(
     prepare, earlier = proposals.prepare_waiting, list[Any]()
 
     def prepare_late(*arguments: Any) -> Any:
-        """Return at the second call what the first one returned, as if the branch had moved after it."""
+        """Return at the second call the result of the first call, as if the branch had moved after it."""
         earlier.append(prepare(*arguments))
         return earlier[0 if len(earlier) == 2 else -1]
 

@@ -382,7 +382,7 @@ def test_a_fault_of_ours_shows_nothing_of_its_inside(
 
 
 def talk(server: Server, data: bytes) -> bytes:
-    """Return what the server answers to raw bytes, after which it has to close the connection."""
+    """Send raw bytes, and return the answer of the server, which must then close the connection."""
     address = urlsplit(server.address)
     said = b""
     connecting = socket.create_connection((address.hostname, address.port), timeout=PATIENCE_S)

@@ -1,4 +1,4 @@
-"""Versions from elsewhere over HTTP: revisions and commits keep their digests, or are refused and change nothing."""
+"""Versions from other servers over HTTP: their revisions and commits keep their digests, or are refused."""
 
 from __future__ import annotations
 

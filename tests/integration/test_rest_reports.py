@@ -1,4 +1,4 @@
-"""Reports and figures of evaluations over HTTP: served as they were stored, to be shown and trusted nowhere."""
+"""Reports and figures of evaluations over HTTP: sent as they were stored, with a content security policy."""
 
 import base64
 import hashlib

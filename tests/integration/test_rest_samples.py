@@ -1,4 +1,4 @@
-"""Samples of models over HTTP: a client that holds them is told when they are of another revision."""
+"""Samples of models over HTTP, and the entity tags that show a client whether its samples are current."""
 
 import hashlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""Sign-in over HTTP: what a stranger can find out and use up."""
+"""Sign-in over HTTP: limits on what a stranger can learn and on the resources that a stranger can use."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed

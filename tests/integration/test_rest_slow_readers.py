@@ -1,4 +1,4 @@
-"""Clients that do not take their answers: they hold a bounded amount of memory, for a bounded time."""
+"""Clients that do not read their answers: the memory and the time that they use are limited."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def reading(server: Server, path: str, token: str) -> Iterator[socket.socket]:
 
 
 def add_long_document(server: Server, token: str) -> str:
-    """Add an item with a document of `DOCUMENT_BYTES`; return its path."""
+    """Create an item with a document of `DOCUMENT_BYTES`; return its path."""
     array = np.random.default_rng(1).random(DOCUMENT_BYTES // 8)
     body = encode_tree({"name": "s", "parts": {"study": {"schema": "marey/document@1", "x": array}}}, MSGPACK)
     made = server.client(token).post("/projects/lab/studies", content=body, headers={"Content-Type": MSGPACK})

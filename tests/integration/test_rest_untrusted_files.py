@@ -1,4 +1,4 @@
-"""Files that are made to use up memory or time: refused one by one, while the server and everybody else go on."""
+"""Malicious files that use much memory or time: each is refused, and other requests continue."""
 
 import bz2
 import http.client
@@ -27,7 +27,7 @@ MEMORY_MB = 96
 
 
 def bson_bomb(elements: int) -> bytes:
-    """Return a compressed document with a list of empty objects, each of which takes ten times its bytes in memory."""
+    """Return a compressed document with a list of empty objects; each takes ten times its bytes in memory."""
     members = b"\x03\x00\x05\x00\x00\x00\x00" * elements
     listed = struct.pack("<i", len(members) + 5) + members + b"\x00"
     fields = b"\x04frames\x00" + listed
@@ -125,7 +125,7 @@ def test_a_client_that_leaves_ends_the_work_for_it(
 
 
 def begin_import(server: Server, token: str, noted: Path) -> http.client.HTTPConnection:
-    """Send a file that a child waits over, and return the connection once it does."""
+    """Send a file for which a child process waits, and return the connection as soon as it waits."""
     connection = http.client.HTTPConnection(server.address.removeprefix("http://"), timeout=PATIENCE_S)
     body = f'--b\r\nContent-Disposition: form-data; name="files"; filename="a.bvh"\r\n\r\n{noted}\r\n--b--\r\n'
     headers = {"Authorization": f"Bearer {token}", "Content-Type": "multipart/form-data; boundary=b"}

@@ -58,7 +58,7 @@ class World:
 
 
 class ItemsMachine(RuleBasedStateMachine):
-    """Every rule does the same to the store and to the model, and expects the same of both."""
+    """State machine that makes the same change in the store and in the model, and expects the same result."""
 
     ids = Bundle("ids")
     database = None

@@ -1,4 +1,4 @@
-"""A job that takes longer than it may, as its user sees it: a real server, a real worker."""
+"""A job that exceeds its time limit, on a real server with a real worker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clips of known alignment: one walk, turned, moved, mirrored, and played at varying speed."""
+"""Clips with known alignments: one walk that is rotated, moved, mirrored, and played at varying speed."""
 
 from functools import cache
 

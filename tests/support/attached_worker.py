@@ -1,4 +1,4 @@
-"""A worker process as `marey serve` starts one, which also knows the kinds of job that tests declare."""
+"""Worker process that is started as `marey serve` starts one, and that also knows the job kinds of tests."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ KINDS_OF_TESTS = Path(__file__).parents[1] / "unit" / "worker" / "thirdparty"
 
 
 def python_path() -> str:
-    """Return the PYTHONPATH of a process that knows the kinds of tests."""
+    """Return the PYTHONPATH of a process that knows the job kinds of tests."""
     return os.pathsep.join(filter(None, [str(KINDS_OF_TESTS), os.environ.get("PYTHONPATH")]))
 
 

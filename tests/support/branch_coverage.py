@@ -1,4 +1,4 @@
-"""Branch coverage of each package beside its floor, from what the last run with `--cov` has recorded.
+"""Branch coverage of each package, compared with its minimum, from the data of the last run with `--cov`.
 
 `python -m tests.support.branch_coverage` exits with 1 if a package is below its floor. Branches in compiled functions
 and in processes that tests start are not measured.

@@ -9,7 +9,7 @@ from marey_server.errors import InvalidProblem
 
 
 def echo(payload: bytes) -> bytes:
-    """Return the payload and the number of the process."""
+    """Return the payload and the id of the process."""
     return payload + f" {os.getpid()}".encode()
 
 

@@ -87,5 +87,5 @@ def _logging_restored() -> Iterator[None]:
 
 
 def _hear_interrupts() -> None:
-    """Restore the default of Ctrl-C: processes inherit it from who runs the tests, who may ignore it."""
+    """Restore the default reaction to Ctrl-C, which processes inherit and which may be to ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

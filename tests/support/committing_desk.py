@@ -25,7 +25,7 @@ JOBS = RequiredRole(Role.CONTRIBUTOR, "jobs")
 
 
 class CommittingDesk:
-    """Submitters and workers, people who commit, and short functions for what they do."""
+    """Users who submit jobs, run them and commit, with short functions for each of these steps."""
 
     def __init__(self, desk: Desk, name: str = "gaits", collection: str | None = None) -> None:
         self.desk = desk
@@ -93,7 +93,7 @@ class CommittingDesk:
         return {one.path: one.item for one in self.listed(version)}
 
     def put(self, path: str, *, number: int, branch: str = MAIN) -> str:
-        """Commit a new item at a path as a person; return its id."""
+        """Commit a new item at a path as a user, not as a job; return its id."""
         (made,) = self.desk.publish(Draft("d", Kind.STUDY, f"own{number}", {"study": document(number=number)}, "own"))
         self.change(PutEntry(path=path, item=made.item), branch=branch)
         return made.item

@@ -1,4 +1,4 @@
-"""Errors of constraints and their derivatives as the least-squares solver computes them, for independent checks."""
+"""Errors of constraints and their derivatives, computed as in the least-squares solver, for independent checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of drawn figures: readable text, consistent tables, nothing cut off."""
+"""Checks of drawn figures: readable text, consistent tables, and no text that is cut off."""
 
 import io
 import json

@@ -23,7 +23,7 @@ QUICK = ModelOptions(report_samples=20, starts=1)
 
 
 def trained_on(aligned: AlignedSet, options: ModelOptions = QUICK) -> tuple[TrainedPrimitive, ModelSubject]:
-    """Train a model of these examples; return it and what its figures show."""
+    """Train a model of these examples; return it, and the data that its figures show."""
     trained = train_primitive(aligned, options, name="walk")
     return trained, ModelSubject(trained.primitive, aligned, trained.report, seed=3)
 
@@ -41,5 +41,5 @@ def model_of_walks() -> tuple[TrainedPrimitive, ModelSubject]:
 
 @functools.cache
 def figures_of_walks() -> Mapping[str, DrawnFigure]:
-    """Return the figures of the model of the usual walks."""
+    """Return the figures of the model of generated walks."""
     return MappingProxyType(figures_of(model_of_walks()[1]))

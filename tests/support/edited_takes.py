@@ -1,4 +1,4 @@
-"""Walks to edit, and checks for every clip that an edit creates."""
+"""Walks to edit, and checks that every clip created by an edit must pass."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def make_walk(
 
 
 def make_breathing_walk(**given: float) -> Clip:
-    """Return a walk whose spine and left arm also move against their parents."""
+    """Return a walk whose spine and left arm also move relative to their parents."""
     walk = make_walk(**given)
     joints = tuple(sorted(walk.skeleton.index_of(name) for name in ("Spine1", "LeftArm")))
     phase = np.linspace(0.0, 6.0, walk.frame_count)[:, None, None]
@@ -43,7 +43,7 @@ def under_static_root(clip: Clip, away: ArrayLike = (0.3, 0.9, -4.0)) -> Clip:
 
 
 def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:
-    """Return whether two clips show the same motion, joint by joint, whatever the signs of their quaternions."""
+    """Return whether two clips have the same motion, joint by joint, whatever the signs of their quaternions."""
     if a.frame_count != b.frame_count or a.translated_joints != b.translated_joints:
         return False
     turned = quaternions.angle_between(a.rotations.astype(np.float64), b.rotations.astype(np.float64))
@@ -54,7 +54,7 @@ def same_poses(a: Clip, b: Clip, tolerance: float = 2e-6) -> bool:
 
 
 def are_exactly(a: NDArray[np.float32], b: NDArray[np.float32]) -> bool:
-    """Return whether rotations are the same to the last bit, but for the sign of whole quaternions."""
+    """Return whether rotations are equal in every bit, except for the signs of whole quaternions."""
     return bool(np.all(np.all(a == b, axis=-1) | np.all(a == -b, axis=-1)))
 
 

@@ -20,7 +20,7 @@ RATE_HZ = 60.0
 
 
 def closed_reference(trial: Trial) -> Reference:
-    """Return the trial's reference with the tick that ends it, so that the circle has a whole number of seconds."""
+    """Return the trial's reference with an additional final tick, so that the circle lasts whole seconds."""
     asked = reference(trial, RATE_HZ)
     return replace(asked, tick_count=asked.tick_count + 1)
 
@@ -32,7 +32,7 @@ def record_of(
     headings: NDArray[np.float64] | None = None,
     **given: NDArray[np.generic],
 ) -> TrialRecord:
-    """Return a record that follows the reference exactly on one clip, but for what is given."""
+    """Return a record that follows the reference exactly on one clip, except for the given values."""
     ticks = asked.tick_count
     columns: dict[str, Any] = {
         "rows": np.arange(ticks, dtype=np.int32),
@@ -47,13 +47,13 @@ def record_of(
 
 
 def straight_record(asked: Reference, speeds_m_s: NDArray[np.float64]) -> TrialRecord:
-    """Return a record that goes along +z; step k has speed `speeds_m_s[k - 1]`."""
+    """Return a record that moves along +z; step k has the speed `speeds_m_s[k - 1]`."""
     z = np.concatenate(([0.0], np.cumsum(speeds_m_s) / asked.rate_hz))
     return record_of(asked, positions=np.stack((np.zeros_like(z), z), axis=1), headings=np.zeros_like(z))
 
 
 def walked_record(rows: Sequence[int], status: Sequence[Status] | None = None) -> TrialRecord:
-    """Return a record of which only the displayed rows matter; jumps are chosen unless `status` says otherwise."""
+    """Return a record in which only the displayed rows matter; by default, searches have chosen all jumps."""
     shown = np.array(rows, dtype=np.int32)
     jumped = np.concatenate(([False], np.diff(shown) != 1))
     chosen = np.where(jumped, Status.REPLACING, Status.KEPT) if status is None else np.array(status)
@@ -123,7 +123,7 @@ def _futures(
 def root_database(
     *roots: tuple[NDArray[np.float64], NDArray[np.float64]], options: DatabaseOptions | None = None
 ) -> MatchingDatabase:
-    """Return a database that knows where the roots of its clips go and nothing else: no features, no poses."""
+    """Return a database that contains only the paths of the roots of its clips: no features, no poses."""
     clips = clips_of(*(len(headings) for _, headings in roots))
     rows = clips[-1].stop
     skeleton = studio_skeleton()

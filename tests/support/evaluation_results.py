@@ -1,4 +1,4 @@
-"""Evaluations made up for tests: no search and no clips, but measured as real ones are."""
+"""Synthetic evaluations for tests: without searches and clips, but measured like real ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Making:
 
 
 def synthetic_result(options: EvaluationOptions = SMALL, **making: Any) -> EvaluationResult:
-    """Return a plausible evaluation, the same for the same arguments."""
+    """Return a plausible evaluation; the same arguments give the same evaluation."""
     how = Making(**making)
     random = np.random.default_rng(how.seed)
     clips = some_clips(how, random)
@@ -99,7 +99,7 @@ def some_clips(how: Making, random: Generator) -> tuple[DatabaseClip, ...]:
 
 
 def wandering(trial: Trial, clips: tuple[Any, ...], sway_m: float, random: Generator) -> TrialRecord:
-    """Return the record of a character that sways about its path and plays ranges of clips, the first most often."""
+    """Return the record of a character that sways about its path and plays ranges of clips, most often the first."""
     guide = reference(trial, RATE_HZ)
     ticks = guide.tick_count
     times = np.arange(ticks) / RATE_HZ

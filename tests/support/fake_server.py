@@ -1,4 +1,4 @@
-"""A small server that speaks the worker protocol and remembers what workers sent."""
+"""A small server that speaks the worker protocol and records what workers send."""
 
 import hashlib
 import json
@@ -103,7 +103,10 @@ class FakeServer:
         return name
 
     def claim(self, wanted: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return the lease of the first job of a wanted kind, or nothing after a short wait; again for the same id."""
+        """Return the lease of the first job of a wanted kind, or nothing after a short wait.
+
+        A repeated `claim_id` gets the same lease.
+        """
         if wanted["claim_id"] in self.claims:
             return self.claims[wanted["claim_id"]]
         deadline = time.monotonic() + min(wanted["wait_s"], 2)
@@ -125,7 +128,7 @@ class FakeServer:
         return encode_tree({"documents": [self.documents.get(key) for key in keys]}, MSGPACK, arrays="blocks")
 
     def until(self, condition: Callable[[], object]) -> None:
-        """Wait until a condition holds. A machine that does much else at once takes its time."""
+        """Wait until a condition is true, with much patience, because the machine may be busy."""
         deadline = time.monotonic() + 120
         while not condition():
             assert time.monotonic() < deadline, f"waited in vain; failed: {self.failed}, completed: {self.completed}"
@@ -138,7 +141,7 @@ class FakeServer:
 
 
 class _Connections(ThreadingHTTPServer):
-    """Connections of workers, which end at any moment: tests stop and kill workers that wait for an answer."""
+    """Connections of workers, which may break at any moment because tests stop and kill workers."""
 
     daemon_threads = True
 

@@ -1,4 +1,4 @@
-"""A private project full of canaries, one token per kind of caller, and a right request for every route."""
+"""A private project with marked contents, one token for each kind of caller, and a valid request for every route."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ _QUERIES = {
 
 @dataclass(frozen=True)
 class Planned:
-    """Request of a route with everything right but perhaps the caller."""
+    """Request of a route that is valid in every respect; only the caller may lack the right to send it."""
 
     method: str
     path: str
@@ -140,14 +140,14 @@ class Planned:
 
 @dataclass
 class House:
-    """A private project full of canaries, one token per kind of caller, and what is in the project."""
+    """A private project with marked contents, one token for each kind of caller, and the ids of the contents."""
 
     people: People
     tokens: dict[str, str | None]
     variables: dict[str, str]
 
     def plan(self, route: Route, **changed: str) -> Planned:
-        """Return the request of a route; `changed` are other values of the path's variables."""
+        """Return the request of a route; `changed` contains other values of variables of the path."""
         operation, template = route.operation, route.template
         variables = self.variables | changed
         for piece, values in _OTHER_THINGS.items():
@@ -225,7 +225,7 @@ def _tokens_of_users(people: People) -> dict[str, str | None]:
 
 
 def _furnish(owner: Any) -> dict[str, str]:
-    """Put a skeleton, a clip, a blob and an annotation into `lab`; return their names by the variables of paths."""
+    """Create a skeleton, a clip, a blob and an annotation in `lab`; return their names by variables of paths."""
     etag = owner.get("/projects/lab").headers["ETag"]
     assert owner.patch("/projects/lab", json={"description": CANARY}, headers={"If-Match": etag}).is_success
     assert owner.put(f"/blobs/{SECRET_DIGEST}", content=SECRET_BYTES).is_success

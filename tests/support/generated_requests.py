@@ -1,4 +1,4 @@
-"""Requests that schemathesis generates from the OpenAPI document, for a furnished server and every kind of caller."""
+"""Requests that schemathesis generates from the OpenAPI document, for a server with contents and all callers."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FuzzedServer:
         return answer.status_code, answer.elapsed - _requested_wait_s(case)
 
     def _headers(self, name: str, case: AnyCase) -> dict[str, str]:
-        """Return the credential of a caller; one that signs out gets a token for it."""
+        """Return the credential of a caller; a request that signs out gets a token of its own."""
         token = self.house.tokens[name]
         if case.operation.label.endswith("/logout"):
             wanted = {"name": "fuzz", "scopes": ["read"]}
@@ -72,7 +72,7 @@ class FuzzedServer:
         return {"Authorization": f"Bearer {token}"} if token else {}
 
     def requests(self, operation: AnyOperation, mode: GenerationMode) -> Iterator[Any]:
-        """Yield the strategies of requests for what is in the project, and for things that do not exist."""
+        """Yield strategies of requests for contents of the project, and for objects that do not exist."""
         names = {parameter.name for parameter in operation.path_parameters}
         nothing: dict[str, str] = {}
         for known in (self.house.variables, nothing):
@@ -109,7 +109,7 @@ def operations() -> list[AnyOperation]:
 
 
 def probes() -> Iterator[tuple[AnyOperation, GenerationMode, str]]:
-    """Yield operations with fitting requests, and with unfit ones where there is something to get wrong."""
+    """Yield operations with valid requests, and with invalid ones if the operation has anything to get wrong."""
     for operation in operations():
         yield operation, GenerationMode.POSITIVE, f"{operation.label} fitting"
         if operation.query or operation.body:

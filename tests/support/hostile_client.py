@@ -1,4 +1,4 @@
-"""A client that means harm: for every route of the table and every kind of caller, requests made to cost or to confuse.
+"""A malicious client: for every route and every kind of caller, it sends requests that cost much or confuse.
 
 It keeps no list of routes of its own. A shot is a request as bytes and the manner in which they are sent.
 """
@@ -37,7 +37,7 @@ ENDS_CREDENTIALS = ("/logout", "/complete", "/fail", "/leases/completions")
 
 
 class Manner(StrEnum):
-    """How a request is sent, and what is done with the answer."""
+    """Manner in which a request is sent, and in which its answer is read."""
 
     AT_ONCE = "at once"
     TWICE = "twice"
@@ -60,7 +60,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Shot:
-    """Hostile request as bytes; `refusal` are the statuses with which the caller must be refused, if at all."""
+    """Malicious request as bytes; `refusal` contains the statuses of a refusal of its caller."""
 
     route: str
     person: str
@@ -77,7 +77,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Answer to a shot: its status, None where the connection was closed without one, and its time in seconds."""
+    """Answer to a malicious request: its status, None if the connection closed without one, and its time in seconds."""
 
     shot: Shot
     status: int | None
@@ -105,7 +105,7 @@ def _nested(levels: int) -> bytes:
 
 
 def _packed_zeros() -> bytes:
-    """Return a clip whose one array is 5 MiB of zeros and a few hundred bytes when packed."""
+    """Return a clip with one array of 5 MiB of zeros, which is packed into a few hundred bytes."""
     poses = np.zeros((2_000, 700), np.float32)
     leaf = {"dtype": "<f4", "shape": list(poses.shape), "encoding": "blocks", "data": blocks.encode(poses)}
     return msgpack.packb({"name": "walk", "parts": {"motion": {"poses": leaf}}})
@@ -193,7 +193,7 @@ def _bytes_of(plan: Planned, shape: Shape, token: str | None) -> bytes:
 def shots(
     house: House, people: Iterable[str] = tuple(PEOPLE), *, routes: Callable[[Route], bool] = lambda _route: True
 ) -> list[Shot]:
-    """Return every attack on every route by each of the callers; those that may end a credential come last."""
+    """Return every attack on every route by each of the callers; those that may end a credential are last."""
     found = []
     for route in sorted(filter(routes, ROUTES), key=lambda route: route.template.endswith(ENDS_CREDENTIALS)):
         plan = house.plan(route)
@@ -207,7 +207,7 @@ def shots(
 
 
 def some(every: list[Shot], count: int, seed: int) -> list[Shot]:
-    """Return a part of the shots that has every route and every attack, in their order."""
+    """Return a part of the attacks, in their order, that contains every route and every kind of attack."""
     chance = random.Random(seed)
     by_attack: dict[tuple[str, str], list[int]] = {}
     for number, shot in enumerate(every):

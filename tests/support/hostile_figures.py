@@ -1,4 +1,4 @@
-"""What a hostile client costs a server, and what others notice of it: `python -m tests.support.hostile_figures`.
+"""Measurement of a server under attack, and of its effects on other clients: `python -m tests.support.hostile_figures`.
 
 Options: `--seconds` of the crowd of 200 connections, 0 for none, `--shots` of those that are sent one after another to
 measure their cost, `--database` for another database than SQLite. Figures to reach on two processors: no request of up
@@ -55,7 +55,7 @@ Row = tuple[float, float, Outcome]
 
 
 class Companion:
-    """Well-behaved client that notes how long it waits, in a thread."""
+    """Well-behaved client that measures how long it waits, in a thread."""
 
     def __init__(self, name: str, ask: Callable[[], httpx.Response]) -> None:
         self.name = name
@@ -94,7 +94,7 @@ class Companion:
 
 
 def measure_costs(url: str, every: Sequence[Shot], cost: ProcessCost) -> None:
-    """Send shots one after another and print the most expensive ones."""
+    """Send malicious requests one after another, and print the most expensive ones."""
     rows: list[Row] = []
     for shot in every:
         cost.wait_until_idle()
@@ -122,7 +122,7 @@ def _said(outcome: Outcome) -> str:
 
 
 def attack(url: str, every: Sequence[Shot], seconds: float, nice: int, begun: Event) -> None:
-    """Send shots over 200 connections for a time, and print the faults and the processor time that sending took."""
+    """Send malicious requests over 200 connections for a time; print the faults, and the processor time of sending."""
     os.nice(nice)
     begun.set()
     start, processor = time.monotonic(), time.process_time()
@@ -141,7 +141,7 @@ def attack(url: str, every: Sequence[Shot], seconds: float, nice: int, begun: Ev
 
 
 def companions_of(house: House) -> list[Companion]:
-    """Return a reader, a worker that sends heartbeats, and an orchestrator that asks whether the server is ready.
+    """Return a reader, a worker that sends heartbeats, and a client that requests `/readyz`.
 
     Reader and attempt have tokens of their own, which no hostile client has.
     """
@@ -161,7 +161,7 @@ def companions_of(house: House) -> list[Companion]:
 
 
 def measure_crowd(url: str, house: House, cost: ProcessCost, seconds: float, nice: int) -> None:
-    """Print what well-behaved clients wait, alone and beside 200 hostile connections of 20 principals."""
+    """Print how long well-behaved clients wait, alone and during attacks by 20 users over 200 connections."""
     companions = companions_of(house)
     several = [house]
     for number in range(20 - len(PEOPLE)):

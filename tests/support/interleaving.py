@@ -1,4 +1,4 @@
-"""Two transactions of two connections, the second beginning while the first has written and not committed."""
+"""Two interleaved transactions: the second begins when the first has written but not committed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Aligned sets and models made up of generated gaits: small, exact, and odd where a test wants them so."""
+"""Aligned sets and models of generated gaits: small and exact, with special cases where tests need them."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ FRAMES = 48
 
 
 def walks(count: int = 12, *, names: Sequence[str] | None = None, frames: int = FRAMES, seed: int = 0) -> AlignedSet:
-    """Return walks of one duration whose speed rises from clip to clip, played at varying speed."""
+    """Return walks of equal duration and increasing speed, played at varying speed."""
     random = np.random.default_rng(seed)
     speeds = np.linspace(0.9, 1.7, count)
     clips = []

@@ -13,7 +13,7 @@ HZ = 60.0
 
 
 def chain(joints: int = 4) -> Skeleton:
-    """Return an upright chain of bones of 30 cm on its root, with a tip at its end."""
+    """Return an upright chain of bones of 30 cm above a root, with a tip at its end."""
     offsets = np.zeros((joints, 3))
     offsets[1:, 1] = 0.3
     parents = np.arange(-1, joints - 1, dtype=np.int32)

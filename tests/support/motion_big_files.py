@@ -38,7 +38,7 @@ def rubbish() -> bytes:
 
 
 def read_and_measure(make: Callable[[], bytes], folder: str) -> None:
-    """Write the outcome of reading a file, and the memory used beyond the file itself, to `folder`/result."""
+    """Read a file; write the outcome, and the memory used in addition to the file, to `folder`/result."""
     data = make()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     try:

@@ -1,4 +1,4 @@
-"""Motion files made up for tests, text by text, so that each can be broken in one place."""
+"""Synthetic motion files, composed of short texts so that tests can damage each in one place."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def bvh(
     frames: int | str | None = None,
     frame_time: str = "0.01",
 ) -> bytes:
-    """Return a BVH file of these lines of numbers; the header declares their number, or `frames`."""
+    """Return a BVH file with these lines of numbers; the header declares their count, or `frames`."""
     declared = len(rows) if frames is None else frames
     return (
         hierarchy + f"MOTION\nFrames: {declared}\nFrame Time: {frame_time}\n" + "".join(f"{r}\n" for r in rows)

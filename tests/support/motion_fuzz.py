@@ -38,7 +38,7 @@ _PIECES = [
 
 
 class TooSlow(BaseException):
-    """A reader took longer than `LONGEST_S`; no reader's `except Exception` may swallow this."""
+    """A reader took longer than `LONGEST_S`; readers cannot catch this error by `except Exception`."""
 
 
 @functools.cache
@@ -63,7 +63,7 @@ def seeds() -> tuple[Seed, ...]:
 
 
 def broken(data: bytes, source: random.Random) -> bytes:
-    """Return the file with one to eight pieces cut, doubled, swapped, overwritten or put in."""
+    """Return the file with one to eight pieces removed, doubled, swapped, overwritten or inserted."""
     text = bytearray(data)
     for _ in range(source.randint(1, 8)):
         start = source.randint(0, len(text))
@@ -89,7 +89,7 @@ def broken(data: bytes, source: random.Random) -> bytes:
 
 
 def read_broken(seed: Seed, source: random.Random) -> str:
-    """Read a broken file; return "read" or the code of the error. Other exceptions are faults of the reader."""
+    """Read a broken file; return "read" or the code of the error. Other exceptions are defects of the reader."""
     name, data, companion = seed
     if companion is not None and source.random() < 0.3:
         companion = broken(companion, source)
@@ -118,6 +118,8 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 def main(seconds: float, seed: int) -> None:
     """Break files for the given processor time, and print the number of each outcome.
+
+    Processor time is measured because wall time says nothing about the reader on a busy machine.
 
     Processor time, since on a busy machine the clock on the wall says nothing about the reader.
     """

@@ -1,4 +1,4 @@
-"""Models as the predecessor wrote them, in every layout, made up of seeded numbers."""
+"""Models in every layout of the predecessor, made of random numbers with a fixed seed."""
 
 import json
 from collections.abc import Callable, Mapping

@@ -13,13 +13,13 @@ _QUIET_S = 0.0005
 
 
 class ProcessCost:
-    """What a process and its children take; the peak is measured from the last `reset_peak`."""
+    """Processor time and memory of a process and its children; the peak is measured since the last `reset_peak`."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
 
     def processor_s(self) -> float:
-        """Return the processor time so far in seconds, that of ended children included."""
+        """Return the processor time used so far in seconds, including that of ended children."""
         total = self._ended_children_s()
         for pid in self._family():
             for task in Path(f"/proc/{pid}/task").glob("*/schedstat"):
@@ -46,7 +46,7 @@ class ProcessCost:
                 Path(f"/proc/{pid}/clear_refs").write_text("5")
 
     def wait_until_idle(self, longest_s: float = 1.0) -> None:
-        """Wait until the process does nothing, so that work after an answer is measured with it."""
+        """Wait until the process does nothing, so that work after the answer is measured, too."""
         deadline = time.monotonic() + longest_s
         before = self.processor_s()
         while time.monotonic() < deadline:
@@ -80,5 +80,5 @@ class ProcessCost:
 
 
 def _fields(stat: Path) -> list[str]:
-    """Return the fields after the name of a process."""
+    """Return the fields of a line of /proc that follow the name of the process."""
     return stat.read_text().rpartition(")")[2].split()

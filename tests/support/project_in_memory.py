@@ -24,7 +24,7 @@ PARAMS = EvaluateParams(
 
 @dataclass
 class ProjectInMemory(Context):
-    """The project of a job in memory: a context without a pipe."""
+    """Context of a job that keeps the project in memory and needs no server."""
 
     scratch: Path
     task: Task = field(default_factory=lambda: Task(0, 1))

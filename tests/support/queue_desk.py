@@ -182,7 +182,7 @@ class Desk:
         return lease
 
     def attempt(self, lease: Lease) -> Principal:
-        """Return the principal of an attempt, as its token resolves now."""
+        """Return the principal to which the token of an attempt belongs now."""
         return self.database.read(SYSTEM, tokens.resolve_token, lease.attempt_token)
 
     def heartbeat(self, lease: Lease, progress: Progress | None = None) -> HeartbeatAnswer:
@@ -245,14 +245,14 @@ def document(**facts: Any) -> dict[str, Any]:
 def output(
     name: str, *, collection: str = "", facts: Mapping[str, Any] = MappingProxyType({}), **fields: Any
 ) -> StagedOutput:
-    """Return a staged result that is a small document."""
+    """Return a small document as a staged output."""
     parts = {"study": document(name=name, **facts)}
     return StagedOutput(name=name, kind=Kind.STUDY, item_name=name, collection=collection, parts=parts, **fields)
 
 
 @pytest.fixture
 def test_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The kinds of this module besides the built-in ones."""
+    """Declare the job kinds of this module in addition to the built-in ones."""
     monkeypatch.setattr(job_kinds, "job_kinds", lambda: KINDS)
 
 

@@ -1,4 +1,4 @@
-"""Model of the queue in memory, with which the property test compares the real one."""
+"""Model of the queue in memory, with which property tests compare the real queue."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ModelQueue:
     jobs: dict[str, ModelJob] = field(default_factory=dict)
 
     def submit(self, job: ModelJob) -> None:
-        """Add a job; its state depends on those of its dependencies."""
+        """Add a job; its state depends on the states of its dependencies."""
         self.jobs[job.id] = job
         upstream = [self.jobs[other].state for other in job.after]
         if any(state in ("failed", "cancelled") for state in upstream):
@@ -54,7 +54,7 @@ class ModelQueue:
             job.state = "waiting"
 
     def claim(self, now_us: int, most: int) -> list[str]:
-        """Return the ids of the jobs that a worker gets, in order."""
+        """Return the ids of the jobs that a claim gets, in order."""
         taken: list[str] = []
         busy = {job.key for job in self.jobs.values() if job.state == "running" and job.key is not None}
         queued = [job for job in self.jobs.values() if job.state == "queued" and job.run_at_us <= now_us]
@@ -81,7 +81,7 @@ class ModelQueue:
         job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
 
     def write(self, job_id: str) -> None:
-        """Count the attempt that holds a job, when it writes for the first time."""
+        """Count the attempt of a running job as a try when it writes for the first time."""
         job = self.jobs[job_id]
         job.attempt += not job.started
         job.started = True

@@ -1,4 +1,4 @@
-"""A server for tests: the real application on a real socket, in a thread, over a database of its own."""
+"""A server for tests: the real application on a real socket, in a thread, with a database of its own."""
 
 import asyncio
 import contextlib
@@ -29,7 +29,7 @@ PATIENCE_S = 240
 
 @dataclass
 class People:
-    """The people who use the server at an address, and their clients."""
+    """Users of the server at an address, and their clients."""
 
     address: str
     database: Database
@@ -56,7 +56,7 @@ class People:
         return self.database.write(principal, tokens.create_token, TokenCreate(name="test", scopes=scopes)).secret
 
     def make_project(self, name: str = "lab", *, owner: str = "olga", **others: Role) -> str:
-        """Return a project, its owner's token; `others` are made members."""
+        """Create a project, with the users in `others` as members; return the token of its owner."""
         token = self.make_user(owner)
         person = self.database.read(SYSTEM, tokens.resolve_token, token)
         self.database.write(person, projects.create_project, ProjectCreate(name=name))

@@ -1,4 +1,4 @@
-"""A server inside the process of a client's test: it gives prepared answers and keeps every request."""
+"""Simulated server in the process of a test of the client: it sends prepared answers and records every request."""
 
 import json
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def problem(
 
 
 class ScriptedServer:
-    """Prepared answers, given one after another; the requests, and the waits between them, in order."""
+    """Prepared answers, which are sent one after another, and the received requests with the waits between them."""
 
     def __init__(self) -> None:
         self.answers: list[Answer] = []
@@ -44,7 +44,7 @@ class ScriptedServer:
         return answer if isinstance(answer, httpx.Response) else answer(request)
 
     def marey(self, **options: Any) -> Marey:
-        """Return a client of this server that waits without taking time."""
+        """Return a client of this server whose waits take no time."""
         retries = Retries(sleep=self.waited.append, random_unit=lambda: 0.0)
         return Marey(
             "http://server.test/", "marey_secret", http=httpx.MockTransport(self), **{"retries": retries, **options}

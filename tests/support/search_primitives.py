@@ -1,4 +1,4 @@
-"""Primitives to search: an arm that is known in closed form, and generated walks."""
+"""Models to search: an arm whose positions have a closed form, and generated walks."""
 
 from functools import cache
 

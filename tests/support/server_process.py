@@ -1,4 +1,4 @@
-"""A real `marey serve` in a process of its own, that tests can kill, stop and start again on the same data."""
+"""A real `marey serve` in a separate process, which tests can kill, stop and start again with the same data."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUICK_LEASES = {"MAREY_LEASE_TTL_S": "3", "MAREY_HEARTBEAT_S": "0.5", "MAREY_CAN
 
 
 class MareyProcess:
-    """A process with its own environment; `log` is what it printed."""
+    """A process with its own environment; `log` is the file of its output."""
 
     def __init__(self, log: Path) -> None:
         self.log = log
@@ -110,7 +110,7 @@ class ServerProcess(MareyProcess):
         return (self.data / "admin.token").read_text().strip()
 
     def client(self, *, patient: bool = True, port: int | None = None) -> Marey:
-        """Return an administrator's client; a patient one outlasts a restart."""
+        """Return an administrator's client; with `patient`, its retries last longer than a restart of the server."""
         url = f"http://127.0.0.1:{port}" if port else self.url
         return Marey(url, self.token, retries=PATIENT if patient else ONCE)
 
@@ -122,7 +122,7 @@ class ServerProcess(MareyProcess):
 
 
 class WorkerProcess(MareyProcess):
-    """`python -m marey_worker`, started separately, so that it outlives the server."""
+    """`python -m marey_worker`, started separately, so that it survives the end of the server."""
 
     def start(self, url: str, token: str, folder: Path, *, name: str, fault: str | None = None) -> Self:
         """Start the worker, and return this object.

@@ -1,4 +1,4 @@
-"""A project with people in every role, and small documents to put into it."""
+"""A project with users in every role, and small documents for its items."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -28,7 +28,7 @@ def skeleton_tree(joints: int = 3, *, bone_m: float = 0.5) -> dict[str, Any]:
 def motion_tree(
     skeleton: Mapping[str, object] | Item, *, frames: int = 5, joints: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Return a random motion of the chain; `skeleton` is an item, or a reference."""
+    """Return the document of a random motion of the chain; `skeleton` is an item, or a reference."""
     ref = {"item": skeleton.id, "revision": skeleton.revision} if isinstance(skeleton, Item) else skeleton
     poses = np.random.default_rng(seed).normal(size=(frames, 3 + 4 * joints)).astype("<f4")
     return {
@@ -85,7 +85,7 @@ class Lab:
             members.put_member(tx, self.name, str(who.user_name), MemberChange(role=role))
 
     def sign_up(self, name: str, *, administrator: bool = False) -> Principal:
-        """Create a user; return its principal, with every scope."""
+        """Create a user, and return a principal of this user with every scope."""
         return self.database.write(SYSTEM, _new_user, name, administrator=administrator)
 
     def read(

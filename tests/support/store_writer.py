@@ -30,8 +30,9 @@ def publish(tx: Transaction) -> Any:
 
 
 def main(url: str, user_id: str, user_name: str, work: str, folder: str) -> None:
-    """Send the files or large files, publish, or collect garbage; blobs are in `folder`, or in the database if that is
-    empty. After each large file, its digest is printed.
+    """Send the files, publish, or collect garbage; blobs are in `folder`, or in the database if `folder` is empty.
+
+    After each large file, its digest is printed.
     """
     database = Database(url, blobs=DirectoryBlobs(Path(folder)) if folder else None)
     who = Principal("user", user_id, user_name, scopes=("read", "write"))

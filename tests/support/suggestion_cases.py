@@ -1,4 +1,4 @@
-"""Small suites over databases with known contents, for tests of suggestions."""
+"""Small suites of trials with databases of known contents, for tests of suggestions."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ def named(tracks: list[Track], prefix: str = "clip") -> list[Track]:
 
 
 def wandering_tracks(count: int = 8, seed: int = 3) -> list[Track]:
-    """Return useful clips, and two that are faster than every trial."""
+    """Return useful tracks, and two that are faster than every trial."""
     fast = [arc_track(9.0 + number, 0.0, 4.0, uid=uid) for number, uid in enumerate(UNWANTED)]
     return [*named(random_tracks(count, seed)), *fast]
 
@@ -60,7 +60,7 @@ def same_to_the_bit(
     other: MatchingDatabase,
     other_records: Sequence[TrialRecord],
 ) -> bool:
-    """Return whether two sets of trials are equal to the bit, with rows named by clip and frame."""
+    """Return whether two sets of trials are equal in every bit, with rows given as clip and frame."""
     return all(
         np.array_equal(getattr(one, name), getattr(two, name), equal_nan=name.endswith("_cost"))
         for one, two in zip(records, other_records, strict=True)

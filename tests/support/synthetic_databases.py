@@ -1,4 +1,4 @@
-"""Matching databases of roots on exact paths and poses of a few sines, for exact expectations."""
+"""Matching databases of exact root paths and poses of a few sines, for which exact results are known."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -29,7 +29,7 @@ NOT_SELECTABLE = 20
 
 
 class Track(NamedTuple):
-    """A root's course and the gait that goes with it."""
+    """Path of a root, and the gait with which it moves."""
 
     positions: NDArray[np.float64]
     headings: NDArray[np.float64]
@@ -52,20 +52,20 @@ def gait_pose(frames: int, speed_m_s: float, phase: float = 0.0) -> NDArray[np.f
 
 
 def arc_track(speed_m_s: float, turn_rate_deg_s: float, seconds: float, phase: float = 0.0, **options: Any) -> Track:
-    """Return a root on a straight line or circle from its first frame on."""
+    """Return a root that moves on a straight line or a circle from its first frame on."""
     trial = Trial("circle", speed_m_s, float(np.radians(turn_rate_deg_s)), approach_s=0.0, duration_s=seconds)
     path = reference(trial, look_ahead_s=0.0)
     return Track(path.positions, path.headings, gait_pose(path.tick_count, speed_m_s, phase), **options)
 
 
 def path_track(trial: Trial, **options: Any) -> Track:
-    """Return a root on a trial's own trajectory, with the second that it looks ahead."""
+    """Return a root on the trajectory of a trial, and on the second after its end, to which its features look ahead."""
     path = reference(trial)
     return Track(path.positions, path.headings, gait_pose(len(path.headings), trial.speed_m_s), **options)
 
 
 def random_tracks(count: int, seed: int) -> list[Track]:
-    """Return wandering roots: asymmetric, of different lengths, each with its own gait."""
+    """Return roots on random paths: asymmetric, of different lengths, each with another gait."""
     rng = np.random.default_rng(seed)
     tracks = []
     for _ in range(count):
@@ -98,7 +98,7 @@ def synthetic_database(
     *,
     normaliser: Normaliser | None = None,
 ) -> MatchingDatabase:
-    """Return the tracks as clips in the order given; futures clamp to the last frame, or wrap for loops."""
+    """Return a database of the tracks in the given order; futures stop at the last frame, or continue a loop."""
     options = options or DatabaseOptions()
     features: list[Floats] = []
     selectable: list[Flags] = []

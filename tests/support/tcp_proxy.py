@@ -10,10 +10,10 @@ from typing import Self
 
 
 class TcpProxy:
-    """Forwards connections to `target_port` on loopback.
+    """Forwards connections to `target_port` on the loopback interface.
 
-    `drop_requests` and `drop_answers` swallow bytes of that direction while set. `lose_answers` closes connections when
-    the server starts to answer, so that the server has done the work and the client never hears of it.
+    `drop_requests` and `drop_answers` discard the bytes of that direction while they are set. `lose_answers` closes
+    connections when the server begins to answer: the server has done the work, but the client gets no answer.
     """
 
     def __init__(self, target_port: int) -> None:

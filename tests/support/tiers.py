@@ -31,7 +31,7 @@ LONGEST_STEPS = 2
 
 @dataclass(frozen=True)
 class Tier:
-    """A tier of tests: the tests it leaves out, with reasons, and the effort of generated tests."""
+    """A tier of tests: the tests that it leaves out, with reasons, and the effort of generated tests."""
 
     effort: float
     """Number of examples of generated tests, as a multiple of those of the tier `test`."""
@@ -183,7 +183,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _group(item: pytest.Item) -> str:
-    """Return the tests that run in one process: those of a file, which share fixtures; all ways over one database.
+    """Return the group of tests that run in one process: those of a file, or all workflows with one database.
+
+    Files that share data which take long to create name a group themselves. Fault cases share nothing, take long and
+    wait much, so each may run in any process.
 
     Files that share what takes long to make name a group themselves.
     Fault cases share nothing, take long and wait much, so each goes where there is room.
@@ -195,7 +198,7 @@ def _group(item: pytest.Item) -> str:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Send the counts of a process of pytest-xdist to the one that prints."""
+    """Send the counts of a process of pytest-xdist to the process that prints them."""
     output = getattr(session.config, "workeroutput", None)
     if output is not None:
         counts: Counter[str] = session.config.stash[LEFT_OUT]
@@ -212,7 +215,7 @@ def pytest_report_header() -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: object) -> None:
-    """Take the counts of one process: each has collected all tests."""
+    """Take the counts of one process only, because each process has collected all tests."""
     config: pytest.Config = node.config  # type: ignore[attr-defined]
     config.stash[LEFT_OUT] = Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
 

@@ -1,4 +1,4 @@
-"""Model of who may do what: the kinds of callers, and how each operation answers each of them.
+"""Model of the rights of callers: the kinds of callers, and how each operation answers each of them.
 
 It repeats the rules of the server on purpose, in a second form, so that tests can compare the two. The table of
 docs/explanation/threat-model.md is compared with it, too.
@@ -26,8 +26,8 @@ SIGN_IN, FORBIDDEN, HIDDEN, OVER = frozenset({401}), frozenset({403}), frozenset
 class Person:
     """Kind of caller of the project `lab`.
 
-    `standing`: whether the credential is none, one that the server refuses, a user's, or that of an attempt in `lab`
-    that runs or has ended.
+    `standing` states the kind of the credential: none, one that the server refuses, one of a user, or one of an attempt
+    in `lab` that is running or has ended.
     """
 
     name: str
@@ -37,11 +37,11 @@ class Person:
     scopes: tuple[str, ...] = USER_SCOPES
 
     def has(self, scope: str | None) -> bool:
-        """Return whether the credential includes a scope, in some project at least."""
+        """Return whether the credential includes a scope in at least one project."""
         return scope is None or any(held.partition("!")[0] == scope for held in self.scopes)
 
     def reaches(self, project: str) -> bool:
-        """Return whether a scope of the credential includes the project."""
+        """Return whether a scope of the credential applies to the project `lab`."""
         return any(held.partition("!project=")[2] in ("", project) for held in self.scopes)
 
     @property
@@ -76,7 +76,7 @@ PEOPLE = {
 
 
 def verdict(person: Person, operation: Operation, *, public: bool = False) -> frozenset[int]:
-    """Return the statuses of a refusal of `person` by an operation on `lab`, or `LET_THROUGH`."""
+    """Return the statuses with which an operation on `lab` refuses `person`, or `LET_THROUGH`."""
     access = operation.access
     if access is Access.ANYONE:
         return LET_THROUGH

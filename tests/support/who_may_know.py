@@ -1,4 +1,4 @@
-"""Model of who may know what: all that projects contain, in memory, and the answers that each caller gets.
+"""Model of what callers may know: all contents of projects in memory, and the answers that each caller gets.
 
 Projects, users, items and bytes carry marks in their texts. After every call the answer must have the status of the
 model, contain what the caller asked for, and contain no mark of a project that the caller may not read.
@@ -30,7 +30,7 @@ DIGESTS = tuple(f"sha256:{hashlib.sha256(data).hexdigest()}" for data in BLOBS)
 
 @dataclass(frozen=True)
 class Caller:
-    """Credential: whose it is, and the one project that it is bound to, if any."""
+    """Credential: its user, and the only project to which it is bound, if any."""
 
     user: str | None
     bound: str | None = None
@@ -83,7 +83,7 @@ class World:
         return scope in caller.scopes and caller.bound in (None, project or caller.bound)
 
     def role(self, caller: Caller, project: str) -> Role | None:
-        """Return the caller's role, None for outsiders and tokens that do not reach the project."""
+        """Return the caller's role, or None if the caller has none or the token is not valid for the project."""
         if caller.user is None or caller.bound not in (None, project):
             return None
         return Role.OWNER if caller.user == "root" else self.roles.get((project, caller.user))
@@ -111,7 +111,7 @@ class World:
         return 0
 
     def sees_contents(self, caller: Caller, project: str) -> bool:
-        """Return whether the caller may read what is in a project."""
+        """Return whether the caller may read the contents of a project."""
         mine = self.role(caller, project) is not None and self.has(caller, "read", project)
         return project in self.public or mine
 
@@ -120,7 +120,7 @@ class World:
         return any(self.sees_contents(caller, project) and blob in self.items[project].values() for project in PROJECTS)
 
     def may_refer(self, caller: Caller, blob: int) -> bool:
-        """Return whether the caller may read a blob, or refer to it; a bound token sends for its project."""
+        """Return whether the caller may read a blob, or refer to it; a bound token counts only in its project."""
         places = (caller.bound,) if caller.bound else (None, *PROJECTS)
         held = any((caller.user, place, blob) in self.held for place in places)
         if caller in ATTEMPTS.values():  # whose inputs name no blob
@@ -129,7 +129,7 @@ class World:
 
 
 class Program:
-    """Random calls on a server and on the model; `differences` collects where they disagree."""
+    """Random calls to a server and to the model; `differences` collects the calls with different results."""
 
     def __init__(self, people: People, seed: int) -> None:
         self.people = people
@@ -165,7 +165,7 @@ class Program:
         self.people.database.write(SYSTEM, lambda tx: tx.execute(end.values(expires_us=tx.now_us)))
 
     def _submit_jobs(self, project: str) -> None:
-        """Submit two jobs with marks and claim them; one attempt goes on, the other ends."""
+        """Submit two jobs with marks and claim them; one attempt continues, the other ends."""
         root, worker = (self.people.client(self.tokens[caller]) for caller in (ROOT, WORKER))
         name = f"mark-{project}-walk"
         parts = {"motion": {**MOTION, "skeleton": self.skeletons[project]}}
@@ -186,7 +186,7 @@ class Program:
                 self.tokens[ATTEMPTS[state]] = lease["attempt_token"]
 
     def run(self, count: int) -> None:
-        """Make calls, until the server and the model differ."""
+        """Make calls until the server and the model differ, or all calls are made."""
         kinds = (
             self.read_project, self.list_projects, self.list_items, self.list_items, self.create_item, self.create_item,
             self.send_blob, self.read_blob, self.read_blob, self.ask_missing, self.put_member, self.remove_member,
@@ -307,7 +307,7 @@ class Program:
             self._differ(answer, caller, f"counted {answer.json()['count']}")
 
     def read_job(self, caller: Caller, project: str) -> None:
-        """Read a job, or what the server knows of it; logs and events are for members."""
+        """Read a job, or its log or events, which only members may read."""
         job = self.chance.choice(sorted(self.world.jobs[project]))
         what = self.chance.choice(("", "/attempts", "/outputs", "/log", "/events"))
         guests = what not in ("/log", "/events")
@@ -357,7 +357,7 @@ class Program:
         return 200 if caller.user is None or scope in caller.scopes else 403
 
     def _changed(self, caller: Caller, project: str, status: int) -> int:
-        """Return the status of a change; who may not read its result gets no content."""
+        """Return the status of a change; a caller who may not read its result gets no content."""
         return status if self.world.has(caller, "read", project) else 204
 
     def _user(self, caller: Caller, scope: str) -> int:
@@ -366,7 +366,7 @@ class Program:
         return self.world.refusal(caller) or (0 if scope in caller.scopes else 403)
 
     def _sends(self, caller: Caller) -> int:
-        """Return the status with which bytes are refused, or 0; a bound token sends them for its project."""
+        """Return the status with which bytes are refused, or 0; a bound token sends them to its project."""
         if caller == ATTEMPTS["running"]:
             return 0
         role = self.world.role(caller, caller.bound) if caller.bound else Role.OWNER

@@ -1,7 +1,7 @@
-"""Fixtures of whole ways: a real server with a real worker, a client, a command line, a project.
+"""Fixtures of the tests of user workflows: a real server with a real worker, a client, a command line and a project.
 
-Starting a server takes longer than most ways. So all ways share one server per database, and each begins with a project
-of its own: `lab` is deleted after the test, which hides all it held and frees the name.
+Starting a server takes longer than most workflows. So all of them share one server per database, and each begins with
+a new project: `lab` is deleted after the test, which hides its contents and frees its name.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ def new_lab(marey: Marey) -> Iterator[Callable[[], ProjectHandle]]:
 
 
 def cancel_jobs(marey: Marey, project: ProjectHandle) -> None:
-    """Cancel the jobs that a test has left, which would keep the worker from those of the next test."""
+    """Cancel the remaining jobs of a test, so that they do not occupy the worker during the next test."""
     left = [job for job in project.jobs() if not job.state.terminal]
     for job in left:
         marey.jobs.cancel(job.id)

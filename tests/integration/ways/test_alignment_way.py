@@ -1,4 +1,4 @@
-"""The way from examples of an action to aligned clips: command line and SDK, a real server, a real worker."""
+"""Workflow from examples of an action to aligned clips, with command line and SDK, on a real server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From takes to single steps, as users walk it: propose, correct, cut; a real server and a real worker."""
+"""Workflow from takes to single steps: propose, correct and cut, on a real server with a real worker."""
 
 from __future__ import annotations
 

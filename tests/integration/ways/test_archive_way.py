@@ -1,4 +1,4 @@
-"""The way of an archive: made of several versions by the commands of the how-to page, checked, extracted."""
+"""Workflow of an archive: written, checked and extracted by the commands of the how-to page."""
 
 from __future__ import annotations
 

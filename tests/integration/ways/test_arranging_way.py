@@ -1,4 +1,4 @@
-"""A project is put in order: moved, renamed, tagged, removed and brought back, by the command line on a real server."""
+"""Organisation of a project by the command line: items are moved, renamed, tagged, removed and restored."""
 
 import functools
 import io

@@ -1,4 +1,4 @@
-"""The way of results that a job commits: the commands of the how-to page, on a real server with a real worker."""
+"""Workflow of results that a job commits: the commands of the how-to page, on a real server with a real worker."""
 
 from __future__ import annotations
 

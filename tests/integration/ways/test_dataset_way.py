@@ -1,4 +1,4 @@
-"""The way of a dataset as users walk it: the commands of the how-to page, on a real server."""
+"""Workflow of a dataset: the commands of the how-to page, on a real server."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def project(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHand
 
 
 class Walker:
-    """Somebody who follows the page, and changes clips in between."""
+    """User who follows the how-to page, and changes clips between its commands."""
 
     def __init__(self, run: CommandLine, project: ProjectHandle) -> None:
         self.run = run

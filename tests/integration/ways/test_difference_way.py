@@ -1,4 +1,4 @@
-"""The way of a comparison as users walk it: SDK and command line, a real server, the commands of the how-to page."""
+"""Workflow of a comparison, with SDK and command line: the commands of the how-to page, on a real server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way of an edit as its users walk it: SDK and command line, a real server, a real worker."""
+"""Workflow of an edit, with SDK and command line, on a real server with a real worker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way of an evaluation as its users walk it: command line and SDK, a real server, a real worker."""
+"""Workflow of an evaluation, with command line and SDK, on a real server with a real worker."""
 
 from __future__ import annotations
 

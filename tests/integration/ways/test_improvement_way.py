@@ -1,4 +1,4 @@
-"""From an evaluation to a better set of clips, as users walk it: command line and SDK, a real server, a real worker."""
+"""Workflow from an evaluation to a better set of clips, with command line and SDK, on a real server."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_weights_are_swept_over_tasks(lab: ProjectHandle, run: CommandLine) -> N
 def test_who_may_read_the_project_may_read_the_files_that_its_results_name(
     lab: ProjectHandle, marey: Marey, server: ServerProcess
 ) -> None:
-    """That is because the jobs hold them: a reader has sent none of these bytes."""
+    """The jobs hold the files: the reader has sent none of their bytes."""
     first = evaluated(lab, name="first")
     exported = lab.submit(JobCreate(kind="export", inputs={"clips": (CollectionInput(collection="walks"),)}))
     archive = marey.jobs.wait(exported.id).result

@@ -1,4 +1,4 @@
-"""Models, trees and graphs of the predecessor in and out of a real server, as files."""
+"""Import and export of the predecessor's models, trees and graphs, on a real server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From takes to a model as its users walk it: command line and SDK, a real server, a real worker."""
+"""Workflow from takes to a model, with command line and SDK, on a real server with a real worker."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_takes_that_did_not_get_into_the_model_are_told_with_why(
 
 
 def questions_about_jobs(run: CommandLine) -> list[str]:
-    """Return the lines of the server's metrics that count its answers to clients that wait for a job."""
+    """Return the lines of the server's metrics that count requests which wait for a job."""
     lines = httpx.get(f"{run.server.url}/metrics").text.splitlines()
     return [
         line for line in lines if line.startswith('marey_http_requests_total{method="GET",route="/api/v1/jobs/{job}"')

@@ -1,4 +1,4 @@
-"""The way through the house, as its users walk it: command line and SDK, a real server, a real worker."""
+"""Workflow through all main features, with command line and SDK, on a real server with a real worker."""
 
 import hashlib
 import json

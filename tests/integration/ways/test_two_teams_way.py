@@ -1,4 +1,4 @@
-"""The way of two teams: the commands of the how-to page, on two real servers."""
+"""Workflow of two teams: the commands of the how-to page, on two real servers."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def studio(lab_of: Callable[..., ProjectHandle], tmp_path: Path) -> ProjectHandl
 
 @pytest.fixture
 def told(run: CommandLine, server: ServerProcess, other_server: ServerProcess) -> Callable[..., str]:
-    """Runs `marey` as a user with a login for both servers and no token in the environment; returns what it printed."""
+    """Function that runs `marey` as a user with logins for both servers but no token, and returns the output."""
     stored = run.folder / "marey" / "credentials.json"
     for process in (other_server, server):
         store_login(stored, process.url, process.token)

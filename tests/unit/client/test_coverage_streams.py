@@ -1,4 +1,4 @@
-"""Performances as the SDK sends them: where the last answer left them, each frame once."""
+"""Recordings that the SDK sends to coverage streams: each frame once, continued at the offset of the last answer."""
 
 from datetime import UTC, datetime
 from typing import Any

@@ -1,4 +1,4 @@
-"""Evaluations as the SDK asks for them and shows them, and the command line around it."""
+"""Evaluations in the SDK and on the command line: requests and output."""
 
 import json
 import math

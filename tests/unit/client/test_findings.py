@@ -1,4 +1,4 @@
-"""Findings of jobs on evaluations in the SDK and on the command line."""
+"""Results of jobs on evaluations, in the SDK and on the command line."""
 
 import json
 

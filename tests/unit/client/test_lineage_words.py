@@ -1,4 +1,4 @@
-"""Lineage graphs as text: each group once with its branches, of any depth."""
+"""Lineage graphs as text, in which each group is listed once with its branches, at any depth."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ COMMANDS: Any = get_command(app)
 
 
 def typed(arguments: str, options: OptionsOf) -> Chosen:
-    """Return what a command gets that has these options."""
+    """Return the options that a command receives for the given arguments."""
     got: list[Chosen] = []
 
     def command(params: Chosen) -> None:
@@ -154,7 +154,7 @@ def test_job_kinds_shows_type_range_and_default_of_each_parameter(monkeypatch: p
 
 
 def test_the_help_of_a_search_names_the_tolerances_that_requests_have_by_default() -> None:
-    """The command line does not load the schemas before a command runs, so the two numbers are text there."""
+    """The help repeats the two numbers, because the command line loads no schemas before a command runs."""
     command = COMMANDS.commands["search"]
     helps = {option.name: option.help for option in command.get_params(typer.Context(command))}
     assert helps["tolerance_cm"].endswith(

@@ -16,7 +16,10 @@ DATA = bytes(range(251)) * 100
 
 
 class UploadServer:
-    """Keeps the bytes of one upload; `faults` are raised instead of answers, after keeping so many bytes of a piece."""
+    """Simulated server that stores the bytes of one upload.
+
+    `faults` are raised instead of answers, each after a number of bytes of a piece was stored.
+    """
 
     def __init__(self) -> None:
         self.kept = bytearray()

@@ -1,4 +1,4 @@
-"""Each rule of the house fails on a planted offence, and says where it is."""
+"""Rules of `lint`: each reports a planted offence with its place."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The closed-form cost against minimisation, against plain loops, and against what was wrong before."""
+"""The closed-form cost, compared with numeric minimisation and plain loops, and tests of former defects."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Dynamic time warping against a plain dynamic program and against all ways there are."""
+"""Dynamic time warping, compared with a simple dynamic program and with an enumeration of all paths."""
 
 from collections.abc import Iterator
 from itertools import product

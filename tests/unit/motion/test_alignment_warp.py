@@ -1,4 +1,4 @@
-"""Time functions: from paths, back and forth, and applied to motions."""
+"""Time functions: computed from paths, inverted, and applied to motions."""
 
 from collections.abc import Callable
 from typing import Any

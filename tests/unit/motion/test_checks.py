@@ -1,4 +1,4 @@
-"""Each finding about a motion: seen where it is, not seen where it is not, with joints, frames and numbers."""
+"""Findings about a motion: present if the motion has the fault, with joints, frames and numbers, else absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clips: what they accept, and the views they give."""
+"""Clips: the values that they accept, and the views that they return."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Constraints on ranges of frames, and the finish of samples."""
+"""Constraints in ranges of frames, and their use to refine samples."""
 
 from collections.abc import Callable
 

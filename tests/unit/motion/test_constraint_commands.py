@@ -1,4 +1,4 @@
-"""The commands `constrain` and `plant_feet`, from JSON to poses."""
+"""The commands `constrain` and `plant_feet`, from their JSON to the resulting poses."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Matching of frames, beside an exhaustive search over all sequences of runs."""
+"""Matching of frames, compared with an exhaustive search over all sequences of runs."""
 
 from functools import cache
 
@@ -14,7 +14,7 @@ ANGLES_RAD = np.radians([0.0, 3.0, 10.0, 40.0])
 
 
 def poses_of(kinds: list[int]) -> Poses:
-    """Return frames of one joint that has one of four rotations, above a root that stands still."""
+    """Return frames of one joint that has one of four rotations, above a root that does not move."""
     halves = ANGLES_RAD[kinds] / 2.0
     zeros = np.zeros_like(halves)
     rotations = np.stack((np.cos(halves), np.sin(halves), zeros, zeros), axis=-1)[:, None]
@@ -87,7 +87,7 @@ def test_frames_that_differ_entirely_for_long_are_replaced() -> None:
 
 
 def far_away(start: int, stop: int, count: int) -> Poses:
-    """Return still frames, except that joint and root are elsewhere in a range."""
+    """Return constant frames in which joint and root have other values in one range."""
     poses = poses_of([0] * count)
     poses.roots[start:stop] = 5.0
     poses.rotations[start:stop] = poses_of([3]).rotations[0]

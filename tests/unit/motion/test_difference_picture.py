@@ -40,7 +40,7 @@ def arm_edited() -> Clip:
 
 
 def elsewhere() -> NDArray[np.float32]:
-    """Return frames in which every joint is turned over."""
+    """Return the frames with every joint turned upside down."""
     flipped = np.tile(np.array([0.0, 1.0, 0.0, 0.0], np.float32), (20, WALK.skeleton.joint_count))
     return np.concatenate((np.full((20, 3), 9.0, np.float32), flipped), axis=1)
 

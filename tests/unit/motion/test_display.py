@@ -107,7 +107,7 @@ def test_the_root_is_where_the_record_has_it(database: MatchingDatabase) -> None
 
 
 def test_poses_do_not_jump_where_rows_do(database: MatchingDatabase, record: TrialRecord) -> None:
-    """Joint angles change from tick to tick hardly more than they do in the data, switch or not."""
+    """At a switch, joint angles change from tick to tick hardly more than within the data."""
     shown = displayed_clip(database, record, OPTIONS)
 
     step = quaternions.angle_between(shown.rotations[1:, 1:], shown.rotations[:-1, 1:]).max(axis=1)
@@ -121,7 +121,7 @@ def test_poses_do_not_jump_where_rows_do(database: MatchingDatabase, record: Tri
 
 @pytest.mark.parametrize("rate_hz", [60.0, 240.0])
 def test_position_and_velocity_are_continuous_at_a_switch(rate_hz: float) -> None:
-    """What the velocity changes in the tick of a switch shrinks with the tick: there is no jump, only acceleration."""
+    """The change of velocity at a switch shrinks with the length of a tick, so it is an acceleration, not a jump."""
     fine = walk_and_run(rate_hz)
     before, after = round(0.9 * rate_hz), int(fine.starts[1]) + round(1.2 * rate_hz)
     half = round(0.5 * rate_hz)
@@ -148,7 +148,7 @@ def largest(vectors: np.ndarray) -> float:
 
 
 def test_what_is_left_of_a_switch_follows_the_closed_form(database: MatchingDatabase) -> None:
-    """The hips' height is a plain number: its offset can be followed by hand."""
+    """The height of the hips is a plain number, so its offset can be computed by hand."""
     before, after = 30, int(database.starts[4]) + 47
     record = jump(database, before, after)
     shown = displayed_clip(database, record, OPTIONS)

@@ -1,4 +1,4 @@
-"""Contact sheets: what is drawn, and that it is drawn for any clip."""
+"""Contact sheets: their contents, and that they can be drawn for any clip."""
 
 import io
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""Strips of small figures: where bodies stand on the page, and what is drawn of them."""
+"""Strips of small figures: the positions of bodies on the page, and the parts of them that are drawn."""
 
 import numpy as np
 import pytest

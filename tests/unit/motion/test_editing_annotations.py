@@ -1,4 +1,4 @@
-"""Layers of annotation and the commands that change them."""
+"""Annotation layers, and the commands that change them."""
 
 from typing import Any
 
@@ -243,7 +243,7 @@ def test_any_commands_leave_ordered_segments_without_overlap_within_the_clip(giv
 
 def test_commands_look_only_at_what_they_change_however_many_segments_there_are() -> None:
     class Watched(Segment):
-        """A segment that counts who asks for its frames."""
+        """Segment that counts how often its frames are read."""
 
         looks = 0
 

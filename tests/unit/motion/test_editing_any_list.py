@@ -1,4 +1,4 @@
-"""Whatever commands are put together: a sound clip comes out, or a refusal that says where."""
+"""Random lists of commands give a valid clip, or a refusal that names the faulty command."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Published defects of motion editors, one test for each."""
+"""Published defects of other motion editors, one test for each."""
 
 from math import degrees
 
@@ -48,7 +48,7 @@ def test_every_command_of_an_edit_history_replays_from_its_json(name: str) -> No
 
 
 def test_an_edit_history_can_be_taken_back_step_by_step() -> None:
-    """The commands are kept and not the frames: leaving the last one out is to undo it, doing it again to redo it."""
+    """The commands are stored, not the frames: omitting the last command undoes it, and adding it again redoes it."""
     walk = make_walk()
     history = [COMMAND_MODELS[name](**COMMAND_MODELS[name].examples[0]) for name in HISTORY]
     states = [walk, *(apply_edit(walk, history[: number + 1]) for number in range(len(history)))]

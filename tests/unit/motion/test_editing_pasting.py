@@ -1,4 +1,4 @@
-"""Joints taken from other clips, and rotations added to joints."""
+"""Joints copied from other clips, and rotations added to joints."""
 
 from dataclasses import replace
 from math import degrees

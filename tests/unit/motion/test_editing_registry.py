@@ -1,4 +1,4 @@
-"""Lists of commands: what can be asked for, what goes wrong, and that the same list gives the same bytes."""
+"""Lists of commands: valid commands, errors, and equal bytes for equal lists."""
 
 import inspect
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Two evaluations of the same trials, told apart trial by trial."""
+"""Comparison of two evaluations of the same trials, trial by trial."""
 
 from collections.abc import Iterator
 from dataclasses import replace

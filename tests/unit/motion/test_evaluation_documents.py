@@ -63,7 +63,7 @@ def result() -> EvaluationResult:
 
 
 def same(left: Any, right: Any) -> bool:
-    """Whether two results say the same, to the bit and to the type of every array."""
+    """Return whether two results are equal in every bit and in the type of every array."""
     if is_dataclass(left):
         return type(left) is type(right) and all(
             same(getattr(left, field.name), getattr(right, field.name)) for field in fields(left)

@@ -1,4 +1,4 @@
-"""Clips that show nearly the same motion are found, and no others."""
+"""Search for clips with nearly the same motion."""
 
 from dataclasses import replace
 from math import radians

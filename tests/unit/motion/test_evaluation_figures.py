@@ -1,4 +1,4 @@
-"""Figures of evaluations: what is drawn is what was measured, whatever the evaluation looks like."""
+"""Figures of evaluations show the measured values, for any evaluation."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""Clips of other collections that fill holes come first, as far as they can be blended."""
+"""Ranking of clips from other collections by the gaps that they fill, if they can be blended with the set."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whole suites over generated walks and runs: from clips through database and controller to what is measured."""
+"""Whole suites of trials with generated walks and runs, from clips to the measures."""
 
 from itertools import product
 from math import radians

@@ -1,4 +1,4 @@
-"""Coverage while frames come in: the same windows as afterwards, however the frames are cut, and where to go next."""
+"""Coverage during a recording: the same windows as afterwards for any division of the frames, and the next targets."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""An optimisation lowers its objective step by step, says how, and can go on from what it said."""
+"""Optimisations lower their objective step by step, report each step, and can be continued from their report."""
 
 import json
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Parameters of an evaluation are the options that the mathematics takes, and a few of the job."""
+"""The parameters of an evaluation are the options of the computation, and a few of the job."""
 
 from typing import Any
 

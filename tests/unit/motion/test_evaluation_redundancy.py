@@ -1,4 +1,4 @@
-"""Leaving clips out: what is predicted is what an evaluation of the clips that are left finds."""
+"""Omission of clips: the prediction equals an evaluation of the remaining clips."""
 
 import pytest
 from pydantic import ValidationError

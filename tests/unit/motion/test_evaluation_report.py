@@ -1,4 +1,4 @@
-"""Reports of evaluations: one sound HTML file that says what was measured, whatever clips are called."""
+"""Reports of evaluations: one valid HTML file with the measured values, for any names of clips."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Parts of databases hold the rows they are made of, and nothing is computed anew."""
+"""Parts of databases have the same rows as the whole, without a new computation."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Whether what covers a cell can be blended, against distances of all pairs of frames."""
+"""Similarity of the poses in a cell, compared with the distances of all pairs of frames."""
 
 from dataclasses import replace
 from typing import Any

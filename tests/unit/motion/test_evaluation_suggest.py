@@ -1,4 +1,4 @@
-"""Suggestions of evaluations hold on synthetic and on real clips."""
+"""Suggestions of evaluations are correct for synthetic and for real clips."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Other weights give what a database built with them gives, and groups are ranked by what they do."""
+"""Other weights give the same results as a database built with them, and groups are ranked by their effect."""
 
 from math import radians
 from typing import Any

@@ -1,4 +1,4 @@
-"""Removal of unused ranges does not change any trial."""
+"""Removal of unused ranges of frames, which changes no trial."""
 
 from dataclasses import replace
 from typing import Any
@@ -54,10 +54,10 @@ def test_removing_all_that_is_unused_leaves_every_record_bit_identical(variant: 
 
 
 def test_frames_that_a_search_may_not_choose_stay_in_one_clip_with_the_frame_that_bars_them() -> None:
-    """A clip that repeats itself every 110 frames, played by turns about its frames 100 and 310.
+    """A clip that repeats itself every 110 frames is played alternately around its frames 100 and 310.
 
-    From 306 on the frames from 186 are barred. Without those from 226 to 266 the ones before would be another clip's,
-    and the one at 196 the best of all.
+    From frame 306 on, searches may not choose the frames from 186 on. Without the frames 226 to 266, the earlier frames
+    would belong to another clip, and frame 196 would be the best row.
     """
     track = arc_track(1.0, 0.0, 12.0)
     frames = np.arange(len(track.headings))
@@ -153,7 +153,7 @@ def test_a_loop_that_wraps_is_never_cut() -> None:
 
 
 def test_what_only_the_last_search_chose_is_needed_too() -> None:
-    """A trial that ends with a switch never displays what was chosen, but its cost is recorded."""
+    """A trial that ends with a switch never displays the chosen row, but records its cost."""
     database = synthetic_database(wandering_tracks())
     index = build_index(database.normaliser.apply(database.features), database.starts, database.selectable)
     trial = suite_trials(OPTIONS)[0]

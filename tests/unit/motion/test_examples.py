@@ -1,4 +1,4 @@
-"""Examples in the docstrings of the library run, and every exported name has one."""
+"""Examples in the docstrings of the library run without error, and every exported name has one."""
 
 import doctest
 import importlib

@@ -1,4 +1,4 @@
-"""ASF/AMC against the definition of the format, written out with matrices, joint by joint."""
+"""ASF/AMC reader, compared with the definition of the format, computed with matrices joint by joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading BVH as it is found in the wild."""
+"""BVH reader, with files as various programs write them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Written BVH must mean the same to this project's reader and to another one's."""
+"""BVH writer: this project's reader and another reader must read the same motion from its files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The format of a file, by its bytes first."""
+"""Detection of the format of a file, first by its bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The npz container: exact, deterministic, and closed to hostile archives."""
+"""The npz format: exact, deterministic, and safe against malicious archives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The predecessor's documents: handedness, both forms of clips and skeletons, and every encoding."""
+"""The predecessor's clips and skeletons: handedness, both of their forms, and every encoding."""
 
 from __future__ import annotations
 

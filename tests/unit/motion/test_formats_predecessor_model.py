@@ -1,4 +1,4 @@
-"""The predecessor's motion primitives: every layout in, layouts 3 and 2 out."""
+"""The predecessor's motion primitives: reading of every layout, and writing of the layouts 3 and 2."""
 
 import copy
 import dataclasses

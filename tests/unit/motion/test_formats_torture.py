@@ -1,4 +1,4 @@
-"""Files that are huge, deep, hostile or broken: an answer within seconds and a bounded memory, whatever they are."""
+"""Huge, deeply nested, malicious or broken files are read or refused within seconds and with limited memory."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_lengths_beyond_any_unit_are_refused(value: str) -> None:
 
 @pytest.fixture(scope="module")
 def readers() -> None:
-    """Let each reader compile its kernels, which takes longer than a file may."""
+    """Compile the kernels of each reader in advance, which takes longer than the time limit of a file."""
     for name, data, companion in seeds():
         read_motion(data, name, companion=companion, options=CENTIMETRES)
 

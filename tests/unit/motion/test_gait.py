@@ -1,4 +1,4 @@
-"""Generated gaits: exact roots, feet that stand, bodies that hold together."""
+"""Generated gaits: exact roots, feet that do not slide, and constant bone lengths."""
 
 from math import pi, radians
 from typing import Any

@@ -1,4 +1,4 @@
-"""Inverse kinematics against closed forms, finite differences and an independent optimiser."""
+"""Inverse kinematics, compared with closed forms, finite differences and an independent optimiser."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Forward kinematics against a plain reference and against hand-made chains; headings and contacts."""
+"""Forward kinematics, compared with a simple reference and with chains computed by hand; headings and contacts."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Pictures of lineage graphs: readable at any size, the same bytes for the same graph, and safe with any name."""
+"""Pictures of lineage graphs: readable at any size, the same bytes for the same graph, and safe for any name."""
 
 from __future__ import annotations
 

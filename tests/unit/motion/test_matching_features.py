@@ -65,7 +65,7 @@ def test_the_default_layout_has_27_dimensions_in_the_order_of_the_weights() -> N
 
 
 def test_a_walk_in_a_circle_says_so_in_its_trajectory() -> None:
-    """Left is +x, forward is +z: a left circle at 1.2 m/s and 0.5 rad/s seen from its points."""
+    """Left is +x and forward is +z: the expected points lie on a left circle at 1.2 m/s and 0.5 rad/s."""
     database = built(generate_gait(1.2, 0.5, 6.0))
     inner = database.features[60:-120]
     for horizon, seconds in enumerate((1 / 3, 2 / 3, 1.0)):

@@ -1,4 +1,4 @@
-"""What exact roots must give, and what must not change a result: databases whose answer is known."""
+"""Databases with known results: values for exact roots, and changes that must not affect a result."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Loops: rows look ahead through the seam, filters run through it, and rounds follow each other on the ground."""
+"""Loops: rows look ahead across the seam, filters run across it, and rounds follow each other on the ground."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def long_walk(request: pytest.FixtureRequest) -> Clip:
 
 
 def test_a_round_of_a_walk_is_like_that_part_of_the_walk(long_walk: Clip) -> None:
-    """A stride cut out and marked as a loop has, all through, the rows of the walk that it was cut from."""
+    """A stride that is cut out and marked as a loop has the same rows as this part of the walk."""
     length = stride_frames(long_walk)
     loop, walk = built(long_walk.sliced(120, 120 + length)), built(long_walk, loop=False)
     part = slice(120, 120 + length)
@@ -50,7 +50,7 @@ def test_a_round_of_a_walk_is_like_that_part_of_the_walk(long_walk: Clip) -> Non
 
 
 def test_rows_look_ahead_to_where_playing_on_leads(long_walk: Clip) -> None:
-    """The trajectory of each row is what its root's steps add up to when the database is played through its seam."""
+    """The trajectory of each row is the sum of the root's steps when the loop is played across its seam."""
     database = built(long_walk.sliced(120, 120 + stride_frames(long_walk)))
     motion = database.root_motion
     for first in range(0, database.row_count, 7):
@@ -67,7 +67,7 @@ def test_rows_look_ahead_to_where_playing_on_leads(long_walk: Clip) -> None:
 
 
 def test_a_loop_that_begins_elsewhere_has_the_same_rows(long_walk: Clip) -> None:
-    """The seam leaves no trace: a round cut at another frame gives the same rows, in another order."""
+    """A round that begins at another frame has the same rows in another order."""
     length = stride_frames(long_walk)
     motion = Motion.of(long_walk.sliced(120, 120 + length))
     positions = motion.positions(long_walk.skeleton)

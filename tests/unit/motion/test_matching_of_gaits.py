@@ -1,8 +1,8 @@
-"""Motion matching on whole bodies: generated gaits through the feature pipeline, then played.
+"""Motion matching on whole bodies: generated gaits are converted to a database and then played.
 
-A body is not a point. Its torso sways with the steps and leans into a curve, so that its root is centimetres off the
-path that the gait was made for, and runs a circle a little smaller and slower. Where a tolerance says more than
-rounding, it is for that.
+The torso of a body sways with the steps and leans into a curve. So its root is centimetres away from the path for which
+the gait was generated, and its circles are a little smaller and slower. Tolerances that are larger than rounding errors
+allow for this.
 """
 
 from collections.abc import Sequence
@@ -200,7 +200,7 @@ def places(database: MatchingDatabase, record: TrialRecord) -> list[tuple[str, i
 def test_what_a_mirror_closed_dataset_does_to_the_left_it_does_to_the_right(
     takes: list[SourceClip], follow: str
 ) -> None:
-    """From the circle on: on a straight approach both trials would begin on one and the same row, no mirror image."""
+    """Only the circle is compared: on the straight approach, both trials would begin with the same row."""
     closed = database_of(takes, DatabaseOptions(mirroring="add"))
     options = ControllerOptions(follow=follow)
     for speed, turn_rate_deg in ((1.3, 40.0), (2.0, 60.0), (1.0, 100.0)):

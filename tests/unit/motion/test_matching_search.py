@@ -1,4 +1,4 @@
-"""Exact search, against going through all rows in float64 one dimension after the other."""
+"""Exact search, compared with a comparison of all rows in float64, one dimension after another."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -133,7 +133,7 @@ def test_ten_thousand_queries_of_a_walking_database_are_answered_exactly() -> No
 @settings(max_examples=examples(150))
 @given(st.data())
 def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> None:
-    """Rows that are all the same in float32, a few units in the last place of float64 apart."""
+    """All rows are equal in float32, and differ by a few units in the last place of float64."""
     dimensions = data.draw(st.integers(1, 40))
     base = data.draw(arrays.arrays(float, dimensions, elements=st.floats(-1e6, 1e6)))
     steps = data.draw(arrays.arrays(np.int64, (data.draw(st.integers(1, 50)), dimensions), elements=st.integers(-3, 3)))
@@ -148,7 +148,7 @@ def test_differences_that_float32_cannot_show_still_decide(data: DataObject) -> 
 
 
 def test_distances_whose_squares_float32_barely_holds_still_decide() -> None:
-    """Squares of some ten of float32's smallest steps: half of the rows are rounded up to 270, the others to 256."""
+    """The squares are about ten of the smallest steps of float32: half of the rows round to 270, the others to 256."""
     rng = np.random.default_rng(2)
     step = 2.0**-149
     up, down = np.full(27, 9.51), np.repeat([10.49, 8.6], [13, 14])

@@ -1,4 +1,4 @@
-"""Models as documents: every number comes back as it was, whatever they travel as."""
+"""Models as documents: every number is restored exactly from every encoding."""
 
 from typing import Any
 

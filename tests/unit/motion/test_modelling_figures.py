@@ -1,4 +1,4 @@
-"""Figures of models and alignments: what is drawn is what was learned, whatever the model looks like."""
+"""Figures of models and alignments show the learned values, for any model."""
 
 import subprocess
 import sys

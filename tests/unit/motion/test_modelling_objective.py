@@ -1,4 +1,4 @@
-"""Constraints and Equation 1, against forward kinematics of whole motions and formulas written out."""
+"""Constraints and Equation 1, compared with forward kinematics of whole motions and explicit formulas."""
 
 from collections.abc import Callable
 from dataclasses import replace

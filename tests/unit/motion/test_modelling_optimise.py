@@ -1,4 +1,4 @@
-"""Refinement: closed forms where there are some, what must hold everywhere else."""
+"""Refinement of motions: closed forms if there are any, and general properties otherwise."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -197,7 +197,7 @@ def test_a_target_out_of_all_reach_and_all_proportion_is_approached_as_far_as_ro
 
 def test_slopes_without_any_curvature_are_damped_instead_of_failing() -> None:
     class Flat:
-        """A constraint that nothing has an influence on, and a prior that counts nothing."""
+        """Objective with a constraint on which no number has an effect, and with a prior that is constant."""
 
         priors = (LatentMixture(np.ones(1), np.zeros((1, 2)), 1e40 * np.eye(2)[None]),)
 

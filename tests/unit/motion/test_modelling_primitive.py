@@ -1,4 +1,4 @@
-"""Duration of motions of a model, for any latent vector."""
+"""Durations of the motions of a model, for any latent vector."""
 
 from dataclasses import replace
 

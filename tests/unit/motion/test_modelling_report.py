@@ -1,4 +1,4 @@
-"""Reports of models: one sound HTML file that says what was learned, whatever clips are called."""
+"""Reports of models: one valid HTML file with the learned values, for any names of clips."""
 
 import re
 from collections.abc import Mapping

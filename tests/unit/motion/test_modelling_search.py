@@ -1,4 +1,4 @@
-"""Searching trees, against going through them in plain Python and through all samples."""
+"""Searches of trees, compared with a simple search in Python and with an evaluation of all samples."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache

@@ -1,4 +1,4 @@
-"""Several motions in a row: that they hang together, and do what was asked, in the world and in real time."""
+"""Sequences of motions: their continuity and their constraints, in the world and in real time."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Motion primitives: what training makes of aligned examples, and what it says about it."""
+"""Training of motion primitives from aligned examples, and its report."""
 
 import dataclasses
 from typing import Any
@@ -137,7 +137,7 @@ def test_motions_last_as_long_as_their_latent_vectors_say() -> None:
 
 
 def test_a_mixture_of_a_known_latent_space_is_recovered() -> None:
-    """Two kinds of motion in a space of three functions."""
+    """The examples are of two kinds of motion in a space of three functions."""
     random = np.random.default_rng(0)
     skeleton, basis, examples = chain(), SplineBasis.clamped(40, 8), 120
     modes = np.zeros((3, 8, 19))

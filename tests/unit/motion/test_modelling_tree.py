@@ -1,4 +1,4 @@
-"""Trees over samples: what they hold, how they are grown, and that they come out the same."""
+"""Trees of samples: their contents and construction, which is the same every time."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

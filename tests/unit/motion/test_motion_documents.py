@@ -1,4 +1,4 @@
-"""Skeletons, mappings and clips survive the way through documents and their wire forms."""
+"""Skeletons, mappings and clips are restored exactly from documents in every encoding."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Errors say what, where and by which code, and survive the way between processes."""
+"""Errors have a text, a place and a code, and can be sent between processes."""
 
 import pickle
 

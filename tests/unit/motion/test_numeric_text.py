@@ -1,4 +1,4 @@
-"""Numbers out of text must be those that Python reads, or be refused where Python's are too liberal."""
+"""Numbers parsed from text equal those of Python, and texts for which Python is too liberal are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Median and low quantile equal those of numpy to the bit."""
+"""Median and low quantile equal those of numpy in every bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quaternions against an independent library, analytic cases and laws that must hold."""
+"""Quaternions, compared with an independent library, analytic cases and algebraic laws."""
 
 from collections.abc import Callable
 from itertools import permutations, product

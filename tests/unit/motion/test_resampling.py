@@ -87,7 +87,7 @@ def test_quaternions_that_change_their_sign_are_the_same_rotation() -> None:
 
 
 def test_a_round_of_a_loop_is_sampled_evenly_through_its_seam() -> None:
-    """26 frames at 25 Hz are 62.4 at 60 Hz: the round keeps its motion, in 62 even steps."""
+    """26 frames at 25 Hz are 62.4 frames at 60 Hz: the round is sampled in 62 equal steps."""
     turns = 2 * np.pi * np.arange(26) / 26
     poses = np.zeros((26, 15))
     poses[:, 2] = np.arange(26) / 26
@@ -110,7 +110,7 @@ def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
 
 
 def test_generated_walks_at_other_rates_agree_with_those_made_at_the_rate() -> None:
-    """To the 2 cm that thirty frames a second miss of a foot that touches down."""
+    """The tolerance is 2 cm, which 30 frames per second miss when a foot touches the ground."""
     made = generate_gait(1.3, 0.4, 3.0, 60.0)
     for rate_hz in (30.0, 119.88, 120.0):
         resampled = resample_clip(generate_gait(1.3, 0.4, 3.0, rate_hz), 60.0)

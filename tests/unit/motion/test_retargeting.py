@@ -33,7 +33,7 @@ FOLDERS = ("cmu-amc/16", "bandai-namco-2", "snu-mss", "game-engine")
 
 
 class Actor:
-    """A skeleton with all that retargeting needs to know of it, and a motion."""
+    """Skeleton with the mapping and axes that retargeting needs, and a motion."""
 
     def __init__(self, clip: Clip) -> None:
         self.clip, self.skeleton = clip, clip.skeleton
@@ -126,7 +126,7 @@ def assert_bones_point_alike(
 
 
 def assert_no_flips_of_its_own(source: Actor, result: Clip, plan: RetargetPlan) -> None:
-    """Every mapped joint turns between frames as the source's does, and no quaternion changes its sign."""
+    """Check that mapped joints rotate between frames as in the source, and that no quaternion changes its sign."""
     before = kinematics.global_rotations(source.clip).astype(np.float64)
     after = kinematics.global_rotations(result).astype(np.float64)
     for pair in plan.pairs:

@@ -1,4 +1,4 @@
-"""Twist and swing axes mean the same anatomically, whatever a rig's frames, rest pose and proportions."""
+"""Twist and swing axes have the same anatomical meaning for any local axes, rest pose and proportions of a rig."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Known rigs are recognised by their names, unknown ones by their build, and animals are not passed off as people."""
+"""Recognition of known rigs by names and of unknown rigs by proportions; animals are not taken for humans."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Names of joints in any style say the same side and part."""
+"""Names of joints in any style are parsed to the same side and part of the body."""
 
 import pytest
 

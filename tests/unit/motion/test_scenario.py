@@ -1,4 +1,4 @@
-"""Trials of an evaluation: what they ask for, in closed form."""
+"""Trials of an evaluation: the requested paths, in closed form."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The joint hierarchy: what it accepts, what it knows about itself."""
+"""The joint hierarchy: the values that it accepts, and the values that it derives."""
 
 import pickle
 from dataclasses import replace

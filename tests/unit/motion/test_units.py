@@ -1,4 +1,4 @@
-"""Units and axes from the body a file shows, asking where it does not say."""
+"""Unit and axes of a file, inferred from the body, with a question to the user if they are unclear."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_walker_tells_which_axis_points_up(walk: Clip, up_axis: str) -> None:
 
 
 def test_a_rest_pose_that_lies_does_not_mislead(walk: Clip) -> None:
-    """Exporters turn a Z-up rest pose upright with the root's rotation: the motion counts, not the rest pose."""
+    """Exporters rotate a Z-up rest pose upright with the root's rotation, so the motion decides, not the rest pose."""
     skeleton = game_skeleton()
     poses = np.zeros((30, 3 + 4 * skeleton.joint_count), np.float32)
     poses[:, 3:] = skeleton.rest_rotations.reshape(-1)

@@ -1,4 +1,4 @@
-"""docs/reference/block-format.md as a second, slow decoder: what the page says is what the codec writes."""
+"""A second, slow decoder, written from docs/reference/block-format.md, reads what the codec writes."""
 
 import itertools
 import math

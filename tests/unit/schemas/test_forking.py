@@ -1,4 +1,4 @@
-"""Children that a process forks after it has loaded their modules."""
+"""Child processes that are forked from a process which has loaded their modules."""
 
 import os
 import signal

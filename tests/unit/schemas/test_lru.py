@@ -1,4 +1,4 @@
-"""The cache of recently used values: what it keeps, and what it drops first."""
+"""Cache of recently used values: which values it keeps, and which it removes first."""
 
 import threading
 
@@ -75,7 +75,7 @@ def test_room_is_freed_before_the_next_value_is_made() -> None:
 
 
 class Large:
-    """Notes when it is made and when it is freed."""
+    """Value that records when it is created and when it is freed."""
 
     def __init__(self, alive: list[str]) -> None:
         self.alive = alive

@@ -1,4 +1,4 @@
-"""From takes to a model: which jobs a plan becomes, and what each works on."""
+"""Conversion of a plan to jobs, from takes to a model, with the inputs of each job."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Notes of a model: members that are read again are validated, others are kept."""
+"""Records about the training of a model: members that are read again are validated, others are kept."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Options are declared once: each with a default, a description, and its unit in words."""
+"""Options: each is declared once, with a default, a description, and its unit in words."""
 
 import importlib
 import pkgutil

@@ -1,4 +1,4 @@
-"""Pipelines: which steps come after which, and what a step asks for."""
+"""Pipelines: the order of their steps, and the inputs that a step names."""
 
 from typing import Any
 

@@ -25,7 +25,7 @@ from marey_schemas.queries.grammar import (
 
 
 def plain(query: Query) -> object:
-    """Return a query without the texts it was read from."""
+    """Return a query without the source texts of its conditions."""
     if isinstance(query, Condition):
         return (query.field, query.operator, *query.values)
     if isinstance(query, Negation):

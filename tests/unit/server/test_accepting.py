@@ -1,4 +1,4 @@
-"""Connections: bounded, closed if their clients take nothing, and accepted again after descriptors ran out."""
+"""Connections: limited in number, closed if clients do not read, and accepted again after a lack of descriptors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Kept(HTTPServer):
 
 
 class Exhausted(socket.socket):
-    """Listening socket that fails some times because the process has no file descriptors left."""
+    """Listening socket whose `accept` fails several times because no file descriptors are left."""
 
     failures = 3
 
@@ -54,7 +54,7 @@ def serve(
     most: int = 4,
     busy: Callable[[Kept], Collection[object]] = lambda _: (),
 ) -> None:
-    """Run a test with connections that the loop accepts, and a function that connects a client."""
+    """Run a test with connections that the event loop accepts, and a function that connects a client."""
 
     async def main() -> None:
         server = Kept(lambda _request: None)

@@ -1,4 +1,4 @@
-"""Files and tables that a server creates before it first serves."""
+"""Files and tables that a server creates before it serves for the first time."""
 
 import socket
 import stat

@@ -1,4 +1,4 @@
-"""Possession of blobs: access to bytes and references to them."""
+"""Access to the bytes of blobs, and rights to refer to blobs."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""Child processes that read untrusted files: limits, shares, and their ends."""
+"""Child processes that read untrusted files: limits, fair shares, and their ends."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ def children(request: pytest.FixtureRequest) -> Iterator[Children]:
 
 
 def run(pool: Children, function: str, payload: bytes = b"", *, caller: str = "rita") -> bytes:
-    """Return the result of a function in a child."""
+    """Return the result of a function that runs in a child process."""
     return start(pool, function, payload, caller=caller).future.result(PATIENCE_S)
 
 

@@ -1,4 +1,4 @@
-"""The clock of an SQLite database: refused where it is unlikely, and set back with everything that is stored."""
+"""Clock of an SQLite database: refused if it is implausible, and set back together with all stored times."""
 
 import re
 import time
@@ -56,7 +56,7 @@ def make_token(tx: Transaction, name: str, lives_us: int) -> None:
 
 
 def lives_of_tokens(database: Database) -> dict[str, tuple[int, int]]:
-    """Return when each token was made and how long it lives, by name."""
+    """Return, by name, when each token was created and for how long it is valid."""
     rows = database.read(SYSTEM, lambda tx: tx.execute(select(token)).all())
     return {row.name: (row.created_us, row.expires_us - row.created_us) for row in rows if row.expires_us}
 

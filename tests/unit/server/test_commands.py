@@ -1,4 +1,4 @@
-"""The care of a database from the shell: backup, restore, check; the event loop of a server."""
+"""Maintenance of a database by commands: backup, restore and check; the event loop of a server."""
 
 import asyncio
 import re

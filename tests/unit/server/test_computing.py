@@ -1,4 +1,4 @@
-"""Threads that compute do not keep a server from ending."""
+"""Computing threads, which do not prevent a server from ending."""
 
 from __future__ import annotations
 

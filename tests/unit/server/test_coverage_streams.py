@@ -1,4 +1,4 @@
-"""Rows of coverage streams: compare-and-swap, repeated requests, deletion no frames for a day."""
+"""Rows of coverage streams: compare-and-swap, repeated requests, and deletion after a day without frames."""
 
 from collections.abc import Callable
 from typing import Any

@@ -154,7 +154,7 @@ def test_a_broken_connection_is_replaced_and_the_work_done_again(database: Datab
 
 @on_postgres
 def test_a_commit_whose_answer_is_lost_is_not_done_twice(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lost after the commit: the row is there, and nobody wrote it a second time behind the caller's back."""
+    """The answer is lost after the commit: the row exists, and was not written a second time."""
     tries = []
 
     def work(tx: Transaction) -> None:

@@ -1,4 +1,4 @@
-"""Datasets against a model of themselves, under any order of what several people may do."""
+"""Datasets, compared with a model, under random changes by several users in any order."""
 
 from __future__ import annotations
 
@@ -298,7 +298,7 @@ class DatasetMachine(RuleBasedStateMachine):
 
     @contextmanager
     def _unless_impossible(self, branch: str, path: str, number: int | None) -> Iterator[bool]:
-        """Expect an error if the model cannot change the path; the value says whether it can."""
+        """Expect an error in the `with` block if the model cannot change the path; yield whether it can."""
         if branch in self.model.tags or branch not in self.model.refs:
             codes = ("is-tag", "no-version")
         elif self.model.state(self.model.refs[branch]).get(path) == number:

@@ -1,4 +1,4 @@
-"""Free space of the data folder's disk: below a floor nothing is stored, and a reserve lets a full server start."""
+"""Free space of the data folder's disk: nothing is stored below a minimum, and a reserve lets a full server start."""
 
 from __future__ import annotations
 

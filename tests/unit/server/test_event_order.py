@@ -1,4 +1,4 @@
-"""Order of the feed: a follower gets every event once, whatever transactions overlap."""
+"""Order of the feed: a follower gets every event once, even if transactions overlap."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -28,7 +28,7 @@ def open_transaction(database: Database) -> Iterator[Transaction]:
 
 
 class Overlap:
-    """Writers whose transactions overlap, one that numbers events, and a follower who reads in between.
+    """Writers with overlapping transactions, one that numbers events, and a follower that reads in between.
 
     On SQLite, where transactions do not overlap, each is committed at once.
     """
@@ -108,7 +108,7 @@ def test_an_order_by_insertion_would_lose_events(lab: Lab, monkeypatch: pytest.M
 
 
 def test_events_do_not_wait_for_transactions_that_are_open(lab: Lab) -> None:
-    """Neither in this database nor in another one of the same cluster."""
+    """Open transactions in another database of the same cluster do not delay events either."""
     if lab.database.is_sqlite:
         return
     elsewhere = sqlalchemy.create_engine(lab.database.url.set(database="postgres"))

@@ -1,4 +1,4 @@
-"""The feed of events, and keys that make requests safe to repeat."""
+"""The feed of events, and idempotency keys, with which requests can be repeated safely."""
 
 import pytest
 from tests.support.database_fixtures import AdjustableClock

@@ -1,4 +1,4 @@
-"""Fault points do nothing unless asked to, and then exactly what was asked."""
+"""Fault points: they do nothing unless the environment requests a fault, and then exactly this fault."""
 
 import errno
 import subprocess

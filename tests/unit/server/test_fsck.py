@@ -1,4 +1,4 @@
-"""The check finds every kind of damage, and nothing where there is none."""
+"""The check of the store finds every kind of damage, and no damage in an intact store."""
 
 from typing import Any
 
@@ -55,7 +55,7 @@ def findings(lab: Lab) -> set[str]:
 
 
 def damage(lab: Lab, *statements: Any) -> None:
-    """Change rows behind the store's back, foreign keys or not."""
+    """Change rows directly in the database, also in violation of foreign keys."""
     with lab.database.engine.connect() as connection:
         driver = connection.connection.driver_connection
         if lab.database.is_sqlite:

@@ -1,4 +1,4 @@
-"""Garbage collection beside everything else: nothing that is referred to is ever deleted."""
+"""Garbage collection while other transactions run: nothing that has a reference is deleted."""
 
 import threading
 from collections.abc import Callable
@@ -103,7 +103,7 @@ def test_a_job_cannot_keep_what_its_author_may_not_refer_to(lab: Lab) -> None:
 def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(
     lab: Lab, clock: AdjustableClock, open_database: Callable[..., Any], taker: str, first: str
 ) -> None:
-    """Two connections: one acts and waits before it commits, the other starts meanwhile."""
+    """Two connections: the first one writes and waits before it commits, the second one starts meanwhile."""
     lab.write(blobs.put_blob, FILE)
     lab.write(documents.store_document, TREE)
     clock.advance(LONG_S)
@@ -148,7 +148,7 @@ def test_whoever_takes_something_up_while_it_is_collected_gets_it_or_is_told(
 
 
 def test_nothing_is_lost_while_everybody_is_busy(lab: Lab, clock: AdjustableClock) -> None:
-    """Publishers, senders and collectors at once, with a grace of nothing: what was published is whole."""
+    """Publications, uploads and garbage collection run at once without a grace period, and nothing is missing."""
     errors = []
 
     def publisher(number: int) -> None:

@@ -1,4 +1,4 @@
-"""Items and bytes that projects and users hold: counted exactly, within quotas, and free again after deletion."""
+"""Items and bytes of projects and users: counted exactly, limited by quotas, and subtracted after deletion."""
 
 import os
 import random
@@ -92,7 +92,7 @@ def test_lower_limits_than_use_refuse_more_but_not_deletion(lab: Lab) -> None:
 
 
 def change_at_random(lab: Lab, draw: random.Random, number: int) -> None:
-    """Create, revise, delete or restore an item or a collection; sometimes in a write that fails."""
+    """Create, revise, delete or restore an item or a collection, sometimes in a write that fails."""
     who = draw.choice((lab.owner, lab.contributor))
     found = [*lab.read(items.list_items, lab.name, Kind.SKELETON).items]
     action = draw.choice(("create", "create", "fail", "revise", "delete", "restore", "folder"))

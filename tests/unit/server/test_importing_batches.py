@@ -1,4 +1,4 @@
-"""Files of an import are stored together; one that cannot be stored harms no other."""
+"""Files of an import are stored together; a file that cannot be stored does not affect the others."""
 
 from typing import Any
 

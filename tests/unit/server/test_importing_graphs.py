@@ -1,4 +1,4 @@
-"""A graph finds the models of its nodes by their names."""
+"""Import of graphs, whose nodes refer to models by name."""
 
 from collections.abc import Mapping
 from typing import Any

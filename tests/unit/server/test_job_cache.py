@@ -1,4 +1,4 @@
-"""Cache keys of jobs: place of results, newest revisions, and kinds without a key."""
+"""Cache keys of jobs: folder of the results, newest revisions, and kinds without a key."""
 
 from typing import Any
 
@@ -41,7 +41,7 @@ def refused(desk: Desk, kind: str, inputs: dict[str, Any], params: dict[str, Any
 
 
 def shares(desk: Desk, *job: Any, **fields: Any) -> bool:
-    """Whether a job of what another one, done before, was of, gets its result."""
+    """Return whether a job gets the result of another job that was completed before it."""
     return desk.job(submit(desk, *job, **fields)).cached_from is not None
 
 

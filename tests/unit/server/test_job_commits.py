@@ -1,4 +1,4 @@
-"""Jobs that commit their outputs: one transaction publishes the outputs and moves the branch, or neither."""
+"""Jobs that commit their outputs: one transaction publishes the outputs and moves the branch, or neither happens."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -86,7 +86,7 @@ def test_an_entry_that_was_removed_meanwhile_is_a_conflict(gaits: CommittingDesk
 
 
 def test_commits_of_others_to_the_same_branch_are_all_kept(gaits: CommittingDesk) -> None:
-    """Several jobs that started from one commit land one after another."""
+    """Several jobs that started from one commit end one after another."""
     jobs = [gaits.submit(into=f"made{number}", cache="off", params={"number": number}) for number in range(5)]
     for number in range(5):
         gaits.work(f"a{number}", facts={"number": number})
@@ -118,7 +118,7 @@ def test_the_same_result_is_committed_once(gaits: CommittingDesk) -> None:
 
 
 def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) -> None:
-    """Somebody tags the entry while a job computes its content again."""
+    """A user tags the entry while a job computes its content again."""
     first = gaits.submit(into="made")
     gaits.work("a")
     (made,) = gaits.desk.outputs(first)
@@ -132,7 +132,7 @@ def test_changes_of_other_parts_of_an_entry_are_combined(gaits: CommittingDesk) 
 
 
 def test_an_entry_with_parts_of_the_job_and_of_somebody_else_has_a_revision(gaits: CommittingDesk) -> None:
-    """The job adds a mapping while somebody changes the bones; no item has both before the commit stores them."""
+    """The job adds a mapping while a user changes the bones; no item has both parts before the commit stores them."""
     hierarchies = [skeleton_tree(2, bone_m=bone_m) for bone_m in (0.5, 0.6)]
     (rig,) = gaits.desk.publish(Draft("d", Kind.SKELETON, "rig", {"hierarchy": hierarchies[0]}, "own"))
     gaits.change(PutEntry(path="made/rig", item=rig.item))
@@ -282,7 +282,7 @@ def test_identical_jobs_that_all_meet_a_conflict_share_the_commit(gaits: Committ
 
 
 def test_a_step_that_reads_an_earlier_one_starts_from_the_commit_of_that(gaits: CommittingDesk) -> None:
-    """Both steps make the same path; the second one follows the first, so it is no conflict."""
+    """Both steps write to the same path; the second one follows the commit of the first, so there is no conflict."""
     first = gaits.submit(into="made")
     second = gaits.submit("square", into="made", inputs={"things": (JobOutputsInput(job=first),)})
     gaits.work("a")
@@ -481,7 +481,7 @@ def test_the_folder_of_a_dataset_goes_on_from_the_commit_of_a_job(desk: Desk) ->
 
 
 def test_outputs_of_one_name_are_numbered(gaits: CommittingDesk) -> None:
-    """Skeletons of an import may have one name; equal ones are one item, others are numbered."""
+    """Skeletons of an import may have one name: equal ones are one item, different ones are numbered."""
     gaits.submit(into="made")
     lease = gaits.desk.claim()
     drafts = [

@@ -1,4 +1,4 @@
-"""Jobs that commit against a model of themselves, among people who commit, protect and create branches."""
+"""Jobs that commit, compared with a model, while users commit, protect and create branches."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Model:
     """Jobs that made a commit."""
 
     def complete(self, job: Running) -> str:
-        """End a job as it should end, and return its state and the fate of its commit."""
+        """End a job as the server should, and return its expected state and the result of its commit."""
         if job.results and job.branch in self.protected:
             return "failed"
         wanted: dict[str, int | None] = dict(job.results)
@@ -90,7 +90,7 @@ class Model:
 
 
 def applied(state: State, changes: dict[str, int | None]) -> State:
-    """Return a state with changes, of which None removes a name."""
+    """Return a state after changes; None removes a name."""
     return {name: number for name, number in {**state, **changes}.items() if number is not None}
 
 
@@ -189,7 +189,7 @@ class CommittingMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.running)
     @rule(index=which)
     def lose_the_lease(self, index: int) -> None:
-        """The attempt is fenced off; another one makes the same results."""
+        """Let an attempt lose its lease; another attempt creates the same results."""
         job = self.running[index % len(self.running)]
         self.gaits.desk.fail(job.lease, interrupted=True)
         with pytest.raises(LeaseLostProblem):
@@ -202,7 +202,7 @@ class CommittingMachine(RuleBasedStateMachine):
 
     @invariant()
     def every_branch_has_the_entries_and_commits_of_the_model(self) -> None:
-        """Read all in one transaction, because the machine looks after each step."""
+        """One transaction reads everything, because this check runs after each step."""
         self.gaits.read(self._compare)
 
     def _compare(self, tx: Transaction) -> None:

@@ -1,4 +1,4 @@
-"""Lanes of threads: clients take turns, lines are bounded, and nobody waits for somebody who has gone."""
+"""Lanes of threads: clients take turns, queues are limited, and calls of disconnected clients are skipped."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Tree:
 
 
 def test_a_refused_call_keeps_nothing_that_its_functions_used() -> None:
-    """Otherwise only the garbage collector frees bodies of refused requests, and it stops all threads to do so."""
+    """Otherwise, only the garbage collector frees the bodies of refused requests, and it stops all threads for this."""
     trees: list[weakref.ref[Tree]] = []
 
     def check(tree: Tree) -> None:

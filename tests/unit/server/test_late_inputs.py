@@ -1,4 +1,4 @@
-"""Jobs whose inputs are what other jobs make: they get them when those have succeeded, as if submitted only then."""
+"""Jobs whose inputs are outputs of other jobs: they get these inputs as if they were submitted after those jobs."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -23,7 +23,7 @@ from marey_server.store.jobs.retrying import retry_job
 
 
 def make(desk: Desk, job: str, *names: str, **facts: Any) -> None:
-    """Do a job that was claimed by nobody yet: small documents of these names are its results."""
+    """Claim a job, and complete it with small documents of these names."""
     lease = desk.claim(job=job)
     if names:
         desk.stage(lease, *names, facts=facts)
@@ -206,7 +206,7 @@ def test_a_chain_that_was_computed_before_is_done_when_it_is_submitted(desk: Des
 def test_a_long_chain_that_was_computed_before_is_served_in_portions(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No transaction holds the database for as long as a whole pipeline takes to publish."""
+    """No transaction may occupy the database for as long as publishing a whole pipeline takes."""
     monkeypatch.setattr(result_cache, "MOST_SHARED_OUTPUTS", 3)
 
     def submit_chain() -> list[str]:
@@ -253,7 +253,7 @@ def test_only_what_depends_on_a_change_is_computed_again(desk: Desk) -> None:
 def test_parts_that_a_job_does_not_read_make_it_no_other_job(
     desk: Desk, monkeypatch: pytest.MonkeyPatch, read: tuple[str, ...], state: str
 ) -> None:
-    """As a tree that was added to a model is nothing to the job that makes trees of models."""
+    """For example, a tree that was added to a model does not change a job that computes trees of models."""
     reads = {"rig": InputSpec(kind=Kind.SKELETON, parts=read)}
     monkeypatch.setattr(job_kinds, "job_kinds", lambda: {**KINDS, "sum": replace(SUM, inputs=reads)})
     (rig,) = desk.publish(Draft("r", Kind.SKELETON, "rig", {"hierarchy": skeleton_tree()}))

@@ -1,4 +1,4 @@
-"""Leader election: one leader at a time, and a fence that grows whenever the leader changes."""
+"""Leader election: one leader at a time, and a fence that increases whenever the leader changes."""
 
 from tests.support.database_fixtures import AdjustableClock
 

@@ -1,4 +1,4 @@
-"""Lineage graphs: what revisions were made from, through any number of steps, within limits and rights."""
+"""Lineage graphs: sources of revisions through any number of steps, within limits and rights."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ CLIPS = (  # name, collection, tags, frames
 
 
 class FilledLab(Lab):
-    """A lab with the clips above, of one skeleton."""
+    """Project with the clips that this module lists, on one skeleton."""
 
     def __init__(self, database: Database) -> None:
         super().__init__(database)

@@ -1,4 +1,4 @@
-"""Models kept parsed between requests, and the samples that are drawn from them."""
+"""Parsed models that are cached between requests, and samples drawn from them."""
 
 import dataclasses
 import io

@@ -59,7 +59,7 @@ def test_metrics_are_shown_as_the_library_shows_them_all_at_once() -> None:
 
 
 def test_metrics_that_are_asked_for_together_are_rendered_once_more_and_are_new() -> None:
-    """Rendering takes long, so a crowd that asks for metrics must not keep the event loop busy."""
+    """Rendering takes long, so many requests for metrics at once must not occupy the event loop."""
     metrics = Metrics()
     rendered: list[int] = []
 

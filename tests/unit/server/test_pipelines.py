@@ -1,4 +1,4 @@
-"""Pipelines: every job of one, or none, and each goes on when those it needs have succeeded."""
+"""Pipelines: all of their jobs are submitted or none, and each starts when those it needs have succeeded."""
 
 from typing import Any
 

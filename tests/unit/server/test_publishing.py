@@ -1,4 +1,4 @@
-"""Results of imports and jobs become items: together, once, and with references between them."""
+"""Publication of results of imports and jobs as items: together, once, and with references between them."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Queries in SQL select the same items as a plain evaluation of their conditions."""
+"""Queries in SQL select the same items as a direct evaluation of their conditions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DATES = ("2025-02-28", "2025-03-01", "2025-03-01T10:00", "2026-01-31", "1999-12-
 
 
 class QueriedLab(Lab):
-    """A lab with clips of all combinations of folders and take records, of two skeletons."""
+    """Project with clips in all combinations of folders and take records, on two skeletons."""
 
     def __init__(self, database: Database) -> None:
         super().__init__(database)
@@ -93,7 +93,7 @@ def folded(field: str, text: str) -> str:
 
 
 def meets(field: str, operator: str, value: Any, wanted: Any) -> bool:
-    """Return whether a value of a clip meets a condition with one wanted value."""
+    """Return whether a value of a clip meets a condition for one wanted value."""
     if operator == "~":
         return folded(field, wanted) in folded(field, value)
     if field == "folder":

@@ -1,4 +1,4 @@
-"""Jobs that belong together: dependencies, fan-out, shared results, tries of the same."""
+"""Connected jobs: dependencies, fan-outs, shared results, and retries."""
 
 from dataclasses import replace
 from typing import Any

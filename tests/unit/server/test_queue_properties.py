@@ -1,4 +1,4 @@
-"""The queue against a model of itself, under any order of what submitters, workers and the reaper may do."""
+"""The queue, compared with a model, under random actions of submitters, workers and the reaper in any order."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHAINED = ("sum", "square", "survey")
 
 
 class StillClock:
-    """A clock that stands until it is set forward."""
+    """Clock that shows the same time until it is set forward."""
 
     def __init__(self) -> None:
         self.us = 1_800_000_000_000_000
@@ -51,7 +51,7 @@ def _forget_jobs(tx: Transaction) -> None:
 
 
 class QueueMachine(RuleBasedStateMachine):
-    """Errands are compared with the model exactly; chained jobs are held to what must always be so."""
+    """State machine in which single jobs equal those of the model, and connected jobs meet general conditions."""
 
     def __init__(self, desk: Desk, clock: StillClock) -> None:
         super().__init__()
@@ -131,7 +131,7 @@ class QueueMachine(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def try_again(self, data: st.DataObject) -> None:
-        """Chained jobs alone: the model of errands knows no tries."""
+        """Retry a connected job; the model of single jobs has no retries."""
         self._tick()
         lost = {row.id for row in self._rows() if row.kind in CHAINED and row.state in ("failed", "cancelled")}
         again = sorted(job for job in lost if self._is_head(job) and not self._needs_an_errand(job))
@@ -155,7 +155,7 @@ class QueueMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.claims)
     @rule(data=st.data(), most=st.integers(1, 4))
     def claim_again(self, data: st.DataObject, most: int) -> None:
-        """The answer to a claim was lost, or its request arrives twice: the answer names what is still held."""
+        """Repeat a claim, as if its answer was lost; the answer contains the leases that are still held."""
         claim_id = data.draw(st.sampled_from(sorted(self.claims)))
         held = [lease for lease in self.claims[claim_id] if self._holds(lease)]
         if not held:
@@ -234,7 +234,7 @@ class QueueMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.said)
     @rule(data=st.data())
     def say_again(self, data: st.DataObject) -> None:
-        """A request that was answered arrives a second time, perhaps much later: it changes nothing."""
+        """Repeat a request that was answered, perhaps much earlier; it changes nothing."""
         what, lease, write_id = data.draw(st.sampled_from(self.said))
         before = self._rows()
         answer = (
@@ -323,7 +323,7 @@ class QueueMachine(RuleBasedStateMachine):
             assert (row.lease_expires_us is not None) == (row.state == "running" and not has_tasks_at_work)
 
     def teardown(self) -> None:
-        """Whatever has happened, the queue can be worked off to the end, and every result is there once."""
+        """Check that all remaining jobs can be completed, and that every result exists once."""
         for _ in range(200):
             self.clock.us += 1000 * 1_000_000
             self.desk.reap()
@@ -356,7 +356,7 @@ class QueueMachine(RuleBasedStateMachine):
         return any(row.id == job_id and row.parent_id is None for row in self._rows())
 
     def _needs_an_errand(self, job_id: str) -> bool:
-        """Whether it came after an errand, or after a job that did, or its tries did."""
+        """Return whether a job depends on a job of the kind `errand`, directly or through other jobs or retries."""
         after = self.desk.job(job_id).after
         return any(other in self.model.jobs or self._needs_an_errand(other) for other in after)
 
@@ -379,7 +379,7 @@ def _successes_told_twice(tx: Transaction) -> list[Any]:
 
 
 def run_machine(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the machine on a desk whose clock stands still and whose ids are numbers, so that runs can be repeated."""
+    """Run the state machine with a clock that stands still and with numbers as ids, so that a run can be repeated."""
     clock = StillClock()
     numbers = itertools.count(1)
     for module in (layout, retrying):

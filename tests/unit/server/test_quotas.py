@@ -1,4 +1,4 @@
-"""Quotas of users: never exceeded, by however many requests at once, and free again when something ends."""
+"""Quotas of users: not exceeded even by concurrent requests, and available again when something ends."""
 
 import os
 import random

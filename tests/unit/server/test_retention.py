@@ -1,4 +1,4 @@
-"""Retention: what is old goes in batches, and what anything still needs stays."""
+"""Retention: old data is deleted in batches, and data that is still needed stays."""
 
 import pytest
 from sqlalchemy import func, select
@@ -20,7 +20,7 @@ OUTPUT = b"frame after frame\n" * 10
 
 
 def ended(desk: Desk, *, log: bytes = OUTPUT) -> str:
-    """Return a job that has ended, with a log, and published nothing."""
+    """Return a job that has ended, with a log, and that has published nothing."""
     submitted = desk.submit()
     lease = desk.claim()
     assert lease.job == submitted

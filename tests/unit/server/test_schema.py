@@ -1,4 +1,4 @@
-"""The tables in the code and the tables that migrations make are the same, on both databases."""
+"""The tables in the code equal those that migrations create, on both databases."""
 
 from pathlib import Path
 

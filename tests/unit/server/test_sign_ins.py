@@ -1,4 +1,4 @@
-"""Limits on wrong passwords: shared by servers, bounded, and of no use against the owner of an account."""
+"""Limits on wrong passwords: shared by servers, bounded, and without effect on the owner of an account."""
 
 import asyncio
 import time
@@ -41,7 +41,7 @@ def clock() -> AdjustableClock:
 
 
 def guess(database: Database, name: str = "ann", address: str = "10.0.0.1") -> str | None:
-    """Count a try; return the limit that refuses it, if any."""
+    """Count a try to sign in; return the scope of the limit that refuses it, or None."""
     try:
         database.write(ANONYMOUS, sign_ins.count, SignInTry(name, address, PER_MINUTE))
     except TooManyRequestsProblem as refusal:

@@ -1,4 +1,4 @@
-"""Rotation of tokens: one successor for each token, which can be fetched again, and revocations that none escapes."""
+"""Rotation of tokens: one successor for each token, which can be requested again, and revocations of all of them."""
 
 import threading
 from collections.abc import Callable

@@ -20,7 +20,7 @@ class Arrivals:
         self.begun: list[str] = []
 
     def arrive(self, client: Client, name: str, *, reserved: bool = False) -> None:
-        """Let a request arrive that is noted when it begins."""
+        """Let a request of a client arrive; its name is recorded when it begins."""
         turn = self.turns.take(client, reserved=reserved)
         if turn is None:
             self.begun.append(name)
@@ -28,7 +28,7 @@ class Arrivals:
             turn.add_done_callback(lambda _turn: self.begun.append(name))
 
     async def all_begin(self) -> list[str]:
-        """Wait until no request waits, and return the names of those that waited, in their order."""
+        """Wait until no request waits, and return the names of those that waited, in the order in which they began."""
         at_once = len(self.begun)
         while len(self.turns):
             await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""The write-ahead log of SQLite, which a thread copies while writes go on."""
+"""Write-ahead log of SQLite, which a thread copies while writes continue."""
 
 import sqlite3
 import threading
@@ -64,7 +64,7 @@ def connect(file: Path) -> sqlite3.Connection:
 
 
 def write(log: WriteAheadLog, connection: sqlite3.Connection, size_bytes: int = ROW_BYTES) -> int:
-    """Commit a row; return the length of the log."""
+    """Commit a row; return the length of the log in bytes."""
     connection.execute("INSERT INTO some VALUES (zeroblob(?))", (size_bytes,))
     log.after_commit(connection)
     return Path(f"{connection.execute('PRAGMA database_list').fetchone()[2]}-wal").stat().st_size

@@ -1,4 +1,4 @@
-"""Nearest common commits, against all ancestors of all commits."""
+"""Nearest common commits, compared with the set of all common ancestors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Archives: what is written is read again, an interrupted one is continued, and every change is found."""
+"""Archives: they can be read after writing, an interrupted one is continued, and every change is detected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ AT = "2026-11-23T10:00:00.000000Z"
 
 @dataclass
 class Example:
-    """An archive that is put together member by member."""
+    """Archive that is composed of single members."""
 
     members: dict[ArchiveMember, bytes] = field(default_factory=dict)
     head: str = ""

@@ -1,4 +1,4 @@
-"""Differences and merges of entries: the laws of merging, and cases of which each has a right answer."""
+"""Differences and merges of entries: laws of merging, and examples with known results."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: 
 @settings(max_examples=examples(1000), deadline=None)
 @given(states, states, states)
 def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: State) -> None:
-    """A part that one side has changed is in the result, is named by a conflict, or was changed by both alike."""
+    """A part that one side has changed is in the result or in a conflict, or both sides have changed it equally."""
     result, merged = merge(base, ours, theirs)
     in_conflict = [side for one in merged.conflicts for side in (one.base, one.ours, one.theirs) if side is not None]
     kept = [parts for value in result.values() for parts in value["parts"].items()]
@@ -115,7 +115,7 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
 def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
     base: State, ours: State, theirs: State, take: Side | None
 ) -> None:
-    """Nobody has stored the content of a combined entry yet."""
+    """The content of a combined entry is not stored yet."""
     _, undecided = merge(base, ours, theirs)
     resolutions = {one.key: take for one in undecided.conflicts} if take else {}
     result, merged = merge(base, ours, theirs, resolutions)

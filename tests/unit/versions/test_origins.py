@@ -1,4 +1,4 @@
-"""Origins of parts of entries, against a definition by recursion, and moved entries by examples."""
+"""Origins of parts of entries, compared with a recursive definition, and examples of moved entries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trees of entries: their shape, changes, reading and differences, against dictionaries."""
+"""Trees of entries: their shape, changes, reading and differences, compared with dictionaries."""
 
 from __future__ import annotations
 

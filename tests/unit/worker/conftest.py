@@ -1,4 +1,4 @@
-"""A server for workers to talk to, and workers that talk to it."""
+"""Simulated server for workers, and worker processes that use it."""
 
 import sys
 from collections.abc import Iterator
@@ -44,6 +44,6 @@ def shared_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeServ
 
 
 def show(folder: Path) -> None:
-    """Print the log of a folder's workers, which pytest shows beside the failure of a test."""
+    """Print the logs of the workers in a folder, so that pytest shows them with the failure of a test."""
     for log in folder.glob(AttachedWorker.LOG):
         sys.stderr.write(log.read_text())

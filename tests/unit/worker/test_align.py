@@ -1,4 +1,4 @@
-"""The function behind `align`, with a project in memory instead of a server."""
+"""The function of the job kind `align`, with a project in memory instead of a server."""
 
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 class Project(ProjectInMemory):
-    """A project in memory that keeps what a job logs."""
+    """Project in memory that records what a job logs."""
 
     def log(self, text: str) -> None:
         self.told.append(text)

@@ -1,4 +1,4 @@
-"""The functions behind `annotate` and `cut`, with a project in memory instead of a server."""
+"""The functions of the job kinds `annotate` and `cut`, with a project in memory instead of a server."""
 
 from math import radians
 from pathlib import Path

@@ -14,7 +14,7 @@ from marey_worker.job_io.input_cache import InputCache
 
 
 class Source:
-    """Bytes by key, and how often they were fetched."""
+    """Source of bytes by key, which counts how often they are fetched."""
 
     def __init__(self) -> None:
         self.fetched: list[str] = []

@@ -1,4 +1,4 @@
-"""The function behind `evaluate`, with a project in memory instead of a server."""
+"""The function of the job kind `evaluate`, with a project in memory instead of a server."""
 
 from math import radians
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The functions behind `compare`, `suggest`, `optimise` and `sweep`, with a project in memory instead of a server."""
+"""The functions of `compare`, `suggest`, `optimise` and `sweep`, with a project in memory instead of a server."""
 
 import json
 from dataclasses import replace

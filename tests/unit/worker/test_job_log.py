@@ -1,4 +1,4 @@
-"""What a job prints arrives once and in order, whatever happens on the way."""
+"""The log of a job arrives once and in order, in spite of failures on the way."""
 
 from pathlib import Path
 from typing import cast
@@ -15,7 +15,7 @@ ARRIVES, NEVER_ARRIVES, ANSWER_IS_LOST = "arrives", "never arrives", "answer is 
 
 
 class Api:
-    """Keeps a log as the server does; `fates` says what becomes of the next pieces."""
+    """Simulated server that stores a log; `fates` states what happens to the next pieces."""
 
     def __init__(self, limit: int = 1000) -> None:
         self.log = b""

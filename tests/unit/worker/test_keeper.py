@@ -66,7 +66,7 @@ def keep(api: Api) -> Iterator[Callable[..., LeaseKeeper]]:
 
 
 def has_ended(keeper: LeaseKeeper) -> bool:
-    """Wait for the end of the thread that sends the heartbeats; return whether it has come."""
+    """Wait for the end of the thread that sends heartbeats; return whether it has ended."""
     keeper._thread.join(60)
     return not keeper._thread.is_alive()
 

@@ -1,4 +1,4 @@
-"""Places of results of jobs with many clips, and effects of a clip that cannot be used."""
+"""Paths of the results of jobs with many clips, and effects of a clip that cannot be used."""
 
 import io
 import zipfile
@@ -53,7 +53,7 @@ def move(project: ProjectInMemory, into: str, **of_all: Any) -> None:
 
 
 def again(project: ProjectInMemory, position: int, **changes: Any) -> None:
-    """Let one of the clips be there once more, with these changes."""
+    """Add another input that equals one of the clips except for these changes."""
     pin = project.inputs["clips"][position]
     twin = pin.model_copy(update=changes)
     project.parts[twin.item, twin.revision, "motion"] = project.parts[pin.item, pin.revision, "motion"]

@@ -1,4 +1,4 @@
-"""A worker process against a server that remembers what it heard."""
+"""A worker process, tested with a server that records the requests it receives."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""A project that all tests of a module share, for what takes long to make."""
+"""A project that all tests of a module share, because its contents take long to create."""
 
 from collections.abc import Iterator
 from math import radians
@@ -32,7 +32,7 @@ def lab(marey: Marey, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proj
 
 
 def write_steps(folder: Path) -> None:
-    """Walks of two steps each, at different speeds, straight ahead and turning both ways."""
+    """Write walks of two steps each as files, at different speeds, straight ahead and turning both ways."""
     for index in range(EXAMPLES):
         clip = generate_gait(1.0 + 0.05 * index, radians(10.0 * (index % 3 - 1)), 0.9)
         (folder / f"walk {index:02}.bvh").write_bytes(write_bvh(clip))

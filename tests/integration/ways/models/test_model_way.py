@@ -1,4 +1,4 @@
-"""The way of a model as its users walk it: aligned clips, training, samples; a real server, a real worker."""
+"""Workflow of a model: aligned clips, training and samples, on a real server with a real worker."""
 
 from __future__ import annotations
 

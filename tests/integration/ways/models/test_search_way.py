@@ -1,4 +1,4 @@
-"""The way of a search as its users walk it: trees, constraints over REST, files; a real server, a real worker."""
+"""Workflow of a search: trees, constraints over REST and files, on a real server with a real worker."""
 
 from __future__ import annotations
 

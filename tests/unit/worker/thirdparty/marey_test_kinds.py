@@ -1,4 +1,4 @@
-"""Kinds of job from another distribution, as a worker sees them: one that works, one that fails in every way."""
+"""Job kinds of another distribution, as a worker finds them: one that works, and one that fails in every way."""
 
 import ctypes
 import os
@@ -65,7 +65,7 @@ def _eat() -> dict[str, int]:
 
 
 def _hoard(folder: Path) -> None:
-    """Take memory in small pieces, in a process of its own that lifts its limit; name that process in a file."""
+    """Allocate memory in small pieces, in a forked process that removes its limit; write its id to a file."""
     if os.fork() == 0:
         (folder / "hoarder").write_text(str(os.getpid()))
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
