@@ -195,7 +195,7 @@ class ChildProcess(ConnectedChild):
     def _status(self) -> int | None:
         """Return the exit status of the process, and None while it is running.
 
-        On Linux, an ended process keeps its number until `_close`, so that its descendants can still be killed.
+        On Linux, an ended process keeps its process id until `_close`, so that its descendants can still be killed.
         """
         with self._reaping:
             if sys.platform == "linux" and self._process.returncode is None:
@@ -203,7 +203,7 @@ class ChildProcess(ConnectedChild):
             return self._process.poll()
 
     def _signal(self, number: signal.Signals) -> None:
-        """Send a signal to the session of the process, unless its number may belong to another process by now."""
+        """Send a signal to the session of the process, unless its process id may belong to another process by now."""
         with self._reaping:
             if self._process.returncode is None:
                 super()._signal(number)
@@ -215,7 +215,7 @@ class ChildProcess(ConnectedChild):
 
 
 def exit_status(pid: int) -> int | None:
-    """Return the exit status of a child that has ended, and None otherwise; the number of the child stays in use."""
+    """Return the exit status of a child that has ended, and None otherwise; its process id stays in use."""
     ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     if ended is None:
         return None

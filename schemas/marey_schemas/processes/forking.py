@@ -4,8 +4,8 @@ Loading numeric modules and compiled kernels takes two seconds of processor time
 child is ready in milliseconds and shares this memory. The fork server has no other thread, since the locks of other
 threads would stay locked in its children for ever, and it never reads what children read.
 
-Parent and fork server exchange these messages: `FORK`, followed by a socket for the new child; the number of a child
-and its exit status (`STARTED` for a new one); the number of a child that the parent will not signal any more.
+Parent and fork server exchange these messages: `FORK`, followed by a socket for the new child; the process id of a
+child and its exit status (`STARTED` for a new one); the process id of a child that the parent will not signal any more.
 """
 
 from __future__ import annotations
@@ -112,11 +112,11 @@ class ForkServer:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the fork server has ended, so that the system may use the numbers of its children again."""
+        """Whether the fork server has ended, so that the system may use the process ids of its children again."""
         return self._ended
 
     def release(self, pid: int) -> None:
-        """Let the system use the number of an ended child again."""
+        """Let the system use the process id of an ended child again."""
         with self._changed:
             known = self._statuses.pop(pid, None) is not None
         if known and self._process is not None:
@@ -135,7 +135,7 @@ class ForkServer:
             self._watching.join()
 
     def _watch(self) -> None:
-        """Start the fork server, receive the numbers and exit statuses of children, and reap it at its end."""
+        """Start the fork server, receive the process ids and exit statuses of children, and reap it at its end."""
         module, arguments = self._command
         try:
             process = self._process = ChildProcess(module, arguments, threads=1, at_most=True)
@@ -158,7 +158,7 @@ class ForkServer:
         self._started.put(None)
 
     def _read(self, process: ChildProcess) -> None:
-        """Receive the numbers and exit statuses of children until the fork server ends."""
+        """Receive the process ids and exit statuses of children until the fork server ends."""
         with suppress(EOFError, OSError):
             while (message := process.receive()) is not None:
                 pid, status = _NUMBER_AND_STATUS.unpack(message)
@@ -253,7 +253,7 @@ def fork_children(pipe: Connection, serve: Callable[[Connection], None]) -> None
 def _carry_out(
     pipe: Connection, serve: Callable[[Connection], None], others: tuple[socket.socket, socket.socket]
 ) -> set[int]:
-    """Carry out one order of the parent; return the number of the child that it has started, if any.
+    """Carry out one order of the parent; return the process id of the child that it has started, if any.
 
     The child closes `others`. Raises `EOFError` if the parent has closed the pipe.
     """

@@ -76,7 +76,7 @@ class ComputedFile(Message):
 
 
 def pack_tree(tree: Any) -> bytes:
-    """Return a document as bytes for an order; arrays that are encoded already are copied as they are."""
+    """Return a document as bytes for a message; arrays that are encoded already are copied as they are."""
     return encode_tree(tree, MSGPACK, arrays="blocks")
 
 
@@ -106,7 +106,7 @@ class ChildRefusal(Message):
 
 
 class ChildAnswer(Message):
-    """Answer to an order: its result, or one reason why there is none."""
+    """Answer to a `ChildOrder`: the result of the function, or one reason why there is none."""
 
     payload: bytes = b""
     refusal: ChildRefusal | None = None
@@ -115,7 +115,7 @@ class ChildAnswer(Message):
 
 
 def main() -> None:
-    """Load modules; then fork children that carry out orders, or carry out orders, until the pipe closes."""
+    """Load modules; then carry out the orders from the pipe until it closes, or fork children that do so."""
     pipe = connect_to_parent()
     memory_bytes, forks, functions = int(sys.argv[2]), sys.argv[3] == FORK_SERVER, sys.argv[4:]
     keep_freed_memory()
@@ -147,7 +147,7 @@ def carry_out_orders(pipe: Connection, *, memory_bytes: int) -> None:
 
 
 def run(order: ChildOrder) -> bytes:
-    """Call the function of an order and return the packed answer."""
+    """Call the function that a `ChildOrder` names, and return the packed answer."""
     try:
         return _answer(order).pack()
     except MemoryError:

@@ -1,4 +1,4 @@
-"""Reading of uploaded files in a child process: the orders to read them, and the documents that the child returns."""
+"""Reading of uploaded files in a child process: the messages that ask for it, and the documents that are returned."""
 
 from __future__ import annotations
 

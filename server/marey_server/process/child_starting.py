@@ -20,7 +20,7 @@ Loading = TypeVar("Loading", ChildProcess, ForkServer)
 
 
 class ChildStarter:
-    """Start of child processes that may use `memory_bytes` for their orders; any thread may start children.
+    """Start of child processes that may use `memory_bytes` for their tasks; any thread may start children.
 
     All children are killed when the starter is closed.
     """

@@ -1,7 +1,7 @@
 """Child processes in which the server reads untrusted files and computes.
 
-Their number is limited, and users share them fairly. Each child has a thread, which starts it, sends it one order after
-another, and replaces it. When a child is free, it gets an order of the caller who uses the fewest children; no caller
+Their number is limited, and users share them fairly. Each child has a thread, which starts it, sends it one task after
+another, and replaces it. When a child is free, it gets a task of the caller who uses the fewest children; no caller
 can use all of them.
 """
 
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ChildLimits:
-    """Limits of the child processes: of all together, and of each order."""
+    """Limits of the child processes: of all of them together, and of each task."""
 
     children: int
     requests: int

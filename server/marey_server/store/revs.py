@@ -16,7 +16,7 @@ ExpectedRev = int | frozenset[int] | None
 
 
 def at_rev(column: Column[int], expected: ExpectedRev) -> ColumnElement[bool]:
-    """Return the condition that the row is at an expected `rev`, for the statement that writes."""
+    """Return the SQL condition that a row has an expected `rev`, for use in the statement that changes the row."""
     if expected is None:
         return true()
     return column == expected if isinstance(expected, int) else column.in_(sorted(expected))

@@ -145,7 +145,7 @@ def _translating(database: MatchingDatabase, joints: tuple[int, ...]) -> Matchin
 
 
 def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
-    """Check whether clips of two databases can be mixed.
+    """Check whether clips of two databases can be in one database.
 
     The end sites of the skeletons may differ, and so may the offsets of joints that are translated in both databases.
     To make the skeletons equal, build one database with the body of the other (`build_database`).
@@ -168,7 +168,7 @@ def same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> bool:
 
 
 def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> None:
-    """Check that clips of two databases can be mixed.
+    """Check that two databases have the same skeleton, so that their clips can be in one database.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def require_same_skeleton(first: MatchingDatabase, second: MatchingDatabase) -> 
 
     Raises
     ------
-    MotionError    if they cannot be mixed
+    MotionError    if the skeletons differ
     """
     if not same_skeleton(first, second):
         raise MotionError(

@@ -57,7 +57,7 @@ class ItemFilters:
 
     @property
     def looks_up_name(self) -> bool:
-        """Whether only one name can match, or only names that begin with a text that ends in `*`."""
+        """Whether `name` selects one name, or the names that begin with a text that itself ends in `*`."""
         return bool(self.name) and (not str(self.name).endswith("*") or str(self.name).endswith("**"))
 
 
