@@ -63,7 +63,7 @@ SUM = KindDeclaration(
 )
 SQUARE = KindDeclaration(
     name="square",
-    description="Makes one thing of each thing.",
+    description="Creates one study from each study of the input.",
     params=Params,
     implementation="tests:square",
     version=1,
@@ -77,7 +77,7 @@ SQUARE = KindDeclaration(
 )
 SURVEY = KindDeclaration(
     name="survey",
-    description="Looks at all things in as many parts as its number says, and gathers what it saw.",
+    description="Divides the work into the number of tasks that a parameter gives, and gathers their results.",
     params=Params,
     implementation="tests:survey",
     version=1,

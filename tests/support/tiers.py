@@ -133,14 +133,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         type=int,
         choices=range(2, 1001),
         metavar="TIMES",
-        help=f"In the tier soak, how many times as many examples to draw as in the tier test (default: {SOAK_EFFORT}).",
+        help=f"Factor by which the tier soak draws more examples than the tier test (default: {SOAK_EFFORT}).",
     )
     parser.addoption(
         "--fuzz-minutes",
         type=float,
         default=1.0,
         metavar="MINUTES",
-        help="In the tier soak, how long each kind of caller sends generated requests on each database (default: 1).",
+        help="In the tier soak, minutes of generated requests for each kind of caller and database (default: 1).",
     )
 
 

@@ -111,7 +111,9 @@ def _place_beside(path: str) -> tuple[str, str]:
 def report(
     context: typer.Context,
     place: Annotated[str, typer.Argument(help="An evaluation or a model: project/folder/name, or project/id.")],
-    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="The file to write.")] = Path("report.html"),
+    out: Annotated[Path, typer.Option("--out", "--output", "-o", help="File that receives the report.")] = Path(
+        "report.html"
+    ),
     figures: Annotated[
         Path | None, typer.Option(help="Write every figure to this folder: PNG, SVG, JSON, CSV.")
     ] = None,

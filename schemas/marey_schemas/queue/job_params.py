@@ -218,8 +218,8 @@ class ModelParams(ModelOptions, TaggedResults):
     report: bool = Field(True, description="Write the report and its figures.")
     search_check: bool = Field(
         True,
-        description="For the report, test searches: leave out each example in turn, train a model on the "
-        "others, and search for positions that the example reached.",
+        description="For the report, test searches: leave out every fifth example, train a model on the "
+        "others, and search for positions that the hands and feet of the left-out examples reached.",
     )
 
 

@@ -32,8 +32,8 @@ class ModelPlan(Request):
     rigs: tuple[ItemInput, ...] = Field(
         (),
         max_length=1000,
-        description="The clips' skeletons at the revisions whose joint mappings are used; for mappings "
-        "edited after the import.",
+        description="Revisions of the clips' skeletons whose joint mappings are used; needed only for "
+        "mappings that were edited after the import.",
     )
     annotations: Inputs = Field((), max_length=1000, description="Annotations of the takes.")
     annotate: AnnotateParams | None = Field(

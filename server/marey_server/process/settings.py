@@ -45,7 +45,7 @@ class Settings(BaseSettings):
     blobs: Literal["database", "directory"] = Field(
         "database", description="Storage of blobs: in the database, or in the folder `blobs` of the data folder."
     )
-    answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory for a cache of encoded documents.")
+    answer_cache_bytes: int = Field(64 * MIB, ge=0, description="Memory in bytes for a cache of encoded documents.")
     trust_proxy: bool = Field(
         False,
         description="Read the addresses of clients from the header proxy_header. Safe only if all clients reach the "
@@ -101,7 +101,7 @@ class Settings(BaseSettings):
     min_free_bytes: int = Field(
         64 * MIB,
         ge=0,
-        description="Free space of the data folder's disk below which nothing is stored; deleting stays possible.",
+        description="Free bytes on the data folder's disk below which nothing is stored; deleting stays possible.",
     )
     max_header_bytes: int = Field(
         64 * KIB, ge=4096, description="Greatest size of the request line and the headers, in bytes."
@@ -151,7 +151,9 @@ class Settings(BaseSettings):
     child_processor_s: float = Field(
         30.0, ge=1, description="Greatest processor time in seconds of a child process for one request."
     )
-    child_wall_s: float = Field(120.0, ge=1, description="Greatest time in seconds of a child process for one request.")
+    child_wall_s: float = Field(
+        120.0, ge=1, description="Greatest duration in seconds of a child process for one request."
+    )
     lease_ttl_s: float = Field(
         QueuePolicy.lease_ttl_s,
         ge=1,
