@@ -16,12 +16,14 @@ from marey_reports.drawing.drawn import DrawnFigure
 
 
 def is_sound(figure: DrawnFigure) -> DrawnFigure:
-    """Check that both pictures can be read, columns of a table are equally long, and the caption is not empty.
-
-    Returns the figure.
-    """
+    """Check that both pictures can be read, and what `has_sound_data` checks; return the figure."""
     assert imread(io.BytesIO(figure.png)).shape[0] > 100
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
+    return has_sound_data(figure)
+
+
+def has_sound_data(figure: DrawnFigure) -> DrawnFigure:
+    """Check that columns of a table are equally long and the caption is a sentence; return the figure."""
     assert figure.caption.endswith(".")
     assert "nan" not in figure.caption
     for columns in figure.data["tables"].values():

@@ -1,4 +1,4 @@
-"""Drawn figures: a PNG and an SVG of each, with the numbers that they show."""
+"""Drawn figures: as PNG and as SVG, with the numbers that they show."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -31,25 +32,41 @@ class Sketch(NamedTuple):
     caption: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DrawnFigure:
-    """A figure.
+    """A figure, whose pictures are made when they are first asked for.
 
     Parameters
     ----------
+    sketch : the page, the numbers that it shows, and its caption
     name : name by which it is requested
     number : number in the paper, or "" for figures that the paper does not have
-    caption : description of the figure, also for people who cannot see it
-    tables : the numbers that the figure shows, see `Tables`
     """
 
+    sketch: Sketch
     name: str
     number: str
     title: str
-    caption: str
-    png: bytes
-    svg: str
-    tables: Tables
+
+    @property
+    def caption(self) -> str:
+        """The description of the figure, also for people who cannot see it."""
+        return self.sketch.caption
+
+    @property
+    def tables(self) -> Tables:
+        """The numbers that the figure shows."""
+        return self.sketch.tables
+
+    @cached_property
+    def png(self) -> bytes:
+        """The picture as PNG."""
+        return to_png(self.sketch.figure)
+
+    @cached_property
+    def svg(self) -> str:
+        """The picture as SVG."""
+        return to_svg(self.sketch.figure, self.title)
 
     @property
     def data(self) -> dict[str, Any]:
@@ -75,19 +92,6 @@ class DrawnFigure:
         for table, columns in self.tables.items():
             files[f"{self.name}-{table}.csv"] = as_csv(columns).encode()
         return files
-
-
-def finish(sketch: Sketch, name: str, number: str, title: str) -> DrawnFigure:
-    """Write a sketch as PNG and SVG, and return it as a figure."""
-    return DrawnFigure(
-        name=name,
-        number=number,
-        title=title,
-        caption=sketch.caption,
-        png=to_png(sketch.figure),
-        svg=to_svg(sketch.figure, title),
-        tables=sketch.tables,
-    )
 
 
 def listed(values: Column) -> list[Any]:

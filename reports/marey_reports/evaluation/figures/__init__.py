@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from marey_motion.errors import MotionError
 from marey_motion.evaluation.result import EvaluationResult
-from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
+from marey_reports.drawing.drawn import DrawnFigure, Sketch
 from marey_reports.evaluation.figures.clip_graph import draw_clip_graph
 from marey_reports.evaluation.figures.clip_usage import draw_usage
 from marey_reports.evaluation.figures.coverage_points import draw_points
@@ -110,7 +110,7 @@ def draw_figure(
             f"the figure {name!r} shows all trials together; leave out the trial", code="figure-without-trial"
         )
     subjects = [Subject("", result)] if other is None else [Subject(labels[0], result), Subject(labels[1], other)]
-    return finish(kind.draw(subjects, trial, options or FigureOptions()), name, kind.number, kind.title)
+    return DrawnFigure(kind.draw(subjects, trial, options or FigureOptions()), name, kind.number, kind.title)
 
 
 def draw_figures(

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 from marey_motion.alignment.aligned import AlignedSet
-from marey_reports.drawing.drawn import DrawnFigure, Sketch, finish
+from marey_reports.drawing.drawn import DrawnFigure, Sketch
 from marey_reports.models.figures.alignment_costs import draw_alignment_costs
 from marey_reports.models.figures.components import draw_component, draw_mean
 from marey_reports.models.figures.latent_space import draw_latent_space, draw_likelihood
@@ -64,7 +64,7 @@ def draw_model_figures(subject: ModelSubject) -> dict[str, DrawnFigure]:
 def _drawn(makers: dict[str, tuple[str, Callable[[], Sketch | None]]]) -> dict[str, DrawnFigure]:
     sketches = {name: (title, draw()) for name, (title, draw) in makers.items()}
     return {
-        name: finish(sketch, name, PUBLISHED.get(name, ""), title)
+        name: DrawnFigure(sketch, name, PUBLISHED.get(name, ""), title)
         for name, (title, sketch) in sketches.items()
         if sketch is not None
     }
