@@ -73,7 +73,7 @@ def _draft(one: ReceivedRevision, local: LocalRevisions) -> Draft:
     return Draft(
         name_in_batch=one.content, kind=one.kind, parts=dict(parts), reuse="new",
         item_name=item_name(one.path or one.kind.value, one.content),
-        collection="" if one.path is not None else f"{IMPORTED}/{one.kind.plural}",
+        collection="" if one.path is not None else f"{IMPORTED}/{one.kind.plural}", hidden=one.path is not None,
     )  # fmt: skip
 
 
@@ -91,17 +91,15 @@ def _stored(one: ReceivedRevision, part: str, content: str, local: LocalRevision
 def store_revisions(tx: Transaction, project: str, name: str, drafts: Mapping[str, Draft]) -> StoredRevisions:
     """Store received revisions; `drafts` maps the content digest of each to its draft.
 
-    The items of revisions that are the content of entries are deleted at once. Raises `InvalidProblem` if the content
+    The items of revisions that are the content of entries are hidden. Raises `InvalidProblem` if the content
     digest of a stored revision is not the one that the request gives.
     """
     project_row = projects.require(tx, project)
     folder = find_dataset(tx, project_row, name).path or ""
-    of_entries = {content for content, draft in drafts.items() if not draft.collection}
     placed = {
-        content: replace(draft, collection=folder) if content in of_entries else draft
-        for content, draft in drafts.items()
+        content: replace(draft, collection=folder) if draft.hidden else draft for content, draft in drafts.items()
     }
-    added = publish_contents(tx, project_row, placed, of_entries, author_id=tx.principal.user_id)
+    added = publish_contents(tx, project_row, placed, author_id=tx.principal.user_id)
     return StoredRevisions(added=added)
 
 

@@ -1,12 +1,11 @@
 """Revisions that entries need and no item has, because another server sent them or a merge combined them.
 
-Each gets a new item, which is deleted at once, so that no folder changes; a checkout restores the item at the path of
-its entry.
+Each gets a new hidden item, so that no folder changes; a checkout restores the item at the path of its entry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from marey_schemas.kinds import Kind
 from marey_schemas.wording import counted
@@ -48,12 +47,11 @@ def publish_contents(
     tx: Transaction,
     project_row: ProjectRow,
     drafts: Mapping[str, Draft],
-    hidden: Collection[str],
     *,
     author_id: str | None,
     job_id: str | None = None,
 ) -> int:
-    """Publish drafts by their content digests, and delete the items of those in `hidden`; return how many were new.
+    """Publish drafts by their content digests; return how many were new.
 
     Drafts whose content the project has already are left out. Raises `InvalidProblem` if the content digest of a
     revision is not the one under which `drafts` has it.
@@ -71,9 +69,6 @@ def publish_contents(
                 code="other-content",
             )
     store_contents(tx, contents)
-    for one in made:
-        if one.name in hidden:
-            items.hide_item(tx, project_row, one.kind, one.item)
     return len(made)
 
 
@@ -104,6 +99,6 @@ def store_combined(
             parts[part] = merged[digest] if side is None else StoredDocument(stored[held[side.content]][part])
         drafts[entry.content] = Draft(
             name_in_batch=entry.content, kind=Kind(entry.kind), parts=parts, reuse="new", message=message,
-            item_name=item_name(entry.path, entry.content), collection=folder or "",
+            item_name=item_name(entry.path, entry.content), collection=folder or "", hidden=True,
         )  # fmt: skip
-    publish_contents(tx, project_row, drafts, drafts.keys(), author_id=author_id, job_id=job_id)
+    publish_contents(tx, project_row, drafts, author_id=author_id, job_id=job_id)

@@ -172,13 +172,7 @@ def change_item(
 
 def delete_item(tx: Transaction, project: str, kind: Kind, item_id: str, *, expected_rev: ExpectedRev) -> None:
     """Hide an item; it can be restored. References to its revisions stay valid."""
-    hide_item(tx, projects.require(tx, project), kind, item_id, expected_rev=expected_rev)
-
-
-def hide_item(
-    tx: Transaction, project_row: ProjectRow, kind: Kind, item_id: str, *, expected_rev: ExpectedRev = None
-) -> None:
-    """Delete an item as `delete_item` does, for a caller whose rights were checked."""
+    project_row = projects.require(tx, project)
     which = (*_this(project_row, kind, item_id), item.c.deleted_us.is_(None))
     gone = _shown(tx, project_row, kind, item_id)
     absent = no_item(kind, item_id)

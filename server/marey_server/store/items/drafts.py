@@ -41,6 +41,8 @@ class Draft:
     sources: Mapping[str, Sequence[tuple[str, int]]] = field(default_factory=dict)
     reuse: Literal["by_name", "by_content", "new"] = "by_name"
     message: str = ""
+    hidden: bool = False
+    """Whether a new item is deleted from the beginning, so that no folder shows it before a checkout restores it."""
 
 
 @dataclass(frozen=True, slots=True)
