@@ -82,7 +82,7 @@ def test_merging_with_an_unchanged_side_gives_the_other_side(base: State, change
     assert not merge(base, base, changed)[1].conflicts
 
 
-@settings(max_examples=examples(1000), deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(states, states, states)
 def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: State, theirs: State) -> None:
     one, merged = merge(base, ours, theirs)
@@ -92,7 +92,7 @@ def test_the_order_of_the_sides_matters_for_their_names_only(base: State, ours: 
         assert one == other
 
 
-@settings(max_examples=examples(1000), deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(states, states, states)
 def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: State) -> None:
     """A part that one side has changed is in the result or in a conflict, or both sides have changed it equally."""
@@ -110,7 +110,7 @@ def test_nothing_of_either_side_disappears(base: State, ours: State, theirs: Sta
                     assert (part, one.after.parts[part]) in kept
 
 
-@settings(max_examples=examples(1000), deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 @given(states, states, states, st.none() | st.sampled_from(Side))
 def test_each_content_is_that_of_a_side_or_is_listed_as_combined(
     base: State, ours: State, theirs: State, take: Side | None
