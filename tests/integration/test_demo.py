@@ -35,6 +35,10 @@ def test_the_demonstration_tells_how_good_the_motion_is_and_does_nothing_twice(t
     assert again["evaluation"]["trials"] == 50
     assert 0 < again["evaluated_clips"] < again["retargeted_clips"]
     assert again["statuses"] == {"unchanged": again["files"]}
+    version = again["version"]
+    assert (version["dataset"], version["tag"], version["entries"]) == ("results", "v1", again["retargeted_clips"] + 1)
+    assert f"{version['edited']} was smoothed on a branch and merged" in told
+    assert Path(version["picture"]).read_text("utf-8").endswith("</svg>\n")
     with open(again["evaluation_report"], encoding="utf-8") as page:
         assert "</html>" in page.read()
 
@@ -49,3 +53,5 @@ def test_a_run_with_other_files_reports_on_these_alone(tmp_path: Path) -> None:
         assert report["retargeted_clips"] == report["evaluated_clips"] == report["tasks"] == 1, name
         assert [Path(file).stem for file in report["exported"]] == [name]
         assert report["frames"] == report["retargeted_frames"] > 0
+        assert report["version"]["edited"] == f"takes/{name}"
+    assert [(one["version"]["tag"], one["version"]["entries"]) for one in reports] == [("v1", 2), ("v2", 3)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from marey_client.cli.demo.versions import DemoVersion
 from marey_client.cli.terminal.output import Advance
 from marey_client.handles.clips import ClipHandle
 from marey_client.project import ProjectHandle
@@ -51,17 +52,25 @@ class DemoEvaluation:
 
 
 def evaluate_locomotion(
-    project: ProjectHandle, clips: Sequence[ClipHandle], root: str, folder: Path, advance: Advance
+    project: ProjectHandle,
+    clips: Mapping[str, ClipHandle],
+    version: DemoVersion | None,
+    root: str,
+    folder: Path,
+    advance: Advance,
 ) -> DemoEvaluation:
-    """Evaluate the clips that are locomotion, and write the report to `folder`. `root` is their root joint."""
+    """Evaluate the clips that are locomotion as the version has them, and write the report to `folder`.
+
+    `clips` are given by the paths of their entries; `root` is their root joint. Without a version, there are no clips.
+    """
     chosen = []
-    for done, clip in enumerate(clips):
+    for done, (path, clip) in enumerate(clips.items()):
         advance("looking for locomotion", done, len(clips))
         if travels(clip, root):
-            chosen.append(clip)
-    if not chosen:
+            chosen.append(path)
+    if not chosen or version is None:
         return DemoEvaluation(len(clips), 0)
-    job = project.evaluate(chosen, name=NAME, **OPTIONS)
+    job = project.evaluate(version.places(chosen), name=NAME, **OPTIONS)
     found = project.evaluation(job, on_progress=lambda now: _show(now.progress, advance))
     return DemoEvaluation(len(clips), len(chosen), found.summary(), found.save_report(folder / "evaluation.html"))
 

@@ -14,6 +14,7 @@ from typing import Any
 import typer
 
 from marey_client.cli.demo.evaluation import DemoEvaluation
+from marey_client.cli.demo.versions import DATASET, DemoVersion
 from marey_client.cli.terminal.output import print_message, print_rows
 from marey_client.credentials import ADMIN_TOKEN
 from marey_client.imports import refusal_text
@@ -28,7 +29,7 @@ REASONS_SHOWN = 12
 class DemoReport:
     """Results of the demonstration and places of its files.
 
-    `seconds` is the time of each step: import, retarget, files, evaluate.
+    `seconds` is the time of each step: import, retarget, files, version, evaluate.
     """
 
     entries: Sequence[ImportEntry]
@@ -42,6 +43,7 @@ class DemoReport:
     tasks: int
     shared_tasks: int
     sheet: Path | None
+    version: DemoVersion | None
     evaluation: DemoEvaluation
     server: str = ""
 
@@ -82,6 +84,7 @@ class DemoReport:
             "job": self.job.id if self.job else None,
             "contact_sheet": str(self.sheet.absolute()) if self.sheet else None,
             "exported": [str(path.absolute()) for path in self.exported],
+            "version": self.version.as_dict() if self.version else None,
             "evaluated_clips": self.evaluation.chosen,
             "evaluation": self.evaluation.summary,
             "evaluation_report": str(self.evaluation.report.absolute()) if self.evaluation.report else None,
@@ -105,6 +108,8 @@ def print_report(report: DemoReport) -> None:
         print_message(f"retargeted files  {report.exported[0].parent.absolute()}")
     if report.sheet:
         print_message(f"contact sheet     {report.sheet.absolute()}")
+    if report.version and report.version.picture:
+        print_message(f"smoothed clip     {report.version.picture.absolute()}")
     if report.evaluation.report:
         print_message(f"evaluation        {report.evaluation.report.absolute()}")
     marey, data = _command(), shlex.quote(str(report.data))
@@ -142,6 +147,9 @@ def _rows(report: DemoReport) -> Iterator[tuple[str, str, str]]:
     yield "", f"{seconds['retarget']:.2f}", f"seconds, through queue and worker{shared}"
     yield "", f"{rates['retarget']:,.0f}", "poses per second"
     yield "", f"{sizes['retargeted']:.0f}", "bytes per pose"
+    if (version := report.version) is not None:
+        edited = f"; {version.edited} was smoothed on a branch and merged" if version.edited else ""
+        yield "version", version.tag, f"of the dataset {DATASET}, with {version.entries} entries{edited}"
     yield from _evaluation_rows(report)
 
 

@@ -1,4 +1,4 @@
-"""Demonstration: takes are imported, retargeted to a second skeleton, drawn, evaluated, and exported.
+"""Demonstration: takes are imported, retargeted to a second skeleton, drawn, exported, versioned, and evaluated.
 
 All steps use a local server and the same requests as any other program.
 """
@@ -16,6 +16,7 @@ from typing import Any
 from marey_client import embedded
 from marey_client.cli.demo.evaluation import evaluate_locomotion
 from marey_client.cli.demo.report import DemoReport, print_report
+from marey_client.cli.demo.versions import version_results
 from marey_client.cli.terminal.output import Advance, print_json, print_message, progress
 from marey_client.credentials import ADMIN_TOKEN, read_secret
 from marey_client.errors import NotFound
@@ -77,9 +78,12 @@ class Story:
             shown = _evenly(results, SHEET_TAKES)
             exported = [self._export(clip) for clip in shown]
             sheet = self._contact_sheet([(sources[_source_path(clip)], clip) for clip in shown], len(results))
+        with self._timed("version"):
+            entries_of = {_source_path(clip): clip for clip in results}
+            version = version_results(self.project, entries_of, target, self.data) if results else None
         with self._timed("evaluate"):
             root = target.hierarchy().joints[0].name
-            evaluation = evaluate_locomotion(self.project, results, root, self.data, self.advance)
+            evaluation = evaluate_locomotion(self.project, entries_of, version, root, self.data, self.advance)
         return DemoReport(
             entries=entries,
             left_out=len(self.files.left_out),
@@ -92,6 +96,7 @@ class Story:
             tasks=len(tasks),
             shared_tasks=sum(task.cached_from is not None for task in tasks),
             sheet=sheet,
+            version=version,
             evaluation=evaluation,
         )
 
