@@ -54,7 +54,7 @@ class AnnotationClash(NamedTuple):
 
 
 ADDED_TWICE = AnnotationClash("Both sides have added the annotation, so there is no version to compare them with.")
-OTHER_MOTION = AnnotationClash("The two sides label clips with different motion, so their frames do not correspond.")
+OTHER_MOTION = AnnotationClash("The versions label clips with different motion, so their frames do not correspond.")
 
 
 def merge_annotations(
@@ -70,9 +70,10 @@ def merge_annotations(
         the merged document, in which the clip is referred to by the digest of its content; or the reason why both
         changes cannot be kept
     """
-    documents = (base.document, ours.document, theirs.document)
-    same_clip = ours.document.get("clip") == theirs.document.get("clip")
-    if not same_clip and (ours.motion is None or ours.motion != theirs.motion):
+    versions = (base, ours, theirs)
+    documents = [one.document for one in versions]
+    same_clip = all(one.get("clip") == documents[0].get("clip") for one in documents)
+    if not same_clip and (base.motion is None or len({one.motion for one in versions}) > 1):
         return OTHER_MOTION
     merged: dict[str, Any] = {}
     for name in sorted({name for one in documents for name in one}):

@@ -62,5 +62,5 @@ def test_no_piece_may_be_without_frames() -> None:
 
 @pytest.mark.parametrize("at", [[0], [50, 50], [60, 50]])
 def test_cuts_increase_from_the_second_frame(at: list[int]) -> None:
-    with pytest.raises(ValidationError, match=r"must increase|greater than or equal to 1"):
+    with pytest.raises(ValidationError, match=r"in increasing order|greater than or equal to 1"):
         Split(at=at)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 from tests.support.committing_desk import CommittingDesk
 from tests.support.queue_desk import Desk
 from tests.support.store_fixtures import motion_tree, skeleton_tree
@@ -28,7 +28,8 @@ from marey_server.store import datasets, fsck, items
 from marey_server.store.documents import load_body
 from marey_server.store.items.drafts import Draft
 from marey_server.store.items.revisions import read_part_digests
-from marey_server.store.tables import document, revision
+from marey_server.store.tables import document, holding, project, revision
+from marey_server.store.transaction import Transaction
 
 Segment = tuple[str, int, int]
 
@@ -232,6 +233,34 @@ def test_a_job_and_a_person_label_different_ranges(labelling: LabellingDesk) -> 
     assert labelling.job(made).publish_conflict is None
     assert labelling.labels() == BOTH
     assert labelling.commit().job == made
+    assert labelling.problems() == []
+
+
+def test_the_commit_of_a_job_merges_fewer_annotations_since_others_wait(
+    labelling: LabellingDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("marey_server.store.datasets.outputs.MOST_MERGED_BY_JOB", 0)
+    made = labelling.submit("label")
+    labelling.label(OURS)
+    stage_labels(labelling, THEIRS)
+    conflict = labelling.job(made).publish_conflict
+    assert conflict is not None
+    assert (conflict.branch, labelling.labels(), labelling.labels(made)) == (made, OURS, THEIRS)
+
+
+def leave_no_room(tx: Transaction) -> None:
+    """Limit each project to the items that it has."""
+    for row in tx.execute(select(holding).join(project, project.c.id == holding.c.owner_id)).all():
+        tx.execute(update(holding).where(holding.c.owner_id == row.owner_id).values(limits={"items": row.items}))
+
+
+def test_a_merge_needs_no_room_for_items(labelling: LabellingDesk) -> None:
+    """The item of merged labels is in no folder, so that it counts as little as a deleted one."""
+    labelling.label(OURS)
+    labelling.label(THEIRS, "trial")
+    labelling.write(leave_no_room)
+    labelling.merge()
+    assert labelling.labels() == BOTH
     assert labelling.problems() == []
 
 

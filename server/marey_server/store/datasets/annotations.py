@@ -21,22 +21,26 @@ AT_ONCE = 100
 """Greatest number of annotations whose versions are loaded by the same statements."""
 MOST_MERGED = 1_000
 """Greatest number of annotations that one merge combines. It limits how long other writers wait for the commit."""
+MOST_MERGED_BY_JOB = 50
+"""Greatest number of annotations that the commit of a job merges, which also computes them while others wait."""
 MOST_BYTES = 8 * 1024**2
 """Greatest total size of the documents that one merge loads."""
 
 NO_CONTENT = AnnotationClash("The project has no revision with the content of one of the versions.")
-TOO_LARGE = AnnotationClash(
-    f"Both sides have changed more than {MOST_MERGED:,} annotations, or annotations of more than "
-    f"{MOST_BYTES // 1024**2} MiB in total, so this one was not merged segment by segment."
-)
 
 
 class AnnotationMerger:
     """Merges annotations of one project, and keeps the resulting documents until a commit stores them."""
 
-    def __init__(self, tx: Transaction, project_id: str) -> None:
+    def __init__(self, tx: Transaction, project_id: str, most: int | None = None) -> None:
+        """Merge at most `most` annotations, by default `MOST_MERGED`; further ones are in conflict."""
         self._tx = tx
         self._project_id = project_id
+        self._most = MOST_MERGED if most is None else most
+        self._too_many = AnnotationClash(
+            f"Both sides have changed more than {self._most:,} annotations, or annotations of more than "
+            f"{MOST_BYTES // 1024**2} MiB in total, so this one was not merged segment by segment."
+        )
         self._loaded = 0
         self._loaded_bytes = 0
         self.documents: dict[str, PreparedDocument] = {}
@@ -86,7 +90,7 @@ class AnnotationMerger:
             return NO_CONTENT
         self._loaded += 1
         self._loaded_bytes += sum(sizes[digests[content]] for content in three)
-        return TOO_LARGE if self._loaded > MOST_MERGED or self._loaded_bytes > MOST_BYTES else None
+        return self._too_many if self._loaded > self._most or self._loaded_bytes > MOST_BYTES else None
 
     def _merge_versions(self, bodies: Sequence[Mapping[str, Any]], contents: Contents) -> str | AnnotationClash:
         """Merge the documents of the base, our side and their side; return the content digest of the result."""

@@ -20,7 +20,7 @@ from marey_schemas.wording import counted
 from marey_server import faults
 from marey_server.errors import NotFoundProblem
 from marey_server.store.database.clock import datetime_of
-from marey_server.store.datasets.annotations import AnnotationMerger
+from marey_server.store.datasets.annotations import MOST_MERGED_BY_JOB, AnnotationMerger
 from marey_server.store.datasets.chunks import StoredChunks, store_chunks
 from marey_server.store.datasets.committing import PreparedCommit, insert_commit, move_branch_to
 from marey_server.store.datasets.history import tree_of
@@ -102,7 +102,7 @@ def commit_outputs(tx: Transaction, wanted: OutputEntries, mover: Mover) -> Comm
     entries = _with_removals(Tree(reader, base), wanted)
     if (refused := _unfit(entries)) is not None:
         return CommittedOutputs(conflict=refused)
-    annotations = AnnotationMerger(tx, wanted.project_id)
+    annotations = AnnotationMerger(tx, wanted.project_id, MOST_MERGED_BY_JOB)
     merged = _merged(reader, base, head, entries, annotations)
     if merged.conflicts:
         tree = change(store, base, _values(entries))

@@ -59,7 +59,6 @@ def publish(
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
     quotas.hold(tx, project_row.id, publication.added)
-    quotas.release(tx, project_row.id, publication.hidden)
     faults.point("publish.before_commit")
     tx.after_commit(lambda: faults.point("publish.after_commit"))
     return [publication.done[draft.name_in_batch] for draft in drafts]
@@ -174,9 +173,7 @@ class _Publication:
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
     added: dict[str | None, Held] = field(default_factory=dict)
-    """New items and bytes, by the creator of the items."""
-    hidden: dict[str | None, Held] = field(default_factory=dict)
-    """Those of hidden items, which count for a quota only while they are created."""
+    """New items and bytes, by the creator of the items; like deleted items, hidden ones do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -327,9 +324,8 @@ class _Publication:
             made.update(self.tx.execute(insertion, given).scalars())
         created = [(one, at) for at, one in zip(ids, new, strict=True) if at in made]
         self._write("item.created", [(one, _Head(at, 1, one.digests, self.author_id)) for one, at in created])
-        self._add(self.author_id, _held(rows, [at for _, at in created]))
-        if hidden := [at for one, at in created if one.draft.hidden]:
-            self.hidden[self.author_id] = self.hidden.get(self.author_id, Held()) + _held(rows, hidden)
+        counted = [at for one, at in created if not one.draft.hidden]
+        self._add(self.author_id, Held(len(counted), sum(rows[at]["stored_bytes"] for at in counted)))
         for one in new:
             if one.draft.reuse == "new" and one.draft.name_in_batch not in self.done:
                 place = "/".join(filter(None, (one.draft.collection, one.draft.item_name)))
@@ -393,11 +389,6 @@ class _Publication:
             "item_kind": draft.kind.value, "name": draft.item_name, "collection": draft.collection,
             "revision": head.number, "job": self.job_id,
         }  # fmt: skip
-
-
-def _held(rows: Mapping[str, Mapping[str, Any]], ids: Sequence[str]) -> Held:
-    """Return the number of new items and of their bytes."""
-    return Held(len(ids), sum(rows[at]["stored_bytes"] for at in ids))
 
 
 def _names(draft: Draft) -> Iterator[str]:
