@@ -21,7 +21,7 @@ from marey_server.store.tables import project
 from marey_server.store.transaction import Transaction
 
 REFUSALS = {
-    "unauthenticated", "bad-token", "no-project", "insufficient-role", "insufficient-scope", "scope-missing",
+    "unauthenticated", "bad-token", "no-project", "insufficient-role", "insufficient-scope",
     "administrators-only", "attempt-only", "not-for-attempts", "users-only", "forbidden", "no-user", "no-job",
     "no-blob", "no-attempt", "not-yours", "lease-lost",
 }  # fmt: skip

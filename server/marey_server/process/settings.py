@@ -110,8 +110,8 @@ class Settings(BaseSettings):
         10,
         ge=1,
         description="Greatest number of wrong passwords per minute for one user name from one address (in IPv6, one "
-        "network of 64 bits). Ten times as many are allowed for all names from one address, and for one name from all "
-        "addresses where it has never signed in.",
+        "network of 64 bits). All names from one address: ten times as many. One name from all addresses where it has "
+        "not signed in for 90 days: ten times as many at once, then as many per minute.",
     )
     name_guesses_per_hour: int = Field(
         20,

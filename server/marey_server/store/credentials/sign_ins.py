@@ -22,7 +22,10 @@ from marey_server.store.tables import sign_in_limit
 from marey_server.store.transaction import Transaction
 
 MORE_FOR_MANY = 10
-"""Factor by which the limit of an address, and that of an account from unknown addresses, exceed `per_minute`."""
+"""Factor by which the limit of an address exceeds `per_minute`.
+
+For an account from unknown addresses, only the number of tries without a pause is multiplied by it.
+"""
 KNOWN_FOR_US = 90 * DAY_US
 """Time for which an address is known after a sign-in."""
 LimitScope = Literal["account-at-address", "address", "account"]

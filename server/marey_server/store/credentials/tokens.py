@@ -291,7 +291,7 @@ def revoke_token(tx: Transaction, token_id: str, *, with_created: bool = False) 
         which = and_(which, token.c.user_id == principal.user_id)
     found = tx.execute(select(token.c.user_id, token.c.created_by, token.c.successor_of).where(which)).first()
     if found is None:
-        raise NotFoundProblem(f"You have no token {token_id!r}.", code="no-token")
+        raise NotFoundProblem(f"There is no token {token_id!r} that you may revoke.", code="no-token")
     _lock_tokens(tx, found.user_id)
     if with_created:
         _revoke(tx, token.c.id.in_(_connected_with(which)))
@@ -353,7 +353,7 @@ def _revoke(tx: Transaction, which: ColumnElement[bool]) -> None:
 
 
 def forget_ended(tx: Transaction) -> int:
-    """Delete tokens that ended more than `KEPT_AFTER_END_US` ago; return their number."""
+    """Delete tokens that expired more than `KEPT_AFTER_END_US` ago; return their number."""
     return tx.execute(delete(token).where(token.c.expires_us < tx.now_us - KEPT_AFTER_END_US)).rowcount
 
 
