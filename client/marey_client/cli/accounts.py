@@ -146,7 +146,7 @@ def change_password(
         who = name or (me.name if me else None)
         if who is None:
             raise WrongUsage(
-                "the token in use does not belong to a user; give the name of the user whose tokens you mean"
+                "the token in use does not belong to a user; give the name of the user whose password you want to set"
             )
         change: dict[str, Any] = {"password": _ask_secret("New password", twice=True)}
         if end_tokens:

@@ -300,7 +300,7 @@ def fix_drift(take: Take, command: FixDrift) -> Take:
     start, stop = take.frames(command.frames)
     if stop - start < 2:
         raise EditError(
-            f"the drift is spread over a range of at least 2 frames, but the range {start}:{stop} has only one",
+            f"the range {start}:{stop} has only one frame; the drift must be spread over at least 2",
             code="frames-missing",
             where="frames",
         )

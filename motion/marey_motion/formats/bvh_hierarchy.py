@@ -118,10 +118,14 @@ class _HierarchyReader:
     def _read_piece(self, piece: bytes) -> None:
         if piece == b"{":
             if not self.brace_due:
-                raise self.lines.error("a { must follow a joint", joint=self._joint_name())
+                raise self.lines.error(
+                    "this { does not follow the line of a joint or end site; remove it", joint=self._joint_name()
+                )
             self.brace_due = False
         elif self.brace_due:
-            raise self.lines.error(f"a {{ must follow the joint, not {excerpt(piece)!r}", joint=self._joint_name())
+            raise self.lines.error(
+                f"the joint must be followed by {{, not {excerpt(piece)!r}", joint=self._joint_name()
+            )
         elif piece == b"}":
             if not self.open:
                 raise self.lines.error("this } closes no joint; remove it")

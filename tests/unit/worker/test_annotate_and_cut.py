@@ -110,9 +110,17 @@ def test_margins_end_where_the_clip_ends_and_short_or_long_segments_are_left_out
 
 def test_a_label_that_no_annotation_has_is_refused_with_those_there_are(project: ProjectInMemory) -> None:
     annotated(project, segments=[{"label": "a", "start": 0, "end": 10}])
-    with pytest.raises(JobRefused, match="their labels are a") as refused:
+    with pytest.raises(JobRefused, match="the labels of the segments are a") as refused:
         cut.run(project, CutParams(labels=("b",)))
     assert refused.value.code == "nothing-to-cut"
+
+
+def test_annotations_without_segments_or_of_another_layer_have_nothing_to_cut(project: ProjectInMemory) -> None:
+    annotated(project, segments=[], layer="mine")
+    with pytest.raises(JobRefused, match="the annotations have no segments"):
+        cut.run(project, CutParams())
+    with pytest.raises(JobRefused, match="no annotation of the layer 'yours' can be used"):
+        cut.run(project, CutParams(layer="yours"))
 
 
 def test_layers_that_would_make_pieces_of_one_name_are_refused(project: ProjectInMemory) -> None:

@@ -186,7 +186,9 @@ class _Job:
         if not pins:
             if self._params.layer is not None or self._params.labels:
                 raise JobRefused(
-                    "no-annotations", "the parameters layer and labels select annotations, but no annotations are given"
+                    "no-annotations",
+                    "the parameters layer and labels select annotations, but no annotations are given; add the "
+                    "annotations of the clips, or leave out these parameters",
                 )
             return None
         found: dict[str, list[_ClipAnnotation]] = {}
@@ -206,7 +208,7 @@ class _Job:
             raise MotionError(
                 f"the clip has {len(known)} annotations that could be used (layers: {layers}); name one layer"
                 if known
-                else "none of the annotations belongs to this clip" + self._of_layer(),
+                else f"none of the given annotations{self._of_layer()} belongs to this clip; add one, or omit the clip",
                 code="several-annotations" if known else "no-annotation",
             )
         (one,) = known
@@ -226,7 +228,7 @@ class _Job:
         )
 
     def _of_layer(self) -> str:
-        return f", in the layer {self._params.layer!r}" if self._params.layer else ""
+        return f" of the layer {self._params.layer!r}" if self._params.layer else ""
 
     # -- options --
 

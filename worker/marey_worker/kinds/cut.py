@@ -21,6 +21,7 @@ from marey_schemas.names import MAX_NAME_LENGTH
 from marey_schemas.queue.job_params import CutParams
 from marey_schemas.queue.jobs import ItemInput
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
+from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused, NoSuchThing
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces
@@ -122,12 +123,7 @@ class _Cutting:
     def _require_pieces(self, todo: Sequence[_AnnotatedClip]) -> None:
         places = Counter((self._folder(one, segment), name) for one in todo for segment, name in one.pieces)
         if not places:
-            labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
-            known = f"their labels are {', '.join(labels)}" if labels else "they have no segments"
-            raise JobRefused(
-                "nothing-to-cut",
-                f"the chosen labels select no segment of {len(todo)} annotations; {known}{self._refusals.first}",
-            )
+            raise JobRefused("nothing-to-cut", self._why_nothing(todo) + self._refusals.first)
         (folder, name), count = places.most_common(1)[0]
         if count > 1:
             raise JobRefused(
@@ -141,6 +137,16 @@ class _Cutting:
                 "name-too-long",
                 f"the name {long[0]!r} has {len(long[0])} characters; at most {MAX_NAME_LENGTH} are allowed",
             )
+
+    def _why_nothing(self, todo: Sequence[_AnnotatedClip]) -> str:
+        """Return the reason why no segment is cut out, apart from refused annotations."""
+        if not todo:
+            layer = self._params.layer
+            return "no annotation can be used" if layer is None else f"no annotation of the layer {layer!r} can be used"
+        labels = sorted({segment.label for one in todo for segment in one.annotation.segments})
+        if not labels:
+            return f"the annotations have no segments ({counted(len(todo), 'annotation')} could be used)"
+        return f"no segment has one of the chosen labels; the labels of the segments are {', '.join(labels)}"
 
     def _folder(self, one: _AnnotatedClip, segment: Segment) -> str:
         folder = one.item.folder if isinstance(one.item, PinnedInput) else one.item.collection

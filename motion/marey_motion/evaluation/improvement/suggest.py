@@ -153,7 +153,7 @@ def _require_same(database: MatchingDatabase, result: EvaluationResult) -> None:
     different = [name for name in ("dataset", "normaliser") if getattr(own, name) != getattr(result.provenance, name)]
     if different:
         raise MotionError(
-            f"the evaluation was made from other data: {' and '.join(different)} differ; evaluate this data set first",
+            f"the evaluation was made from other data ({', '.join(different)}); evaluate this data set first",
             code="not-comparable",
             where=", ".join(different),
         )
