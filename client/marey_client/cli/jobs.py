@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from marey_client.reruns import ComparedOutput
     from marey_schemas.queue.jobs import InputSpec, Job, JobInput, JobKind
 
-job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Jobs.")
+job = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Submit, watch and cancel jobs.")
 
 
 def add_to(app: typer.Typer) -> None:

@@ -68,7 +68,8 @@ def mv(
     places: Annotated[
         list[str],
         typer.Argument(
-            help="Items or folders to move, then the destination: a new name, or a folder, which ends with /."
+            help="Items or folders to move, then the destination: a new name, an existing folder, or a new folder, "
+            "which ends with /. Several items or folders are always moved into a folder."
         ),
     ],
     kind: KindOf = None,

@@ -13,15 +13,19 @@ from marey_client.cli.terminal.output import print_json, print_message, print_pa
 if TYPE_CHECKING:
     from marey_schemas.access import QuotaChange, QuotasInUse
 
-project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Projects.")
-member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects and their members.")
+project = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage projects.")
+member = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the members of a project.")
 
 ItemLimit = Annotated[int | None, typer.Option("--items", min=0, help="Set the maximum number of items.")]
 ByteLimit = Annotated[
     int | None, typer.Option("--stored-bytes", min=0, help="Set the maximum total size of all revisions, in bytes.")
 ]
 DefaultLimits = Annotated[
-    bool, typer.Option("--defaults", help="Use the limits in the server's settings, except for those given here.")
+    bool,
+    typer.Option(
+        "--defaults",
+        help="Use the limits in the server's settings, except for those given by `--items` and `--stored-bytes`.",
+    ),
 ]
 
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 archive = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Archives: a version of a dataset, with all versions before it, as one file that can be "
-    "checked without a server.",
+    help="Manage archives. An archive contains a version of a dataset and all versions before it, as one file that can "
+    "be checked without a server.",
 )
 
 ArchivePath = Annotated[

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.proposals import Comment, Proposal, ProposalDetail
 
 proposal = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Proposals to merge a version of a dataset into a branch."
+    no_args_is_help=True, rich_markup_mode=None, help="Manage proposals to merge a version of a dataset into a branch."
 )
 
 BranchPlace = Annotated[

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marey_schemas.datasets.protection import Protection
 
 dataset = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Versions of datasets: commits, branches, tags, differences."
+    no_args_is_help=True, rich_markup_mode=None, help="Manage datasets and their versions: commits, branches, tags."
 )
 
 
