@@ -140,10 +140,10 @@ def forward_kinematics(
 
 
 class _Chain(NamedTuple):
-    """Arguments of the kernel that depend only on the skeleton, with P points: J joints and then the end sites.
+    """Those arguments of `kinematics_kernels.positions` that depend only on the skeleton.
 
-    `no_slots` is -1 for each point, which means that no translation replaces its offset; `turned` is True for each
-    joint whose rotation moves another point, and False for leaves.
+    Points are the joints, then the end sites. `no_slots` (points,) is -1 everywhere: it is the argument `slots` if all
+    points have the offsets of the skeleton. `turned` (joints,) is True for joints with children.
     """
 
     offsets: AnyFloats

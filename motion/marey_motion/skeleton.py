@@ -221,12 +221,12 @@ class Skeleton:
 def same_hierarchy(a: Skeleton, b: Skeleton, *, tolerance_m: float = 0.0) -> bool:
     """Check whether clips of one skeleton are also clips of another.
 
-    Joints, parents, offsets, rest pose and end sites must be equal; display names need not.
+    Joint names, parents, offsets, rest rotations and end sites must be equal; display names may differ.
 
     Parameters
     ----------
     a, b : Skeleton    the skeletons
-    tolerance_m : float    metres by which each component of an offset may differ
+    tolerance_m : float    metres by which each component of the offset of a joint or end site may differ
 
     Returns
     -------

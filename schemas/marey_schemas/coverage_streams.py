@@ -43,7 +43,7 @@ def _spanned(values: tuple[float, ...]) -> str:
 
 
 class CoverageStreamCreate(Request):
-    """Request for a new stream: the form of its frames, and the speeds and turn rates to cover."""
+    """Request to create a stream: frame rate and skeleton of its frames, and the speeds and turn rates to cover."""
 
     frame_rate_hz: float = Field(
         ge=LEAST_FRAME_RATE_HZ,

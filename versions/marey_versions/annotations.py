@@ -1,4 +1,7 @@
-"""Three-way merges of annotations: the segments and keyframes that two sides have added to a version and removed."""
+"""Three-way merges of annotations.
+
+A merge combines the segments and keyframes that each side has added or removed since the base.
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ POINT_M = 0.01
 UNEXPLAINED = 0.1
 """Greatest share of the mean change of a path that may remain if a movement of the whole path is to explain it."""
 MOST_SPANS = 100
-"""Maximum number of ranges listed for a joint; if there are more, ranges farther apart are joined, too."""
+"""Maximum number of ranges in a list; if there are more, the ranges with the smallest gaps are joined, too."""
 
 
 class Course(NamedTuple):
@@ -40,16 +40,17 @@ class Course(NamedTuple):
 
 
 def spans_where(exceeds: Flags, course: Course) -> tuple[Range, ...]:
-    """List the ranges of frames in which a change exceeds a threshold.
+    """List the ranges of frames of the new clip in which a change exceeds a threshold.
 
     Parameters
     ----------
     exceeds : (n,) bool    whether the change in each matched frame exceeds the threshold
-    course : Course    the matched frames
+    course : Course    the matched frames of the new clip
 
     Returns
     -------
-    tuple of ranges    half open and in order; ranges less than `JOINED_S` seconds apart are joined
+    tuple of ranges    frames of the new clip, half open and in order; ranges less than `JOINED_S` seconds apart are
+        joined, and wider gaps too if there would be more than `MOST_SPANS` ranges
     """
     frames = course.frames[exceeds]
     if not len(frames):

@@ -83,7 +83,7 @@ def compare_clips(
         duration_s=(before.duration_s, after.duration_s),
         skeleton=compare_skeletons(before.skeleton, after.skeleton),
         runs=frame_runs(timing, before.frame_count, after.frame_count),
-        frames_per_frame=timing.pace.frames,
+        frames_per_frame=timing.pace.samples_per_frame,
         duration_ratio=_duration_ratio(timing, before, after),
         rotations=joint_changes(names, rotations, course, threshold=options.threshold_deg, noise=NOISE_DEG),
         path=path_change(names[carrier], *_paths(timing, new, move), course, options.threshold_cm, move),
@@ -112,7 +112,10 @@ def _poses(clip: Clip, joints: tuple[int, ...], carrier: int) -> Poses:
 
 
 def _compare_moved(before: Poses, after: Poses, rate_ratio: float) -> tuple[Timing, Move | None]:
-    """Match the frames. If the whole clip was moved, apply the movement to the old clip, and match again."""
+    """Match the frames. If the whole clip was moved, apply the movement to the old clip, and match again.
+
+    Returns the timing, and the movement, which is None if there is none.
+    """
     timing = compare_timing(before, after, rate_ratio)
     move = whole_move(*_paths(timing, after, None))
     if move is None:
@@ -138,7 +141,7 @@ def _paths(timing: Timing, after: Poses, move: Move | None) -> tuple[Floats, Flo
 
 
 def _duration_ratio(timing: Timing, before: Clip, after: Clip) -> float:
-    ratio = timing.pace.frames * before.frame_rate_hz / after.frame_rate_hz
+    ratio = timing.pace.samples_per_frame * before.frame_rate_hz / after.frame_rate_hz
     return 1.0 if abs(ratio - 1.0) <= SAME_PACE else ratio
 
 

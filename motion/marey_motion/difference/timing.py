@@ -34,29 +34,29 @@ GREATEST_PACE = 16.0
 
 
 class Pace(NamedTuple):
-    """Rate and start at which a stored clip is sampled.
+    """Rate and start at which the old clip is sampled.
 
     Parameters
     ----------
-    frames : float    number of samples per frame of the stored clip
-    phase : float    place of the first sample, in frames of the stored clip
+    samples_per_frame : float    number of samples for each frame of the old clip
+    phase : float    place of the first sample, in frames of the old clip
     """
 
-    frames: float
+    samples_per_frame: float
     phase: float = 0.0
 
-    def places(self, frames: AnyInts | Floats) -> Floats:
-        """Return the places of samples in the stored clip.
+    def places(self, samples: AnyInts | Floats) -> Floats:
+        """Return the places of samples in the old clip.
 
         Parameters
         ----------
-        frames : (n,)    numbers of samples, from 0
+        samples : (n,)    numbers of samples, from 0
 
         Returns
         -------
-        (n,) float64    fractional frame numbers of the stored clip
+        (n,) float64    fractional frame numbers of the old clip
         """
-        return np.asarray(self.phase + frames / self.frames, dtype=np.float64)
+        return np.asarray(self.phase + samples / self.samples_per_frame, dtype=np.float64)
 
 
 class Timing(NamedTuple):
@@ -121,7 +121,7 @@ def _at_pace(before: Poses, after: Poses, pace: Pace, *, search: bool) -> Timing
     """Sample the old clip at a pace, and match the samples with the frames of the new clip."""
     sampled = before
     if pace != Pace(1.0):
-        count = int((before.frame_count - 1 - pace.phase) * pace.frames + ROUNDED_FRAMES) + 1
+        count = int((before.frame_count - 1 - pace.phase) * pace.samples_per_frame + ROUNDED_FRAMES) + 1
         sampled = before.sampled(np.minimum(pace.places(np.arange(count)), before.frame_count - 1.0))
     return Timing(pace, sampled, match_frames(sampled, after, search=search))
 

@@ -91,7 +91,7 @@ def offset_to(motion: Motion, frame: int, other: Motion, other_frame: int) -> Po
 
     Returns
     -------
-    PoseOffset    of one pose
+    PoseOffset    the pose of the other frame minus the pose of the frame
     """
     back = quaternions.conjugate(motion.rotations[frame])
     turns = quaternions.as_rotation_vector(quaternions.multiply(other.rotations[other_frame], back))

@@ -78,11 +78,11 @@ class Exceeding(Answer):
 
     mean: float = Field(description="Mean over all matched frames.")
     largest: float
-    largest_at: int = Field(description="Frame with the largest change.")
+    largest_at: int = Field(description="Frame of the revision `after` with the largest change.")
     spans: tuple[Range, ...] = Field(
         (),
-        description="Ranges of frames in which the change exceeds the threshold; ranges less than 0.1 s apart "
-        "are joined.",
+        description="Ranges of frames of the revision `after` in which the change exceeds the threshold; at most 100. "
+        "Ranges less than 0.1 s apart are joined, and wider gaps too if there would be more than 100.",
     )
 
 

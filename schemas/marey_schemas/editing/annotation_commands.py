@@ -144,5 +144,5 @@ class AnnotationImport(Request):
 
 
 def command_arguments(command: Request) -> dict[str, Any]:
-    """Return the parameters of a command."""
+    """Return the fields of a command by name, without `command` itself."""
     return command.model_dump(exclude={"command"})

@@ -47,7 +47,7 @@ MOST_EXAMPLES = 2000
 
 
 class AlignParams(AlignOptions, SuffixedResults):
-    """Parameters of `align`."""
+    """Parameters of jobs of the kind `align`."""
 
     layer: LayerName | None = Field(
         None, description="Layer of the annotations to use; required if a clip has annotations of several layers."
@@ -62,14 +62,14 @@ _NAME_FIELD = re.compile(r"\{(clip|label|number)(?::([1-9]))?\}")
 
 
 class AnnotateParams(TaggedResults):
-    """Parameters of `annotate`."""
+    """Parameters of jobs of the kind `annotate`."""
 
     proposal: Proposal = Field(description="Method that proposes segments and keyframes, with its options.")
     layer: LayerName | None = Field(None, description="Name of the layer; default: the name of the method.")
 
 
 class CutParams(TaggedResults):
-    """Parameters of `cut`."""
+    """Parameters of jobs of the kind `cut`."""
 
     layer: LayerName | None = Field(None, description="Layer of the annotations to use; absent: all layers.")
     labels: tuple[Label, ...] = Field(
@@ -135,7 +135,7 @@ MOST_EVALUATION_TASKS = 64
 
 
 class EvaluateParams(EvaluationOptions, TaggedResults):
-    """Parameters of `evaluate`."""
+    """Parameters of jobs of the kind `evaluate`."""
 
     name: ItemName = Field("evaluation", description="Name of the result.")
     loops: tuple[ItemId, ...] = Field(
@@ -186,7 +186,7 @@ WEIGHT_GROUPS = len(FeatureWeights.model_fields.keys() - {"extra_joints"})
 
 
 class CompareParams(Request):
-    """Parameters of `compare`."""
+    """Parameters of jobs of the kind `compare`."""
 
     title: str = Field(
         "", max_length=200, description="Title of the report; default: the names of the two evaluations."
@@ -195,15 +195,15 @@ class CompareParams(Request):
 
 
 class SuggestParams(SuggestionOptions):
-    """Parameters of `suggest`."""
+    """Parameters of jobs of the kind `suggest`."""
 
 
 class OptimiseParams(OptimisationOptions):
-    """Parameters of `optimise`."""
+    """Parameters of jobs of the kind `optimise`."""
 
 
 class SweepParams(SweepOptions):
-    """Parameters of `sweep`."""
+    """Parameters of jobs of the kind `sweep`."""
 
 
 def count_sweep_tasks(params: SweepParams) -> int:
@@ -212,7 +212,7 @@ def count_sweep_tasks(params: SweepParams) -> int:
 
 
 class ModelParams(ModelOptions, TaggedResults):
-    """Parameters of `model`."""
+    """Parameters of jobs of the kind `model`."""
 
     name: ItemName = Field("model", description="Name of the model and of the action.")
     report: bool = Field(True, description="Write the report and its figures.")
@@ -224,7 +224,7 @@ class ModelParams(ModelOptions, TaggedResults):
 
 
 class TreeParams(TreeOptions):
-    """Parameters of `tree`."""
+    """Parameters of jobs of the kind `tree`."""
 
     def unclear_place(self, into: str) -> str | None:
         """Return the reason why the tree cannot be stored in a collection, or None if it can."""
@@ -232,7 +232,7 @@ class TreeParams(TreeOptions):
 
 
 class EditParams(SuffixedResults):
-    """Parameters of `edit`."""
+    """Parameters of jobs of the kind `edit`."""
 
     commands: tuple[EditCommand, ...] = Field(
         (),
@@ -267,7 +267,7 @@ class EditParams(SuffixedResults):
 
 
 class ImportParams(ImportOptions):
-    """Parameters of `import`."""
+    """Parameters of jobs of the kind `import`."""
 
     files: tuple[ImportFile, ...] = Field(
         min_length=1, max_length=10_000, description="Names and digests of the files."
@@ -275,7 +275,7 @@ class ImportParams(ImportOptions):
 
 
 class RetargetParams(SuffixedResults):
-    """Parameters of `retarget`."""
+    """Parameters of jobs of the kind `retarget`."""
 
     scale: float | None = Field(
         None, gt=0, lt=1000, description="Scale of the root's path; absent: the ratio of the hip heights."
@@ -283,7 +283,7 @@ class RetargetParams(SuffixedResults):
 
 
 class ExportParams(Request):
-    """Parameters of `export`: one archive of files."""
+    """Parameters of jobs of the kind `export`: one archive of files."""
 
     format: ExportFormat = Field(DEFAULT_FORMAT, description="Format of the files.")
     unit: WrittenUnit = Field(

@@ -89,7 +89,10 @@ def unpack_tree(packed: bytes) -> Any:
 
 
 class ChildOrder(Message):
-    """Message that asks a child process to call a function, `module:function`, with bytes; it returns bytes."""
+    """Message that asks a child process to call a function, `module:function`, with bytes; it returns bytes.
+
+    The function may use `processor_s` seconds of processor time.
+    """
 
     function: str
     payload: bytes

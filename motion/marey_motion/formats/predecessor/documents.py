@@ -1,4 +1,4 @@
-"""Reading of any file of the predecessor: a motion, a model, a tree over its samples, or a graph of models."""
+"""Reading of any file of the predecessor: a motion, a model, a tree of a model's samples, or a graph of models."""
 
 from __future__ import annotations
 

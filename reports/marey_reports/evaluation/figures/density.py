@@ -128,17 +128,17 @@ def _edges(subjects: Sequence[Subject], plane: _Plane) -> tuple[Floats, Floats]:
     spans = []
     for axis, values in enumerate((plane.x, plane.y)):
         found = np.concatenate([values(subject.result.coverage) for subject in subjects])
-        targets = [_target(subject.result.coverage, plane)[axis] for subject in subjects]
-        high = 1.03 * reach(np.maximum(found, 0.0), max(float(each[1]) for each in targets))
-        low = -1.03 * reach(np.maximum(-found, 0.0), max(-float(each[0]) for each in targets))
+        least = [_least_ranges(subject.result.coverage, plane)[axis] for subject in subjects]
+        high = 1.03 * reach(np.maximum(found, 0.0), max(float(each[1]) for each in least))
+        low = -1.03 * reach(np.maximum(-found, 0.0), max(-float(each[0]) for each in least))
         if axis == 0:
             low, high = -max(-low, high), max(-low, high)  # left and right alike
         spans.append(np.linspace(low, high, FINE + 1))
     return spans[0], spans[1]
 
 
-def _target(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the smallest ranges of x and y that the figure shows; they contain all trials."""
+def _least_ranges(coverage: Coverage, plane: _Plane) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of x and y that the figure must at least show so that it contains all trials."""
     fastest = float(coverage.speed_edges_m_s[-1])
     if plane is DIRECTIONS:
         return (-1.0, 1.0), (-1.0, fastest)
