@@ -75,8 +75,7 @@ def cuts_of(layer: Layer) -> tuple[Cut, ...]:
     repeated = [label for label, count in Counter(label for cut in cuts for label in cut.labels).items() if count > 1]
     if repeated:
         raise AnnotationError(
-            "a repeated label gets a number, and another label already has the resulting name; rename one of "
-            "the two labels",
+            "this is a label, and also a repeated label with its number; rename one of the two labels",
             code="label-repeats",
             where=repeated[0],
         )

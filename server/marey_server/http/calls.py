@@ -102,7 +102,7 @@ def require_access(operation: Operation, principal: Principal) -> None:
         raise ForbiddenProblem("Only administrators may do this.", code="administrators-only")
     if operation.scope is not None and not scopes.reaches_somewhere(principal.scopes, operation.scope):
         raise ForbiddenProblem(
-            f"The token lacks the scope {operation.scope!r}.",
+            f"This needs a token with the scope {operation.scope!r}.",
             code="insufficient-scope",
             context={"scope": operation.scope},
         )

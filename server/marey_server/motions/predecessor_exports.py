@@ -100,7 +100,9 @@ def _written(
         if options.part != "tree":
             return "_mm.json", _model(parts["model"], hierarchy, options.layout or "3")
         if "tree" not in parts:
-            raise NotFoundProblem("The model has no tree of samples to export.", code="no-part")
+            raise NotFoundProblem(
+                "The model has no tree of samples to export; build it first, by `marey tree`.", code="no-part"
+            )
         return "_cluster_tree.json", _tree(parts["model"], parts["tree"])
     raise InvalidProblem(f"An item of the kind {kind} can only be exported as json.", code="no-such-export")
 

@@ -124,9 +124,7 @@ def require_sender(principal: Principal) -> None:
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to upload data.")
     if principal.kind == "user" and not any(held.partition("!")[0] == "write" for held in principal.scopes):
-        raise ForbiddenProblem(
-            "The token does not allow uploads, because it has no scope to write.", code="insufficient-scope"
-        )
+        raise ForbiddenProblem("Uploads need a token with the scope 'write'.", code="insufficient-scope")
 
 
 EVERY_PROJECT = ""
@@ -143,7 +141,7 @@ def places_of_sender(tx: Transaction) -> tuple[str, ...]:
         return (EVERY_PROJECT,)
     if not (found := writable_projects(tx, names)):
         raise ForbiddenProblem(
-            "The token does not allow uploads, because it has no scope to write in any project.",
+            "Uploads need a token with the scope 'write' for a project in which you may write.",
             code="insufficient-scope",
         )
     return tuple(found)

@@ -61,7 +61,8 @@ def parse_order(text: str, keys: Mapping[str, ColumnElement[Any]], unique: str =
             f"This list cannot be sorted by {unknown[0]!r}; it can be sorted by {', '.join(keys)}.", code="bad-sort"
         )
     if len(set(bare)) != len(bare):
-        raise BadRequestProblem("The parameter sort contains a key twice.", code="bad-sort")
+        twice = next(name for name in bare if bare.count(name) > 1)
+        raise BadRequestProblem(f"The parameter `sort` contains {twice!r} twice; remove one.", code="bad-sort")
     if unique in bare:
         names = names[: bare.index(unique) + 1]
     else:

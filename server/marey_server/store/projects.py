@@ -251,7 +251,10 @@ def create_project(tx: Transaction, request: ProjectCreate) -> Project:
     if principal.kind == "anonymous":
         raise UnauthenticatedProblem("Sign in to create a project.")
     if principal.kind == "attempt" or not scopes.allows(principal.scopes, "write", request.name):
-        raise ForbiddenProblem("The token does not allow creating projects.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            f"This needs a user's token with the scope 'write' for all projects, or for the project {request.name!r}.",
+            code="insufficient-scope",
+        )
     quotas.require_room(tx, "user_projects")
     made = ProjectRow(
         new_id("project"), request.name, request.title, request.description, request.visibility,

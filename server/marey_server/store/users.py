@@ -132,7 +132,7 @@ def _require_changes(principal: Principal, name: str, request: UserChange) -> bo
     if not itself:
         require_administrator(principal, hidden=_no_user(name))
     elif not scopes.allows(principal.scopes, "write"):
-        raise ForbiddenProblem("The token does not allow changing this user.", code="insufficient-scope")
+        raise ForbiddenProblem("This needs a token with the scope 'write' for all projects.", code="insufficient-scope")
     if not is_administrator(principal) and (request.administrator is not None or request.disabled is not None):
         raise ForbiddenProblem(
             "Only administrators can disable a user or make a user an administrator.", code="administrators-only"

@@ -109,6 +109,11 @@ def test_unknown_orders_are_refused(filled: FilledLab, sort: str) -> None:
         names(filled, sort=sort)
 
 
+def test_an_order_with_a_key_twice_is_refused_with_this_key(filled: FilledLab) -> None:
+    with pytest.raises(BadRequestProblem, match="contains 'frames' twice"):
+        names(filled, sort="name,frames,-frames")
+
+
 @pytest.mark.parametrize("limit", [0, -1, 1001])
 def test_limits_out_of_range_are_refused(filled: FilledLab, limit: int) -> None:
     with pytest.raises(BadRequestProblem):

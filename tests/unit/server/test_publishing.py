@@ -100,7 +100,7 @@ def test_one_bad_draft_and_nothing_is_published(lab: Lab) -> None:
 
 
 def test_names_within_a_batch_are_unique(lab: Lab) -> None:
-    with pytest.raises(InvalidProblem):
+    with pytest.raises(InvalidProblem, match="have the name 'rig'"):
         publish(lab, rig_draft(), rig_draft())
 
 

@@ -105,7 +105,8 @@ def _body(rigged: Rigged) -> MatchingBody:
 def _require_name(pin: PinnedInput, layer_name: str) -> None:
     if len(pin.name) + 1 + len(layer_name) > MAX_NAME_LENGTH:
         raise AnnotationError(
-            f"the names of the clip and the layer together have more than {MAX_NAME_LENGTH} characters",
+            f"the names of the clip and the layer together have more than {MAX_NAME_LENGTH} characters; give a shorter "
+            "name of the layer, or rename the clip",
             code="name-too-long",
         )
 

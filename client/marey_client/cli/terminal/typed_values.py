@@ -227,7 +227,7 @@ def _read(file: str) -> bytes:
         if file != STANDARD_INPUT:
             return Path(file).read_bytes()
         if sys.stdin is None:
-            raise WrongUsage("the command should read standard input, but standard input is closed")
+            raise WrongUsage("standard input is closed, so `-` cannot be read; name a file")
         return sys.stdin.buffer.read()
     except OSError as error:
         raise WrongUsage(f"{_named(file)} cannot be read: {error.strerror or error}") from None

@@ -372,7 +372,9 @@ def _require_user(principal: Principal, scope: str) -> str:
             "Only users have tokens, and the token of a running job does not belong to a user.", code="users-only"
         )
     if not scopes.allows(principal.scopes, scope):
-        raise ForbiddenProblem(f"This token lacks the scope {scope!r}.", code="insufficient-scope")
+        raise ForbiddenProblem(
+            f"This needs a token with the scope {scope!r} for all projects.", code="insufficient-scope"
+        )
     return principal.user_id
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -54,7 +54,8 @@ def publish(
     """
     by_name = {draft.name_in_batch: draft for draft in drafts}
     if len(by_name) != len(drafts):
-        raise InvalidProblem("Two results in the request have the same name.", code="duplicate-output")
+        twice = Counter(draft.name_in_batch for draft in drafts).most_common(1)[0][0]
+        raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
     publication = _Publication(tx, project_row, author_id, job_id, refer_to_deleted)
     for together in _in_turns(_load_parts(tx, drafts)):
         publication.add(together)
@@ -173,7 +174,7 @@ class _Publication:
     refer_to_deleted: bool
     done: dict[str, Published] = field(default_factory=dict)
     added: dict[str | None, Held] = field(default_factory=dict)
-    """New items and bytes, by the creator of the items; like deleted items, hidden ones do not count."""
+    """Numbers of new items and bytes, by the creator of the items; like deleted items, hidden ones do not count."""
     _collection_ids: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -63,7 +64,8 @@ def stage(tx: Transaction, job_id: str, fence: int, outputs: Sequence[PreparedOu
     pins: PinnedInputs = hold(tx, job_id, fence, job.c.inputs).inputs
     names = [one.output.name for one in outputs]
     if len(set(names)) != len(names):
-        raise InvalidProblem("Two results of the attempt have the same name.", code="duplicate-output")
+        twice = Counter(names).most_common(1)[0][0]
+        raise InvalidProblem(f"Two results in the request have the name {twice!r}.", code="duplicate-output")
     of_attempt = (staged_output.c.job_id == job_id) & (staged_output.c.fence == fence)
     last = tx.execute(select(func.max(staged_output.c.position)).where(of_attempt)).scalar()
     replaced = tx.execute(
