@@ -34,7 +34,7 @@ class LabelClash(Generic[Labelled]):
     """Segments or keyframes that exclude each other, in the order of their frames."""
 
     base: tuple[Labelled, ...]
-    """Those of the base that both sides have removed; empty if both sides have added labels at free frames."""
+    """Labels of the base that both sides have removed; empty if both sides have added labels at free frames."""
     ours: tuple[Labelled, ...]
     theirs: tuple[Labelled, ...]
 
@@ -208,17 +208,17 @@ class _Sets(NamedTuple, Generic[Labelled]):
 
     @property
     def added(self) -> tuple[set[Labelled], set[Labelled]]:
-        """Those that our side has added, and those that their side has added."""
+        """Segments or keyframes that our side has added, and those that their side has added."""
         return self.ours - self.base, self.theirs - self.base
 
     @property
     def removed_twice(self) -> set[Labelled]:
-        """Those of the base that neither side has."""
+        """Segments or keyframes of the base that neither side has."""
         return self.base - self.ours - self.theirs
 
     @property
     def merged(self) -> tuple[Labelled, ...]:
-        """Those that both sides have kept or one side has added, in the order of their frames."""
+        """Segments or keyframes that both sides have kept or one side has added, in the order of their frames."""
         return tuple(sorted((self.base & self.ours & self.theirs).union(*self.added)))
 
     def differing(self, group_of: Callable[[Labelled], Hashable]) -> set[Hashable]:
@@ -227,5 +227,5 @@ class _Sets(NamedTuple, Generic[Labelled]):
 
     @staticmethod
     def clash(base: set[Labelled], ours: set[Labelled], theirs: set[Labelled]) -> LabelClash[Labelled]:
-        """Return a clash of these segments or keyframes."""
+        """Return a clash of segments or keyframes: those of the base, of our side and of their side."""
         return LabelClash(*(tuple(sorted(side)) for side in (base, ours, theirs)))

@@ -93,5 +93,5 @@ class AlignedSet:
 
     @property
     def time_functions(self) -> Floats:
-        """Source frames of all clips, (clips, N) float64."""
+        """Fractional source frame of each clip at each canonical frame, (clips, N) float64."""
         return np.stack([clip.time_function for clip in self.clips])

@@ -23,7 +23,7 @@ SHARED = ("set", "reference", "keyframes")
 
 
 class StoredExample(NamedTuple):
-    """The two documents of one example.
+    """Stored form of an aligned example: its frames as a clip, and everything else as a tree.
 
     Parameters
     ----------

@@ -116,7 +116,7 @@ class Take:
 
     @property
     def frame_count(self) -> int:
-        """Frames of the motion."""
+        """Number of frames of the motion."""
         return self.motion.frame_count
 
     @property
@@ -139,7 +139,7 @@ class Take:
         return replace(self, motion=motion)
 
     def with_finding(self, finding: EditFinding) -> Take:
-        """Add a finding.
+        """Add a finding, such as the height of the ground.
 
         Parameters
         ----------

@@ -27,7 +27,7 @@ TOLERANCE = 1e-12
 
 
 class Strain(NamedTuple):
-    """Ratio of each of a trial's three errors to its limit: above 1 if the error exceeds it, infinite if undefined."""
+    """Ratios of a trial's errors of position, speed and turn rate to their limits; infinite for undefined errors."""
 
     place: float
     speed: float
@@ -35,7 +35,7 @@ class Strain(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest of the three ratios."""
+        """The largest ratio."""
         return max(self)
 
 
@@ -58,7 +58,7 @@ class Judgement:
 
 
 def judge(result: EvaluationResult) -> Judgement:
-    """Apply the rules to every trial.
+    """Grade an evaluation by the share of trials that the character followed.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def judge(result: EvaluationResult) -> Judgement:
 
 
 def is_followed(outcome: TrialResult) -> bool:
-    """Check whether a trial is within the three limits.
+    """Check whether a trial exceeds none of the limits of position, speed and turn rate.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class LatentMixture:
         return np.asarray(np.log(self.weights) - log_roots - 0.5 * self.dimensions * np.log(2.0 * np.pi))
 
     def component_log_densities(self, latents: Floats) -> Floats:
-        """Compute ln(pi_k N_k(s)) of each component.
+        """Compute each component's weighted log density ln(pi_k N_k(s)) of latent vectors.
 
         Parameters
         ----------
@@ -73,7 +73,7 @@ class LatentMixture:
         return np.asarray(self.log_peaks - 0.5 * np.einsum("nki,nki->nk", away, away))
 
     def log_density(self, latents: Floats) -> Floats:
-        """Compute ln p(s).
+        """Compute the log density ln p(s) of latent vectors.
 
         Parameters
         ----------

@@ -76,7 +76,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Negation:
-    """Query that is true where another is false."""
+    """Query that selects the items that another query does not select."""
 
     query: Query
     source: str

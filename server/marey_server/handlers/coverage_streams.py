@@ -30,7 +30,7 @@ MOST_FRAMES_BYTES = 16 * MIB
 
 
 class ProjectCoverageStreams(Resource):
-    """Streams whose coverage is measured."""
+    """Coverage streams of a project."""
 
     path = "/projects/{project}/coverage-streams"
     tag = "Evaluations"
@@ -66,7 +66,7 @@ class ProjectCoverageStreams(Resource):
 
 
 class CoverageStreamResource(Resource):
-    """A stream whose coverage is measured."""
+    """A coverage stream."""
 
     path = "/projects/{project}/coverage-streams/{stream}"
     tag = "Evaluations"

@@ -60,7 +60,7 @@ class Search(Searcher):
 
 
 class SearchFile(Searcher):
-    """Search for motions of a model, as a file."""
+    """Search for motions of a model, with the result as a file."""
 
     path = "/projects/{project}/{kind}/{item}/search/export"
     tag = "Models"

@@ -134,7 +134,7 @@ class _Models:
     def document(self) -> Schema:
         """Return the schema that matches every kind of document.
 
-        It uses `anyOf`, not `oneOf`, because the open schema also matches the documents of other schemas.
+        It uses `anyOf`, not `oneOf`, because the schema of `OpenDocument` also matches documents of other schemas.
         """
         return {"anyOf": [self.reading(model) for model in SCHEMAS.values()]}
 

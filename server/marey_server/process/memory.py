@@ -66,7 +66,7 @@ class Holding:
         self._bytes = 0
 
     def grow(self, more: int) -> None:
-        """Hold more bytes.
+        """Count more bytes of the request.
 
         Raises `UnavailableProblem` if all requests together, or the requests of the client, hold too many bytes
         already.

@@ -19,7 +19,7 @@ from marey_worker.job_io.matching_clips import MatchingClips, read_evaluated_cli
 
 @dataclass(frozen=True)
 class EvaluatedSet:
-    """Evaluation with the records of its trials, and with its clips, whose features are scaled by its normaliser."""
+    """Evaluation with the records of its trials, and its clips, with features scaled by its normaliser."""
 
     result: EvaluationResult
     clips: MatchingClips
