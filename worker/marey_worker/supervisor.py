@@ -117,10 +117,10 @@ class Supervisor:
         failures = 0
         opened = self._open_claim()
         finishing: Future[None] | None = None
-        with _Bench(self._options) as bench, ThreadPoolExecutor(1, thread_name_prefix="marey-finish") as finisher:
+        with _SlotChild(self._options) as slot, ThreadPoolExecutor(1, thread_name_prefix="marey-finish") as finisher:
             while not self._stopping.is_set():
                 try:
-                    child = bench.child()
+                    child = slot.child()
                     leases = self._claim(opened)
                 except (Unauthenticated, Forbidden, Invalid) as error:
                     if not opened.transport.has_token_of(self._claims):  # the file of the token has changed
@@ -203,7 +203,7 @@ class _OpenClaim:
     id: str
 
 
-class _Bench:
+class _SlotChild:
     """Child process of a slot; it is replaced after it has died, and after a certain number of jobs."""
 
     def __init__(self, options: WorkerOptions) -> None:

@@ -111,7 +111,7 @@ class Settings(BaseSettings):
         ge=1,
         description="Greatest number of wrong passwords per minute for one user name from one address (in IPv6, one "
         "network of 64 bits). All names from one address: ten times as many. One name from all addresses where it has "
-        "not signed in for 90 days: ten times as many at once, then as many per minute.",
+        "not signed in for 90 days: ten times as many at once, then this number per minute.",
     )
     name_guesses_per_hour: int = Field(
         20,

@@ -108,8 +108,8 @@ def test_a_model_can_do_without_a_tree() -> None:
     [
         ((), "either files"),
         ((FILES, CLIPS), "either files"),
-        ((FILES, LAYER), "annotations: remove them, or remove `files`"),
-        ((CLIPS, LAYER, STEPS), "annotations: remove them, or remove `files`"),
+        ((FILES, LAYER), "annotations: these belong to existing clips"),
+        ((CLIPS, LAYER, STEPS), "annotations: these belong to existing clips"),
         ((CLIPS, {"cut": {}}), "needs annotations"),
         ((CLIPS, LAYER, GAME), "cannot be used after retargeting"),
         ((CLIPS, {"align": {"window": 4}}), "odd"),

@@ -176,7 +176,7 @@ def _functions(part: Document, what: str, file: str) -> tuple[SplineBasis, Float
     channels = mean.size // basis.count
     if part.get("n_dims", channels) != channels:
         raise FormatError(
-            f"{what}: the field n_dims is {part['n_dims']}, but the mean has {channels} channels", file=file
+            f"{what}: the field `n_dims` is {part['n_dims']}, but the mean has {channels} channels", file=file
         )
     given = part.get("eigen") or []
     vectors = model_numbers(given, file, f"{what}: eigen") if given else np.zeros((0, mean.size))

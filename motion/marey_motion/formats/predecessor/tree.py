@@ -145,9 +145,9 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
             )
         held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
         if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
-            raise FormatError(f"{place}: the field indices must contain at least one sample", file=file)
+            raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)
         if held.min() < 0 or held.max() >= count:
-            raise FormatError(f"{place}: each of the indices must be from 0 to {count - 1}", file=file)
+            raise FormatError(f"{place}: each number in the field `indices` must be from 0 to {count - 1}", file=file)
         indices.append(held.astype(np.int64))
         children.append(len(below))
         if len(indices) + len(waiting) + len(below) > MOST_NODES:
@@ -155,7 +155,7 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
         waiting.extend((child, f"{place}.{number}", level + 1) for number, child in enumerate(below))
     if len(np.unique(indices[0])) != count or len(indices[0]) != count:
         raise FormatError(
-            f"root: the field indices must contain the number of each of the {count} samples once", file=file
+            f"root: the field `indices` must contain the number of each of the {count} samples once", file=file
         )
     return indices, children
 

@@ -24,7 +24,7 @@ def opening(url: str) -> Iterator[None]:
         yield
     except (exc.ArgumentError, exc.NoSuchModuleError, ImportError):  # of a url no driver is known for
         raise DatabaseUnusable(
-            "the setting database_url is not the URL of a supported database; write "
+            "the setting `database_url` is not the URL of a supported database; write "
             "sqlite:////folder/file.db, or postgresql://user@host/name with the extra `postgres` installed"
         ) from None
     except UnavailableProblem as error:

@@ -28,7 +28,7 @@ class Mover:
 
 
 def rule_of(ref: Row[Any]) -> Protection | None:
-    """Return the rule of a branch, None if it is not protected."""
+    """Return the protection rule of a branch; None if the branch is not protected."""
     return None if ref.protection is None else Protection.model_validate(ref.protection)
 
 
