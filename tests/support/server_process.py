@@ -8,6 +8,7 @@ import random
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -15,7 +16,6 @@ from pathlib import Path
 from typing import Self
 
 import httpx
-from tests.support.programs import Program, start_program
 
 from marey_client import Marey
 from marey_client.retries import ONCE, Retries
@@ -37,12 +37,23 @@ class MareyProcess:
 
     def __init__(self, log: Path) -> None:
         self.log = log
-        self.process: Program | None = None
+        self.process: subprocess.Popen[bytes] | None = None
 
     def spawn(self, arguments: list[str], environment: dict[str, str], stdin: bytes | None = None) -> None:
         """Start the program; `stdin` is written to it and kept open."""
         surroundings = {name: text for name, text in os.environ.items() if not name.startswith("MAREY_")}
-        self.process = start_program(arguments, surroundings | environment, self.log, stdin)
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", *arguments],
+                env=surroundings | environment,
+                stdin=subprocess.PIPE if stdin is not None else subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        if stdin is not None:
+            assert self.process.stdin is not None
+            self.process.stdin.write(stdin)
+            self.process.stdin.flush()
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal."""
