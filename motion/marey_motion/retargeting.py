@@ -340,8 +340,8 @@ def _heights(
     missing = [f"{side}_{joint}" for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" not in joints]
     if missing:
         raise MappingError(
-            f"the scale is computed from both legs, but {', '.join(missing)} is not mapped on both sides; add "
-            "the mapping, or set the scale with --scale (scale)",
+            "the scale is computed from both legs, but these joints are not mapped in both skeletons: "
+            f"{', '.join(missing)}; map them, or set the scale with --scale (scale)",
             where=missing[0],
         )
     positions, pelvis = skeleton.rest_global_positions, joints["pelvis"]

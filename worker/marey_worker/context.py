@@ -163,7 +163,11 @@ class Context:
         return digest
 
     def progress(self, done: float, total: float | None = None, note: str = "") -> None:
-        """Report the progress of the job; may be called often."""
+        """Report that `done` of `total` units of work are finished, for example clips; may be called often.
+
+        `total` is greater than 0, or None if it is unknown: no share is shown then. `note`, at most 500 characters,
+        names the present step.
+        """
         self._pipe.send_bytes(pack(Made(Progress(done=done, total=total, note=note))))
 
     def log(self, text: str) -> None:

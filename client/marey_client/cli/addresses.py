@@ -183,7 +183,7 @@ class Folder:
 
 @dataclass(frozen=True)
 class SingleItem:
-    """Item of a project."""
+    """One item, as the target of a command that moves, deletes or restores items or folders."""
 
     handle: ItemHandle
 

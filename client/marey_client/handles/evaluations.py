@@ -53,11 +53,17 @@ class EvaluationHandle(ReportedHandle):
         return record_arrays(self.part("records"))
 
     def walk_graph(self, *, trial: str | None = None) -> dict[str, Any]:
-        """Return the frames that the trials displayed, the jumps between them, and the order of each walk.
+        """Return the frames that the trials displayed, the jumps between them, and the order of each walk, as lists.
 
-        `nodes` are frames of clips, with the number of ticks for which they were displayed. Each of `edges` has the
-        indices of two nodes, and the number of jumps from the first to the second. `walks` has a list of runs of frames
-        for each of `trials`. Without `trial`, the graph is that of all trials together.
+        * `clips`: identifier, name and number of frames of each clip;
+        * `nodes`: the lists `clip`, `frame` and `ticks`, with one element for each displayed frame: the index of its
+          clip, its number, and the number of ticks for which it was displayed;
+        * `edges`: the lists `source`, `target` and `count`: the indices of two nodes, and the number of jumps from the
+          first to the second;
+        * `walks`: for each name in `trials`, the lists `tick`, `clip`, `frame` and `frames`, with one element for each
+          run of successive frames: its first tick, its clip, its first frame, and its length.
+
+        Without `trial`, the graph is that of all trials together.
         """
         return dict(json.loads(self._walk_graph("json", trial)))
 

@@ -166,7 +166,10 @@ def _rounded(start: float, step: float, count: int) -> Pace:
 
 
 def _robust_line(places: Floats, values: Floats, weights: Floats, apart: int) -> tuple[float, float]:
-    """Fit a straight line to values that jump where frames were removed; return its start and slope."""
+    """Fit a straight line to values that jump where frames were removed; return its value at place 0 and its slope.
+
+    The first estimate of the slope is the median over pairs of places that are `apart` places apart.
+    """
     apart = max(1, min(apart, len(places) - 1))
     slope = float(np.median((values[apart:] - values[:-apart]) / (places[apart:] - places[:-apart])))
     start = float(np.median(values - slope * places))

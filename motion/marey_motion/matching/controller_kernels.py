@@ -103,7 +103,11 @@ def moments_along(rules, wish, positions, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def fill_query(index, playback, rules, wish, row, when, x, z, heading, query):  # type: ignore[no-untyped-def]
-    """Fill the normalised query (D,): the pose of `row`, and the desired path in the frame of a root."""
+    """Fill `query` (D,) with normalised features: the pose of the database's row `row`, then the desired trajectory.
+
+    The trajectory starts at tick `when`, and is seen from the root at `x`, `z` in metres with `heading` in radians. In
+    open loop, it is the arc of the desired speed and turn rate.
+    """
     horizons = playback.horizons_s.shape[0]
     first = query.shape[0] - 4 * horizons
     query[:first] = index.rows[row, :first]

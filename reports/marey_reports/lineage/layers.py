@@ -19,14 +19,16 @@ MOST_PASSED = 100_000
 
 
 class Layout(NamedTuple):
-    """Nodes by layer, in their order from top to bottom, and for each arrow the nodes that it passes.
+    """Places of boxes in layers, and the way of each arrow.
 
-    Nodes are numbers: those below the number of boxes are the boxes, and the others are points that arrows pass
-    through.
+    A node is a number. With n boxes, the numbers 0 to n - 1 are the boxes, and greater numbers are points at which
+    arrows cross a layer.
     """
 
     layers: list[list[int]]
+    """For each layer, from left to right, its nodes from top to bottom."""
     routes: list[list[int]]
+    """For each arrow, the nodes from its source to its target, both included."""
 
 
 def lay_out(count: int, arrows: Sequence[tuple[int, int]]) -> Layout:

@@ -115,9 +115,10 @@ def _itself(tree: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def render(reply: Reply, form: AnswerForm, answers: AnswerCache) -> Rendered:
-    """Return a settled reply with its content as bytes.
+    """Encode a reply as status, headers and bytes, after `settle` has loaded its document.
 
-    If the client already has this state in this form, the status is 304 and there is no body.
+    If the client already has this state in this form, the status is 304 and there is no body. Encoded documents are
+    added to `answers`.
     """
     headers = {"Vary": "Accept, Accept-Encoding", **reply.headers}
     if reply.location is not None:

@@ -147,5 +147,5 @@ def test_drift_is_taken_out_little_by_little(profile: str) -> None:
 @pytest.mark.parametrize(("frames", "seconds"), [((100, 101), 4.0), (None, 1 / 60)])
 def test_drift_of_a_single_frame_is_refused(frames: tuple[int, int] | None, seconds: float) -> None:
     walk = make_walk(seconds=4.0).sliced(0, round(60 * seconds))
-    with pytest.raises(EditError, match="at least 2 frames"):
+    with pytest.raises(EditError, match="only one frame; the drift must be spread over at least 2"):
         apply_edit(walk, [FixDrift(shift_m=(1.0, 0.0, 0.0), frames=frames)])

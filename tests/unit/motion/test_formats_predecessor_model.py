@@ -227,7 +227,7 @@ def changed(path: list[str], value: object) -> dict[str, Any]:
         ({"poses": []}, "not a model"),
         (changed(["sspm", "mean"], [1.0, 2.0]), "space: the mean has 2 numbers, which is not a multiple of the 9"),
         (changed(["sspm", "n_coeffs"], 7), "n_coeffs is 7"),
-        (changed(["sspm", "n_dims"], 7), "n_dims is 7"),
+        (changed(["sspm", "n_dims"], 7), "`n_dims` is 7"),
         (changed(["sspm", "knots"], [0.0] * 13), "must not decrease, and must span a range"),
         (changed(["sspm", "knots"], "x"), "'knots' must be list"),
         (changed(["sspm", "degree"], 99), "degree of the spline is 99"),

@@ -66,7 +66,7 @@ def test_a_tree_that_was_written_is_read_again_and_written_the_same() -> None:
         (["root", "children", 0, "indices"], [], "root.0: the field `indices` must contain at least one sample"),
         (["root", "children", 0, "indices"], [0, 0.5], "root.0"),
         (["root", "children", 1, "indices"], [0], "must together have all samples"),
-        (["root", "children", 0, "children", 0], 3, r"root\.0\.0: each node needs a list"),
+        (["root", "children", 0, "children", 0], 3, r"root\.0\.0: a node must be an object"),
     ],
 )
 def test_damaged_trees_are_refused_by_the_node(path: list[Any], value: object, told: str) -> None:

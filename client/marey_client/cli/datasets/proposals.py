@@ -217,7 +217,7 @@ def check(
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,
-    text: Annotated[str, typer.Option("--message", "-m", help="Result of the check, as text.")] = "",
+    text: Annotated[str, typer.Option("--message", "-m", help="Explanation of the result.")] = "",
     commit: CommitSeen = None,
     as_json: AsJson = False,
 ) -> None:

@@ -262,7 +262,7 @@ def _shift(change: SegmentChange) -> int | None:
 
 
 def _common_shift(changes: Sequence[SegmentChange]) -> int | None:
-    """Return the shift in frames of more than half of the changed segments, and of at least three; None otherwise."""
+    """Return the shift in frames that more than half of the changes, and at least three, have in common; else None."""
     shifts = [shift for one in changes if (shift := _shift(one)) is not None]
     most = max(set(shifts), key=shifts.count, default=None)
     return most if most is not None and shifts.count(most) >= 3 and 2 * shifts.count(most) > len(changes) else None

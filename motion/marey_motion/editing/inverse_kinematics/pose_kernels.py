@@ -67,7 +67,11 @@ def look_error(gaze, wished):  # type: ignore[no-untyped-def]
 
 @compiled
 def target_error(targets, c, frame, tip, turn):  # type: ignore[no-untyped-def]
-    """Compute the error of target `c`: metres along its axes, or a rotation vector in radians, both in the world."""
+    """Compute the error of target `c` as three numbers along the axes of the world.
+
+    For a position: `tip` minus the target in metres, 0 along the axes that the target leaves free. For other targets:
+    the rotation vector in radians from the target's rotation or direction to that of `turn`.
+    """
     values = targets.values[frame]
     if targets.kinds[c] == POSITION:
         off = minus(tip, vector_at(values, c))

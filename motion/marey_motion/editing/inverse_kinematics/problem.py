@@ -127,7 +127,7 @@ class IkProblem(NamedTuple):
 
     @property
     def placing(self) -> Placing:
-        """Scratch arrays for cyclic coordinate descent."""
+        """Make scratch arrays for cyclic coordinate descent."""
         room = self._pose_room()
         return Placing(**room, matrix=np.zeros((3, 3)), form=np.zeros((4, 4)), vectors=np.zeros((4, 4)))
 

@@ -132,6 +132,6 @@ def twist_angle(q, axis):  # type: ignore[no-untyped-def]
 
 @compiled
 def about(axis, angle):  # type: ignore[no-untyped-def]
-    """Compute the rotation about a unit vector by an angle in radians."""
+    """Compute the quaternion (w, x, y, z), as a tuple, of the rotation about a unit vector by an angle in radians."""
     sine = math.sin(0.5 * angle)
     return math.cos(0.5 * angle), axis[0] * sine, axis[1] * sine, axis[2] * sine

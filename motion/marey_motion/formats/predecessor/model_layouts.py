@@ -190,7 +190,7 @@ def model_numbers(values: Any, file: str, name: str) -> Floats:
 
     Raises
     ------
-    FormatError    if the field is no array of numbers, or contains a number that is greater than `LARGEST`
+    FormatError    if the field is no array of numbers, or contains a number whose absolute value is greater than 1e12
     """
     numbers = number_array(values, file, name)
     if np.abs(numbers).max(initial=0.0) > LARGEST:

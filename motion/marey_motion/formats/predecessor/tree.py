@@ -138,11 +138,13 @@ def _by_levels(root: Node, count: int, file: str) -> tuple[list[Ints], list[int]
     waiting: deque[tuple[Node, str, int]] = deque([(root, "root", 0)])
     while waiting:
         node, place, level = waiting.popleft()
-        below = node.get("children") or [] if isinstance(node, Mapping) else None
-        if not isinstance(below, list) or level > MOST_LEVELS:
-            raise FormatError(
-                f"{place}: each node needs a list of children, and a tree has at most {MOST_LEVELS} levels", file=file
-            )
+        if not isinstance(node, Mapping):
+            raise FormatError(f"{place}: a node must be an object", file=file)
+        below = node.get("children") or []
+        if not isinstance(below, list):
+            raise FormatError(f"{place}: the field `children` must be a list of nodes", file=file)
+        if level > MOST_LEVELS:
+            raise FormatError(f"{place}: the tree has more than {MOST_LEVELS} levels below its root", file=file)
         held = number_array(field_of(node, "indices", list, file), file, f"{place}: indices")
         if held.ndim != 1 or not len(held) or (held != np.floor(held)).any():
             raise FormatError(f"{place}: the field `indices` must contain at least one sample", file=file)

@@ -91,9 +91,12 @@ def search_closely(
 
 
 def _descend(
-    objective: Objective, tree: SampleTree, candidates: int, top: int, drawn: Callable[[Floats], Floats]
+    objective: Objective, tree: SampleTree, candidates: int, top: int, transform: Callable[[Floats], Floats]
 ) -> FoundSamples:
-    """Search a tree whose latent vectors are first transformed by the function `drawn`."""
+    """Return the `top` samples of a tree that have the lowest costs, following `candidates` nodes of each level.
+
+    The costs are those of the latent vectors after `transform`; the result contains these transformed vectors.
+    """
     frontier = np.zeros(1, dtype=np.intp)
     seen, costs, evaluations = [], [], 0
     while frontier.size:
@@ -102,13 +105,13 @@ def _descend(
         alone = tree.sizes[nodes] == 1
         samples = np.concatenate((_ranges(tree.starts[leaves], tree.sizes[leaves]), tree.starts[nodes[alone]]))
         nodes = nodes[~alone]
-        found = objective.costs(drawn(np.concatenate((tree.means[nodes], tree.samples[samples]))))
+        found = objective.costs(transform(np.concatenate((tree.means[nodes], tree.samples[samples]))))
         seen.append(samples)
         costs.append(found[len(nodes) :])
         evaluations += len(found)
         frontier = nodes[_smallest(found[: len(nodes)], nodes, candidates)]
     best = _best(tree, np.concatenate(seen), np.concatenate(costs), top, evaluations)
-    return replace(best, latents=drawn(best.latents))
+    return replace(best, latents=transform(best.latents))
 
 
 def _check(objective: Objective, tree: SampleTree, candidates: int, top: int) -> None:

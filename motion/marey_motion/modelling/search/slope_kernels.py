@@ -206,7 +206,11 @@ def _slopes_of(row, rows, points, turns, residual, by_point, by_turn):  # type: 
 
 @compiled
 def linearise(rows, points, turns, times, point_slopes, turn_slopes, time_slopes, residuals, slopes):  # type: ignore[no-untyped-def]
-    """Fill errors (m, 3) of constraints and their derivatives (m, 3, W)."""
+    """Fill `residuals` (m, 3) with the errors of m constraints, and `slopes` (m, 3, W) with their derivatives.
+
+    The derivatives are with respect to the W unknowns of the search. `rows` describes the constraints; the other arrays
+    are values and derivatives of the tracked points, rotations and times.
+    """
     room, by_point, by_turn = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     for row in range(rows.kinds.shape[0]):
         item = rows.items[row]

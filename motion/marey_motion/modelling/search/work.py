@@ -61,14 +61,15 @@ def drawing_work(
 def searching_work(
     problem: SeveralSteps, trees: Sequence[SampleTree], *, candidates: int, passes: int, refining: RefineOptions | None
 ) -> float:
-    """Estimate the work of `search_steps` for the same arguments.
+    """Estimate the time that `search_steps` takes for the steps of a problem.
 
     Parameters
     ----------
     problem : SeveralSteps    the steps
     trees : sequence of SampleTree    samples of each step's primitive
-    candidates, passes : int    see `search_closely`
-    refining : RefineOptions or None    options of refinement
+    candidates : int    number of nodes that are followed from each level of a tree to the next
+    passes : int    number of searches of each tree
+    refining : RefineOptions or None    options of refinement; None if the samples are not refined
 
     Returns
     -------

@@ -73,7 +73,11 @@ def draw_usage(subjects: Sequence[Subject], trial: str | None, options: FigureOp
 def _draw_bars(
     panel: Axes, places: AnyFloats, values: Sequence[int], use: _Use, number: int, thick: float, others: bool
 ) -> None:
-    """Draw a subject's bars with numbers: one per clip, one for the other clips, then a hatched one for transitions."""
+    """Draw the labelled bars of the subject with index `number`.
+
+    There is one bar for each listed clip, one for all remaining clips if `others` is true, and a hatched one for
+    transitions.
+    """
     total = sum(use.ticks.values())
     colours = [COLOURS[number]] * (len(values) - others) + [REFERENCE] * others
     panel.barh(places[:-1], values, height=thick, color=colours, lw=0)
