@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from marey_client.handles.skeletons import SkeletonHandle
 from marey_client.jobs import Jobs
 from marey_client.project import ProjectHandle
 from marey_schemas.datasets.commits import MOST_CHANGES, PutEntry
-from marey_schemas.datasets.naming import MAIN, RefKind
+from marey_schemas.datasets.naming import MAIN, Ref, RefKind
 from marey_schemas.editing.commands import Smooth
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import DatasetInput
@@ -62,7 +63,7 @@ def version_results(
     puts = [PutEntry(path=path, item=clip.id, revision=clip.item.revision) for path, clip in unedited.items()]
     for start in range(0, len(puts), MOST_CHANGES):
         _commit(dataset, "Retargeted takes", puts[start : start + MOST_CHANGES])
-    tags = sorted((one for one in dataset.refs() if one.kind is RefKind.TAG), key=lambda one: int(one.name[1:]))
+    tags = sorted((one for one in dataset.refs() if _is_numbered(one)), key=lambda one: int(one.name[1:]))
     path = max(results, key=lambda path: (results[path].item.summary["frames"], path))
     chosen = results[path] if results[path].item.summary["frames"] >= SHORTEST_FRAMES else None
     if not tags or tags[-1].commit != dataset.ref(MAIN).commit:
@@ -70,10 +71,16 @@ def version_results(
             _smooth_on_branch(project, dataset, path)
         _commit(dataset, "Add the skeleton", [PutEntry(path="skeleton", item=skeleton.id)])
         _merge_branch(dataset)
-        tags.append(dataset.create_tag(f"v{len(tags) + 1}"))
+        number = 1 + max((int(one.name[1:]) for one in tags), default=0)
+        tags.append(dataset.create_tag(f"v{number}"))
     picture = None if chosen is None else _draw_difference(project, path, chosen, folder)
     made = dataset.at(tags[-1].name)
     return DemoVersion(tags[-1].name, made.digest, made.entries, path if chosen else None, picture)
+
+
+def _is_numbered(ref: Ref) -> bool:
+    """Return whether a ref is a tag of the demonstration, such as `v1`; users may have set others."""
+    return ref.kind is RefKind.TAG and re.fullmatch(r"v[0-9]{1,9}", ref.name) is not None
 
 
 def _opened(project: ProjectHandle) -> DatasetHandle:
