@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from lint.__main__ import ROOT
 from lint.exceptions import shown
-from lint.sources import House, Module, read_house
+from lint.sources import Definition, House, Module, read_house
 
 SIZES = {"docstrings": 60, "error texts": 40, "help texts": 20, "pages": 5}
 """Number of texts of each sort in a sample."""
@@ -30,9 +30,30 @@ def draw(house: House, seed: int) -> dict[str, list[tuple[str, str]]]:
 
 
 def _docstrings(module: Module) -> Iterator[tuple[str, str]]:
-    for name, node in (("", module.tree), *module.definitions):
+    """Yield every docstring after what surrounds it in the code: module, enclosing classes, signature."""
+    if text := ast.get_docstring(module.tree):
+        yield module.name, text
+    introduction = f"In {module.name}: {_first_line(module.tree)}"
+    definitions = dict(module.definitions)
+    for name, node in module.definitions:
         if text := ast.get_docstring(node):
-            yield f"{module.name}:{name}" if name else module.name, text
+            parts = name.split(".")
+            outside = [definitions[".".join(parts[:depth])] for depth in range(1, len(parts))]
+            around = [f"{_head(outer)} {_first_line(outer)}" for outer in outside]
+            yield f"{module.name}:{node.lineno}", "\n".join([introduction, *around, _head(node), text])
+
+
+def _first_line(node: ast.Module | Definition) -> str:
+    return (ast.get_docstring(node) or "").partition("\n")[0]
+
+
+def _head(definition: Definition) -> str:
+    """Return the first line of a definition: its name, parameters and return type."""
+    if isinstance(definition, ast.ClassDef):
+        bases = ", ".join(ast.unparse(base) for base in definition.bases)
+        return f"class {definition.name}({bases}):" if bases else f"class {definition.name}:"
+    answer = f" -> {ast.unparse(definition.returns)}" if definition.returns else ""
+    return f"def {definition.name}({ast.unparse(definition.args)}){answer}:"
 
 
 def _errors(module: Module) -> Iterator[tuple[str, str]]:

@@ -252,8 +252,15 @@ def test_a_sample_of_texts_is_the_same_for_the_same_seed() -> None:
     sample = draw(drawn, seed=1)
     assert sample == draw(drawn, seed=1)
     assert {sort: sorted(found) for sort, found in sample.items()} == {
-        "docstrings": [("marey_x", "Module."), ("marey_x:f", "Turn.")],
+        "docstrings": [("marey_x", "Module."), ("marey_x:2", "In marey_x: Module.\ndef f(n):\nTurn.")],
         "error texts": [("marey_x:4", "{n} is not a number")],
         "help texts": [("marey_x:5", "Number of turns.")],
         "pages": [("/checkout/docs/a.md", "A page.")],
     }
+
+
+def test_the_docstring_of_a_method_is_shown_with_its_class_and_signature() -> None:
+    method = '    def g(self, n: int = 1) -> str:\n        """Go."""\n'
+    text = '"""Module.\n\nMore."""\nclass A(B):\n    """Box.\n\n    Wide."""\n' + method
+    found = dict(draw(house({"marey_x": text}), seed=1)["docstrings"])
+    assert found["marey_x:8"] == "In marey_x: Module.\nclass A(B): Box.\ndef g(self, n: int=1) -> str:\nGo."
