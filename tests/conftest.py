@@ -36,9 +36,6 @@ def keep_files_in_memory() -> None:
 
     Databases wait for the disk at each of many thousand commits. Tests kill processes, but never the machine, so no
     test depends on what survives a power failure.
-
-    Databases wait for the disk at each of many thousand commits. Tests kill processes, never the machine: none can find
-    what a power cut would lose.
     """
     roomy = MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free >= ENOUGH_BYTES
     if roomy and "TMPDIR" not in os.environ:

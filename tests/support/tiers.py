@@ -187,9 +187,6 @@ def _group(item: pytest.Item) -> str:
 
     Files that share data which take long to create name a group themselves. Fault cases share nothing, take long and
     wait much, so each may run in any process.
-
-    Files that share what takes long to make name a group themselves.
-    Fault cases share nothing, take long and wait much, so each goes where there is room.
     """
     folder = _folder(item)
     if folder.startswith("integration/ways/"):

@@ -52,9 +52,6 @@ def links_between_layers(max_run: int | None) -> list[tuple[int, tuple[int, int]
 
     A layer is defined by the last steps of a path: 0 is a step in both motions, then 1 to `max_run` steps in a row in
     the first motion alone, then equally many in the second alone. Without a limit there is one layer.
-
-    Layers are what a way has done last: 0 a step in both motions, then 1 to `max_run` steps in a row in the first
-    alone, then as many in the second alone. Without a limit there is one layer.
     """
     if max_run is None:
         return [(0, step, 0) for step in STEPS]
