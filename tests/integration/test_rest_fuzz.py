@@ -11,7 +11,7 @@ from tests.support.tiers import examples
 from marey_server.store.database.connections import Database
 from marey_server.store.database.schema import upgrade_schema
 
-FEW = 4
+FEW = 2
 """Requests for each probe in the tier `test`."""
 SEED = 20261121
 CALLERS = ("anonymous", "reader", "owner")

@@ -174,7 +174,7 @@ def test_items_are_what_the_model_says(database: Database) -> None:
     run_state_machine_as_test(
         machine,
         settings=settings(
-            max_examples=examples(25),
+            max_examples=examples(12),
             stateful_step_count=steps(20),
             deadline=None,
             suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymotion.io.bvh import BVH
 from pymotion.rotations import quat_np
+from tests.support.tiers import is_soak
 
 
 def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
@@ -21,3 +22,14 @@ def positions_by_another_loader(path: Path) -> NDArray[np.float64]:
             turned[:, joint] = quat_np.mul(turned[:, parent], rotations[:, joint])
             placed[:, joint] = placed[:, parent] + quat_np.mul_vec(turned[:, parent], positions[:, joint])
     return np.asarray(placed)
+
+
+def files_to_compare(names: list[str]) -> list[str]:
+    """Return the files of the collection that a test reads with the other loader, which is slow.
+
+    Files of the folders `bandai-namco-*` differ in the motion alone, so every sixth of them is enough outside of the
+    tier `soak`.
+    """
+    alike = [name for name in names if "bandai-namco-" in name]
+    left_out = set() if is_soak() else set(alike) - set(alike[::6])
+    return [name for name in names if name not in left_out]

@@ -163,8 +163,12 @@ def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.load_profile(name)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests to which a reason applies, count them, and group the others by process."""
+    """Deselect the tests to which a reason applies, count them, and group the others by process.
+
+    First of all, because pytest-xdist reads the groups in the same hook.
+    """
     reasons = TIERS[config.getoption("tier")].leaves_out
     if MOCAP_VARIABLE not in os.environ:
         reasons = {"need real motion capture": _needs_mocap, **reasons}
@@ -180,6 +184,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             config.stash[LEFT_OUT][reason] += 1
     config.hook.pytest_deselected(items=gone)
     items[:] = kept
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Stop if pytest-xdist has not read the groups; each process would make all shared data then."""
+    if session.config.getoption("loadgroup", False) and not all("@" in item.nodeid for item in session.items):
+        raise pytest.UsageError("pytest-xdist has not seen the groups of tests, see tests/support/tiers.py")
 
 
 def _group(item: pytest.Item) -> str:

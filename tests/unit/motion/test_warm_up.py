@@ -99,7 +99,7 @@ def test_compiled_code_of_other_packages_is_kept(package: Path) -> None:
     assert compiled_files(package) == ["foreign.solve-1.py311.nbi"]
 
 
-@pytest.mark.slow
+@pytest.mark.soak  # compiles all kernels of one stage
 def test_a_first_file_finds_the_kernels_compiled(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run([sys.executable, "-m", "marey_motion.warm_up", "files"], env=environment, check=True)

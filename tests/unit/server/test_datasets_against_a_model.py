@@ -404,6 +404,7 @@ def move_whatever_the_head_is(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(committing, "move_branch_to", move)
 
 
+@pytest.mark.soak  # looks for each fault until it is found
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("plant", [drop_their_side, move_whatever_the_head_is], ids=lambda plant: plant.__name__)
 def test_the_model_finds_planted_faults(

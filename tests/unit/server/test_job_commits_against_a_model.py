@@ -258,7 +258,7 @@ def move_unchecked(tx: Transaction, prepared: Any, digest: str, _mover: Any) -> 
 PLANTED = (overwrite_what_others_changed, forget_what_the_job_made, ignore_the_rule)
 
 
-@pytest.mark.slow  # looks for each fault until it is found, which may take two minutes
+@pytest.mark.soak  # looks for each fault until it is found, which may take two minutes
 @pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
 def test_the_model_finds_planted_faults(

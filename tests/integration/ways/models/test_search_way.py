@@ -22,6 +22,7 @@ from marey_schemas.queue.jobs import ItemInput, JobCreate
 pytestmark = pytest.mark.timeout(300)
 
 EXAMPLES = 12
+SAMPLES = 1500
 AHEAD = {"type": "root_position", "at": "end", "target_m": [None, 1.2]}
 TAIL = {"type": "joint_position", "at": "end", "joint": "tail", "target_m": [0, 0, 0]}
 
@@ -36,7 +37,7 @@ def bare(lab: ProjectHandle) -> ModelHandle:
 def walk(lab: ProjectHandle) -> ModelHandle:
     """A model with a tree."""
     made = lab.model(lab.train_model("aligned", name="walk", into="models", report=False))
-    made.make_tree(seed=3, samples=4000)
+    made.make_tree(seed=3, samples=SAMPLES)
     return lab.models.get(made.id)
 
 
@@ -45,14 +46,14 @@ def test_a_tree_becomes_a_part_of_its_model_and_leaves_the_others(walk: ModelHan
     assert walk.path == "models/walk"
     tree = walk.part("tree")
     assert tree["model_digest"] == walk.item.parts["model"].document
-    assert tree["samples"].shape == (4000, walk.document()["mixture"]["means"].shape[1])
-    assert (tree["seed"], tree["options"]["samples"]) == (3, 4000)
+    assert tree["samples"].shape == (SAMPLES, walk.document()["mixture"]["means"].shape[1])
+    assert (tree["seed"], tree["options"]["samples"]) == (3, SAMPLES)
     assert [(edge.item, edge.revision) for edge in walk.lineage().inputs] == [(walk.id, 1)]
 
 
 def test_the_same_seed_makes_the_same_tree(lab: ProjectHandle, walk: ModelHandle) -> None:
     before = walk.item.parts["tree"].document
-    params = {"samples": 4000}
+    params = {"samples": SAMPLES}
     job = JobCreate(kind="tree", inputs={"model": ItemInput(item=walk.id)}, params=params, seed=3, cache="off")
     lab.model(lab.submit(job))
     assert lab.models.get(walk.id).item.parts["tree"].document == before
