@@ -94,6 +94,7 @@ TIERS = {
             "fault cases": _fault,
             "whole ways": _whole_way,
             "slow": _slow,
+            "for the tier soak": _soak_only,
         },
     ),
     "test": Tier(
