@@ -293,22 +293,23 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
-    entries: dict[str, str] = {}
+    lacking: dict[str, str] = {}
     while waiting:
-        seen |= waiting
-        found = StoredChunks(tx).load(waiting)
-        waiting = set()
-        for digest, data in found.items():
+        batch = {waiting.pop() for _ in range(min(len(waiting), PAGE))}
+        seen |= batch
+        entries: dict[str, str] = {}
+        for digest, data in StoredChunks(tx).load(batch).items():
             with suppress(DamagedChunk):  # which `_check_chunk` reports
                 chunk = decode(digest, data)
                 if isinstance(chunk, Branch):
                     waiting |= {child.digest for child in chunk.children} - seen
                 else:
                     entries |= {(one := entry_of(*entry)).content: one.path for entry in chunk.entries}
-    lacking = entries.keys() - revisions_with(tx, row.project_id, entries).keys()
+        found = revisions_with(tx, row.project_id, entries)
+        lacking |= {content: path for content, path in entries.items() if content not in found}
     return [
-        StoreDefect("entry-lost", row.id, f"no revision has the content {content} of {entries[content]!r}")
-        for content in sorted(lacking)
+        StoreDefect("entry-lost", row.id, f"no revision has the content {content} of {path!r}")
+        for content, path in sorted(lacking.items())
     ]
 
 
