@@ -48,9 +48,9 @@ class PartChange(Request):
 def read_part(
     tx: Transaction, project: str, kind: Kind, item: str, part: str, query: PartQuery, *, encoded: bool
 ) -> Reply:
-    """Read a part of an item; if only some frames or joints are requested, `encoded` keeps its arrays encoded.
+    """Read a part of an item, whole or only some frames or joints; with `encoded`, the arrays of these stay encoded.
 
-    A part of a named revision never changes.
+    If the query gives a revision, clients may keep the answer, because a part of a revision never changes.
     """
     found = items.find_part(tx, project, kind, item, part, revision=query.revision)
     load = partial(items.load_part, tx, found)

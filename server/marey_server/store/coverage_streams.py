@@ -142,7 +142,7 @@ def advance_stream(tx: Transaction, project: str, held: Stream, step: StreamStep
 
 
 def answered_before(stream: Stream, said: str) -> Tree | None:
-    """Return the stored answer if this request is a repetition of the last one, otherwise None."""
+    """Return the stored answer if `said`, the digest of a request, is that of the last request, otherwise None."""
     return stream.answer if stream.said == said else None
 
 

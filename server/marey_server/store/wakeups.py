@@ -25,7 +25,7 @@ def job_topic(job_id: str) -> str:
 
 
 def work_topic(kind: str) -> str:
-    """Return the topic of jobs of a kind that can be claimed."""
+    """Return the topic that is announced when a job of this kind can be claimed."""
     return f"work:{kind}"
 
 

@@ -36,8 +36,8 @@ class Sequel:
     ----------
     latents : one latent vector (L,) per step
     measured : their placements and errors
-    joints : standard names of the transition joints; `Measured.jumps_m` lists the jump of the pelvis, then those of
-        these joints
+    joints : standard names of the joints whose jumps are measured, that is, their changes of position from the end
+        of one step to the start of the next; `Measured.jumps_m` lists the jump of the pelvis, then those of `joints`
     searched : result of the search in each tree
     sampled : placements and errors before refining
     refined : result of refining, None if it was not requested

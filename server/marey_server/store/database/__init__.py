@@ -1,1 +1,1 @@
-"""Connections to SQLite and Postgres: the clock, the write lane, prepared statements, and the schema."""
+"""SQLite and Postgres: connections, the queue of writing transactions, prepared statements, schema, and clock."""

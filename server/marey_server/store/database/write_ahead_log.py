@@ -55,7 +55,7 @@ class WriteAheadLog:
         self._failing = False
 
     def after_commit(self, connection: sqlite3.Connection) -> None:
-        """Start to copy the log if it is no longer short; if little is left to copy, let SQLite overwrite it.
+        """Start to copy a long log into the database; if little is left to copy, let SQLite begin the log again.
 
         `connection` has just committed. Only one thread may call this method at a time.
         """

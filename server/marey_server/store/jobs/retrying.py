@@ -162,7 +162,10 @@ def _again(tx: Transaction, project: ProjectRow, row: Row[Any], new: str, stand_
 
 
 def _late_pins(row: Row[Any], stand_ins: Mapping[str, str]) -> PinnedInputs:
-    """Return the late inputs of a job that were never pinned, to be produced by the retries."""
+    """Return the inputs of the retry of a job that ended before its late inputs were pinned.
+
+    Each input that was the result of a job becomes the result of the retry of that job, which `stand_ins` names.
+    """
     return {
         name: [{"job": stand_ins[entry["job"]]} if "job" in entry else entry for entry in entries]
         for name, entries in row.inputs.items()

@@ -274,10 +274,10 @@ def submit_pipeline(tx: Transaction, project: str, pipeline: PipelineCreate) -> 
 
 
 def _placed(request: JobCreate, step: PipelineStep) -> JobCreate:
-    """Return the job request of a step, without what the pipeline gives to all steps and this one cannot use.
+    """Return the job request of a step, without settings of the whole pipeline that the step cannot use.
 
-    This is the collection, if the results of the step have a fixed place, as trees have, and the commit, if the step
-    creates no items.
+    The collection is left out if the results of the step have a fixed place, as trees have. The commit is left out if
+    the step creates no items.
     """
     try:
         kind = find_kind(request.kind)
