@@ -84,16 +84,23 @@ def _reorder(layers: list[list[int]], routes: Sequence[Sequence[int]]) -> None:
         for one, other in pairwise(route):
             right[one].append(other)
             left[other].append(one)
+    position: dict[int, float] = {}
+    for layer in layers:
+        _number(layer, position)
     for sweep in range(SWEEPS):
         forward = sweep % 2 == 0
         neighbours = left if forward else right
         for layer in layers if forward else reversed(layers):
-            _sort_layer(layer, layers, neighbours)
+            _sort_layer(layer, position, neighbours)
 
 
-def _sort_layer(layer: list[int], layers: Sequence[Sequence[int]], neighbours: dict[int, list[int]]) -> None:
+def _number(layer: list[int], position: dict[int, float]) -> None:
+    """Write the position of each node of a layer, from 0 at the top to 1 at the bottom."""
+    position.update((node, (index + 0.5) / len(layer)) for index, node in enumerate(layer))
+
+
+def _sort_layer(layer: list[int], position: dict[int, float], neighbours: dict[int, list[int]]) -> None:
     """Sort a layer by the mean position of each node's neighbours; a node without neighbours keeps its position."""
-    position = {node: (index + 0.5) / len(one) for one in layers for index, node in enumerate(one)}
     means = {
         node: sum(position[other] for other in neighbours[node]) / len(neighbours[node])
         if neighbours[node]
@@ -101,3 +108,4 @@ def _sort_layer(layer: list[int], layers: Sequence[Sequence[int]], neighbours: d
         for node in layer
     }
     layer.sort(key=means.__getitem__)
+    _number(layer, position)

@@ -7,8 +7,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.drawn_evaluations import (
+    DRAWN_EVALUATIONS,
+    changed,
+    drawn_beside_little,
+    drawn_both,
+    drawn_hostile,
+    drawn_of_little,
+    figure_of,
+    hostile,
+    little,
+    usual,
+)
 from tests.support.evaluation_results import synthetic_result
 from tests.support.report_pages import HOSTILE, Page, is_sound
+from tests.support.tiers import is_soak
 
 from marey_motion.evaluation.compare import compare_results
 from marey_motion.evaluation.judgement import is_followed, judge, mean_speed_m_s
@@ -25,21 +38,23 @@ from marey_reports.drawing.markup import element, text
 from marey_reports.drawing.words import duration
 from marey_reports.evaluation import definitions
 from marey_reports.evaluation.definitions import METRICS
-from marey_reports.evaluation.figures import FIGURES, draw_figures
+from marey_reports.evaluation.figures import FIGURES, USE_FIGURES, draw_figure
 from marey_reports.evaluation.page import compared, render_comparison, render_report, verdict
 from marey_reports.evaluation.words import find_holes
 from marey_schemas.options.evaluation import EvaluationOptions
 from marey_schemas.wording import counted
 
+pytestmark = DRAWN_EVALUATIONS
+
 
 @pytest.fixture(scope="module")
 def result() -> EvaluationResult:
-    return synthetic_result(seed=4, turns_deg_s=(-90.0, 20.0))
+    return usual()
 
 
 @pytest.fixture(scope="module")
-def figures(result: EvaluationResult) -> dict[str, DrawnFigure]:
-    return draw_figures(result)
+def figures() -> dict[str, DrawnFigure]:
+    return {name: figure_of(name) for name in FIGURES}
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +73,16 @@ def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures:
         assert figure.caption in page.text
 
 
-@pytest.mark.slow
-def test_the_same_result_gives_the_same_page(result: EvaluationResult) -> None:
-    assert render_report(result, title="Walks") == render_report(result, title="Walks")
+def test_the_same_result_gives_the_same_page(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
+    once, again = (render_report(result, title="Walks", figures=figures) for _ in range(2))
+    assert once == again
 
 
 @pytest.mark.slow
+def test_without_figures_a_report_draws_them(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
+    assert render_report(result, title="Walks") == render_report(result, title="Walks", figures=figures)
+
+
 def test_the_page_opens_with_the_verdict(page: Page, result: EvaluationResult) -> None:
     assert page.text.startswith("Walks Walks " + verdict(result))
 
@@ -83,14 +102,17 @@ def test_pictures_and_tables_can_be_read_aloud(result: EvaluationResult, figures
 
 @pytest.mark.slow
 def test_names_of_clips_and_titles_are_shown_and_never_run(result: EvaluationResult) -> None:
-    hostile = synthetic_result(names=HOSTILE, unused=10, seed=2)
-    page = is_sound(render_report(hostile, title=HOSTILE[1]))
+    page = is_sound(render_report(hostile(), title=HOSTILE[1], figures=drawn_hostile()))
 
     for name in HOSTILE[:3]:
         assert name in page.text
     assert "alert" not in "".join(page.scripts)
     assert "\u202e" not in page.text
-    assert is_sound(render_comparison(hostile, result, title=HOSTILE[0], labels=("<i>", "</td>")))
+    labels = ("<i>", "</td>")
+    figures = None if is_soak() else {
+        name: draw_figure(name, hostile(), other=result, labels=labels) for name in (*USE_FIGURES, "points")
+    }  # fmt: skip
+    assert is_sound(render_comparison(hostile(), result, title=HOSTILE[0], labels=labels, figures=figures))
 
 
 def test_notes_of_the_evaluation_are_told(result: EvaluationResult, figures: dict[str, DrawnFigure]) -> None:
@@ -155,7 +177,7 @@ def test_digests_and_options_are_there_to_repeat_it(page: Page, result: Evaluati
 
 @pytest.mark.slow
 def test_a_report_of_a_thousand_clips_stays_small() -> None:
-    big = synthetic_result(clips=1_000, frames=1_000, unused=300)
+    big = synthetic_result(clips=1_000, frames=300, unused=300)
     source = render_report(big, title="big")
 
     assert len(source.encode()) < 5_000_000
@@ -164,22 +186,10 @@ def test_a_report_of_a_thousand_clips_stays_small() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["bare", "nothing used", "no trials", "no metrics"])
-def test_reports_are_made_of_little(change: str, result: EvaluationResult) -> None:
-    little = {
-        "bare": replace(result, records=(), notes=()),
-        "nothing used": replace(
-            result,
-            usage=tuple(replace(u, ticks=0, share=0.0, popularity=0 * u.popularity) for u in result.usage),
-            switches=np.zeros((0, 3), dtype=np.int64),
-        ),
-        "no trials": replace(result, trials=(), records=(), suite={}),
-        "no metrics": replace(
-            result, trials=tuple(replace(t, metrics=dict.fromkeys(t.metrics)) for t in result.trials), suite={}
-        ),
-    }[change]
-    is_sound(render_report(little, title="little"))
-    is_sound(render_comparison(little, result, title="little"))
+@pytest.mark.parametrize("name", ["no records", "nothing used", "no trials", "no numbers"])
+def test_reports_are_made_of_little(name: str, result: EvaluationResult) -> None:
+    is_sound(render_report(little(name), title="little", figures=drawn_of_little(name)))
+    is_sound(render_comparison(little(name), result, title="little", figures=drawn_beside_little(name)))
 
 
 @pytest.mark.slow
@@ -329,9 +339,8 @@ def test_a_comparison_says_whether_it_helped(result: EvaluationResult) -> None:
 
 @pytest.mark.slow
 def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult) -> None:
-    after = synthetic_result(seed=4, clips=10, turns_deg_s=(-90.0, 20.0), sway_m=0.05)
-    after = replace(after, clips=(replace(after.clips[0], uid="new@1", name="newcomer"), *after.clips[1:]))
-    page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new")))
+    after = changed()
+    page = is_sound(render_comparison(result, after, title="Change", labels=("old", "new"), figures=drawn_both()))
 
     assert page.tags["figure"] == len(FIGURES)
     assert "Clips that came (1) newcomer" in page.text

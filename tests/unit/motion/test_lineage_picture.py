@@ -68,24 +68,34 @@ GRAPHS = {
 }
 
 
-@pytest.mark.parametrize("graph", GRAPHS.values(), ids=list(GRAPHS))
-def test_pictures_are_drawn_as_png_and_svg_with_nothing_cut_off(
-    graph: LineageGraph, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "a chain" else []) for name in GRAPHS]
+)
+def test_pictures_are_the_same_svg_each_time_with_nothing_cut_off(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Any] = []
 
-    def write_png(figure: Any) -> bytes:
+    def write_svg(figure: Any, title: str) -> str:
         figures.append(figure)
-        return paper.to_png(figure)
+        return paper.to_svg(figure, title)
 
-    monkeypatch.setattr(picture, "to_png", write_png)
-    drawn = draw_lineage(graph, "png")
-    assert imread(io.BytesIO(drawn)).shape[0] > 60
-    assert draw_lineage(graph, "png") == drawn
+    monkeypatch.setattr(picture, "to_svg", write_svg)
+    drawn = draw_lineage(GRAPHS[name], "svg")
+    assert ElementTree.fromstring(drawn).tag.endswith("svg")
+    assert draw_lineage(GRAPHS[name], "svg") == drawn
     assert cut_off(figures[0]) == []
-    svg = draw_lineage(graph, "svg")
-    assert ElementTree.fromstring(svg).tag.endswith("svg")
-    assert draw_lineage(graph, "svg") == svg
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("cut off", "names with signs") else [pytest.mark.soak])
+        for name in GRAPHS
+    ],
+)
+def test_pictures_are_the_same_png_each_time(name: str) -> None:
+    drawn = draw_lineage(GRAPHS[name], "png")
+    assert imread(io.BytesIO(drawn)).shape[0] > 60
+    assert draw_lineage(GRAPHS[name], "png") == drawn
 
 
 def test_hundreds_of_clips_are_one_box_that_warns_of_the_outdated_one() -> None:
