@@ -74,6 +74,7 @@ def test_a_figure_of_two_results_is_the_same_drawing_each_time(
         assert is_sound(first).png == second.png
 
 
+@pytest.mark.slow
 def test_threads_draw_the_same_figures_at_once(result: EvaluationResult) -> None:
     def draw(_: int) -> tuple[str, bytes]:
         figure = draw_figure("scenario-switching", result)

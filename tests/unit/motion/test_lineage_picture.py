@@ -88,7 +88,7 @@ def test_pictures_are_the_same_svg_each_time_with_nothing_cut_off(name: str, mon
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in ("cut off", "names with signs") else [pytest.mark.soak])
+        pytest.param(name, marks=pytest.mark.slow if name in ("cut off", "names with signs") else pytest.mark.soak)
         for name in GRAPHS
     ],
 )

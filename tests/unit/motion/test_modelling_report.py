@@ -50,6 +50,7 @@ def page(model: tuple[TrainedPrimitive, ModelSubject], figures: Mapping[str, Dra
     return is_sound(rendered(model[0], model[1], figures))
 
 
+@pytest.mark.slow
 def test_a_report_is_one_sound_file_that_shows_every_figure(page: Page, figures: Mapping[str, DrawnFigure]) -> None:
     assert page.tags["svg"] == page.tags["figcaption"] == len(figures)
     assert page.tags["h1"] == 1
