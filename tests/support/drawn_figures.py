@@ -24,7 +24,7 @@ def is_sound(figure: DrawnFigure) -> DrawnFigure:
 def is_sound_svg(figure: DrawnFigure) -> DrawnFigure:
     """Check that the SVG can be read, and what `has_sound_data` checks; return the figure.
 
-    The SVG takes a third of the time of the PNG, and writing it computes the layout of all texts as well.
+    The SVG takes less than the PNG, and writing it computes the layout of all texts as well.
     """
     assert ElementTree.fromstring(figure.svg).tag.endswith("svg")
     return has_sound_data(figure)
