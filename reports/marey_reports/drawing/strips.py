@@ -17,6 +17,7 @@ from marey_reports.drawing.paper import COLOURS, HAIRLINE, INK, PAPER, QUIET, RE
 from marey_reports.drawing.stick_figures import CENTRE, LEFT, RIGHT, Camera, StickFigure, runs_of
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
@@ -220,22 +221,27 @@ def _draw_body(axes: Axes, shapes: _Shapes, stage: _StripCell, points: Floats, l
     from matplotlib.patches import Circle, PathPatch
 
     seen = stage.placed(points)
-    options: dict[str, Any] = {"facecolor": "none", "capstyle": "round", "joinstyle": "round", "clip_path": frame}
+    options: dict[str, Any] = {"facecolor": "none", "capstyle": "round", "joinstyle": "round"}
     sides = sorted(shapes.bones, key=lambda side: float(seen[shapes.bones[side], 2].mean()))
     for place, side in enumerate(sides):
         if look.rim and place:
             rim = _path(_middles(seen[shapes.bones[side], :2]))
-            axes.add_artist(PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}))
+            _add(axes, PathPatch(rim, edgecolor=PAPER, lw=look.width + 1.8, **{**options, "capstyle": "butt"}), frame)
         lines = _path([seen[run, :2] for run in shapes.runs[side]])
         colour = look.colour or SIDE_COLOURS[side]
-        axes.add_artist(PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options))
+        _add(axes, PathPatch(lines, edgecolor=colour, lw=look.width, alpha=look.alpha, **options), frame)
     if shapes.head is not None:
         (outer, inner), share = shapes.head
         centre = share * seen[inner, :2] + (1.0 - share) * seen[outer, :2]
         fill = PAPER if look.rim else "none"
         circle = Circle(tuple(centre), shapes.head_m * stage.scale, facecolor=fill, edgecolor=look.colour or INK)
-        circle.set(linewidth=0.75 * look.width, alpha=look.alpha, clip_path=frame)
-        axes.add_artist(circle)
+        circle.set(linewidth=0.75 * look.width, alpha=look.alpha)
+        _add(axes, circle, frame)
+
+
+def _add(axes: Axes, artist: Artist, frame: Rectangle) -> None:
+    """Add an artist, cut off at the frame of its cell; `add_artist` replaces rectangles that were set before it."""
+    axes.add_artist(artist).set_clip_path(frame)
 
 
 def _middles(bones: Floats) -> list[Floats]:

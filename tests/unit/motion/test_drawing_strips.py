@@ -93,6 +93,15 @@ def test_many_bodies_on_top_of_each_other_are_pale(walk: tuple[Skeleton, Floats]
     assert many[0].get_alpha() < one[0].get_alpha()
 
 
+def test_a_body_that_is_elsewhere_does_not_reach_into_the_next_cell(walk: tuple[Skeleton, Floats]) -> None:
+    figure = strip(walk, shift=(1.0, 0.0, 0.0), ghost=True)
+    figure.draw_without_rendering()
+    shapes = [one for one in figure.axes[0].get_children() if isinstance(one, PathPatch | Circle) and one.get_clip_on()]
+    widths = {round(box.width / figure.dpi, 3) for one in shapes if (box := one.get_clip_box()) is not None}
+    assert widths == {1.2}  # inches, as a cell
+    assert len(shapes) > 20
+
+
 def test_bones_are_joined_to_runs_that_hold_each_bone_once() -> None:
     bones = np.array([[3, 2], [2, 1], [1, 0], [5, 4], [4, 1]])
     runs = runs_of(bones)
